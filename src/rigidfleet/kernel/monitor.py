@@ -34,6 +34,7 @@ from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
     ACCELERATION,
+    ANY_STEP,
     CLEARANCE,
     CONSTRAINT,
     CONSTRAINT_FORCE,
@@ -42,6 +43,7 @@ from rigidfleet.kernel.records import (
     GEOFENCE,
     HIGHEST,
     KNOTS,
+    LISTED,
     LOST,
     LOWEST,
     SEPARATION,
@@ -632,23 +634,13 @@ def watch_middle(step, before, after, p, w, state, monitor):
 
 
 @compiled
-def known(marks, row):
-    """Whether a step is marked; its row will hold another one."""
-    if row >= marks.shape[0] or not marks[row]:
-        return False
-    marks[row] = False
-    return True
-
-
-@compiled
 def watch_forces(p, w, state, monitor, steps, last):
     """Monitor forces over the steps of a trail; with ``last``, no further step of the segment follows."""
-    trail, before = state.trail, monitor.gauge[0]
-    for step in range(steps):
+    trail, before, listed = state.trail, monitor.gauge[0], monitor.flags[LISTED + 1]
+    for k in range(steps if listed == ANY_STEP else listed):
+        step = k if listed == ANY_STEP else monitor.listed[1, k]
         new = step > 0 or monitor.flags[3] == 0
         row = row_of(step, state)
-        if known(monitor.calm, row) and 0 < step < steps - 1:
-            continue
         start, end = trail.clock[row, 0], end_of(step, state)
         after = trail.gauge[row]
         earlier = trail.gauge[row_of(step - 1, state)] if step > 0 else before
@@ -678,19 +670,25 @@ def watch(p, w, state, monitor):
     forces: none (0); all but the last step, which stays in the trail until its neighbour is known (1); or all steps,
     because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail. With 3 for ``flags[2]``, nothing is
     monitored: the first step's bounds are computed (`bound_moves`).
+
+    ``flags[LISTED]`` and the next one are the numbers of steps in ``monitor.listed`` that alone can hold worse distances
+    and forces, or `ANY_STEP`. Lists count once. That of forces has the first and the last step of the trail.
     """
     trail, flags = state.trail, monitor.flags
     if flags[2] == 3:
         bound_moves(trail.points[row_of(flags[0], state)], p, monitor)
         return 0
-    for step in range(flags[0], flags[1]):
-        row = row_of(step, state)
-        if not known(monitor.quiet, row):
-            watch_distances(row, p, state, monitor)
+    if flags[LISTED] == ANY_STEP:
+        for step in range(flags[0], flags[1]):
+            watch_distances(row_of(step, state), p, state, monitor)
+    for k in range(flags[LISTED]):
+        watch_distances(row_of(monitor.listed[0, k], state), p, state, monitor)
+    flags[LISTED] = ANY_STEP
     if flags[2] == 0:
         return 0
     steps, last = state.count[4], flags[2] == 2
     watch_forces(p, w, state, monitor, steps, last)
+    flags[LISTED + 1] = ANY_STEP
     if last or steps == 0:
         flags[3], state.count[4] = 0, 0
         return 0

@@ -28,6 +28,8 @@ LEAST_ERROR = math.log(1e-4)
     SEPARATION, LOST, SEPARATION_BELOW, CLEARANCE, STANDING, FLYING, GEOFENCE, LOWEST, HIGHEST, SPEED, THRUST,
     THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT,
 ) = range(16)  # fmt: skip
+#: Place among a monitor's flags of the numbers of steps to search, and the number that stands for all of them.
+LISTED, ANY_STEP = 4, -1
 #: Approximate size of a trail in bytes; the integrator pauses when it is full.
 _TRAIL = 1 << 19
 #: Greatest number of points in a search for a greatest force.
@@ -90,10 +92,9 @@ class Monitor(NamedTuple):
     pairs: Pairs  # whose separation is monitored
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
-    flags: Ints  # (4,) see `monitor.watch`
-    # (S,) steps of the trail in which no distance can be worse, and after which no force can, if that is known
-    quiet: Bools
-    calm: Bools
+    flags: Ints  # (6,) see `monitor.watch`
+    # (2, S) steps of the trail to search, for distances and for forces, if they are known: `flags` has their numbers
+    listed: Ints
     moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_moves`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
@@ -128,8 +129,8 @@ def monitor(
         "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
         "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
         "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
-        "flags": np.zeros(4, dtype=np.int64), "quiet": np.zeros(0, dtype=np.bool_),
-        "calm": np.zeros(0, dtype=np.bool_), "moves": np.zeros(2),
+        "flags": np.array([0, 0, 0, 0, ANY_STEP, ANY_STEP]),
+        "listed": np.zeros((2, 0), dtype=np.int64), "moves": np.zeros(2),
         "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),

@@ -151,12 +151,8 @@ class Extremes:
         self.standing[:] = self.stood
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
         if len(self.trail.points):
-            for marks in (
-                self.monitor.monitor.flags,
-                self.monitor.monitor.quiet,
-                self.monitor.monitor.calm,
-            ):
-                marks.fill(0)
+            flags = self.monitor.monitor.flags
+            flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
 
     def begin(self, states: int, edges: int, *, aside: bool = False) -> records.Trail:
         """Begin to monitor an integrator with this many states; it must record its steps in the returned trail.
@@ -170,8 +166,7 @@ class Extremes:
             self.radius, self.boxes, self.fence, states, len(trail.start),
             worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
             standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-            struck=self.struck, quiet=np.zeros(len(trail.clock), dtype=np.bool_),
-            calm=np.zeros(len(trail.clock), dtype=np.bool_),
+            struck=self.struck, listed=np.zeros((2, len(trail.clock)), dtype=np.int64),
         )  # fmt: skip
         self.monitor = native.Watch(found)
         if aside:

@@ -318,6 +318,17 @@ def spread(_context, x, addresses, offset):
 
 
 @intrinsic
+def put(_context, x, address, offset):
+    """Store a number at an address, plus an offset in numbers."""
+
+    def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
+        place = builder.inttoptr(args[1], ir.DoubleType().as_pointer())
+        return builder.store(args[0], builder.gep(place, [args[2]]))
+
+    return types.void(types.float64, types.int64, types.int64), generate
+
+
+@intrinsic
 def in_vectors(_context, array):
     """View float64 (..., n), n a multiple of 8, as lanes (..., n / 8); lanes are returned unchanged."""
     if array.dtype == lanes:

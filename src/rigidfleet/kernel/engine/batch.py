@@ -185,7 +185,7 @@ class Vector:
         ----------
         problems : of eight flights, which `fit_together`
         states : of their integrators, at one time; their trails have the same number of rows
-        monitors : of their extremes, for the same pairs; steps that need not be searched are marked in them
+        monitors : of their extremes, for the same pairs; the steps to search are listed in them
         times, samples : times (K,) [s] to record, and an array (K, n) for each flight
 
         Raises
@@ -198,10 +198,12 @@ class Vector:
             state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
         ):
             self._allocate()
-        self._kept[3] = [x.ctypes.data for x in samples]
         limits = [np.minimum(p.vehicles.thrust_limit, _NO_LIMIT) for p in problems]
         ready = unrolled_together(_alike(problems), self._given)
-        self._problem = ready._replace(kept=self._kept, limit=packed(limits), **self._room)
+        found = self._search._replace(limit=packed(limits))
+        lane_bounds.begin(found, monitors)
+        places = np.array([x.ctypes.data for x in samples])
+        self._problem = ready._replace(samples=places, search=found)
         first = states[0]
         K, n = self._K, len(first.y)
         unpack(K)[: lane_steps.STAGES] = 0.0
@@ -215,23 +217,10 @@ class Vector:
         """Arrays for these trails and monitors, which are those of the phases to come, too."""
         states, monitors = self._states, self._monitors
         self._trails = trails = [state.trail for state in states]
-        n, rows, forces = len(states[0].y), len(trails[0].clock), len(trails[0].start)
-        arrays = [[getattr(t, name) for t in trails] for name in ("points", "gauge", "start")]
-        arrays += [arrays[0], [t.clock for t in trails]]  # the fourth is that of samples
-        self._kept = np.array([[x.ctypes.data for x in row] for row in arrays])
-        self._K, self._length = (
-            empty((lane_steps.ROWS, n)),
-            NO_TRAIL._replace(clock=trails[0].clock),
-        )
-        self._room: dict[str, Any] = {
-            "points": empty((5, n)),
-            "bounds": empty((rows, lane_bounds.COLUMNS)),
-            "forces": empty((2, forces)),
-            "moments": np.zeros(2),
-            "radius": packed([x.radius for x in monitors]),
-            "pairs": monitors[0].pairs,
-            "boxes": packed([x.boxes for x in monitors]),
-        }
+        n, rows = len(states[0].y), len(trails[0].clock)
+        self._K = empty((lane_steps.ROWS, n))
+        self._length = NO_TRAIL._replace(clock=np.empty((rows, 2)))
+        self._search = lane_bounds.search(monitors, trails, self._length.clock)
 
     def __call__(self, t_end: float, max_steps: int) -> int:
         """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
@@ -246,10 +235,10 @@ class Vector:
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
-        rows = np.arange(before, state.count[4]) + state.count[5]
-        if len(rows):
-            rows %= len(self._length.clock)
-            lane_bounds.mark_quiet(self._problem.bounds, rows, self._monitors)
+        steps = range(before, int(state.count[4]))
+        if steps:
+            search, first = self._problem.search, int(state.count[5])
+            lane_bounds.list_steps(search, first, steps, self._monitors)
         return int(status)
 
 
@@ -320,7 +309,8 @@ def fly_all(
         K[lane_steps.ATOL] = atol[:, None]
         y, clock, counts = pack(np.zeros((n, WIDTH))), np.zeros(3), np.zeros(6, dtype=np.int64)
         state = IntegratorState(y, pack(K), clock, counts, rtol, NO_TRAIL)
-        own = ready._replace(before=ready.before.copy(), time=ready.time.copy())
+        names = "before", "time", "known", "stage"
+        own = ready._replace(**{name: getattr(ready, name).copy() for name in names})
 
         def work(*part: Any) -> None:
             fly(own, state, *times, _FIRST_STEP_IN_VECTORS, *part, max_steps, True)

@@ -20,10 +20,11 @@ from numba.extending import intrinsic
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected, unpack
 from rigidfleet.kernel.control import piece_at
 from rigidfleet.kernel.disturbances import spline_weights
-from rigidfleet.kernel.engine import lane_steps
+from rigidfleet.kernel.engine import lane_bounds, lane_steps
+from rigidfleet.kernel.engine.lane_bounds import Search
 from rigidfleet.kernel.engine.tracer import (
     MOMENT,
     SOURCES,
@@ -43,14 +44,17 @@ from rigidfleet.typing import Floats, Ints
 class UnrolledProblem(NamedTuple):
     """A problem in the form that straight-line code reads; arrays of lanes hold a number of each of eight flights.
 
-    ``before``, ``time`` and ``gauge`` are overwritten in flight. Tables over time have no rows if there are none.
+    ``before``, ``time``, ``known``, ``gauge``, ``stage`` and what ``search`` holds are overwritten in flight. Tables
+    over time have no rows if there are none.
     """
 
     address: int  # of the code
     uniform: LaneArray  # (U,) values that depend on the problem's numbers alone
     before: LaneArray  # (m,) distances from which references are blended [m]
-    time: Floats  # (12,) numbers of the moment, see `tracer`
+    time: Floats  # (13,) numbers of the moment, see `tracer`, and the moment itself [s]
+    known: LaneArray  # (T,) values that depend on the moment, but not on the state
     gauge: LaneArray  # (3N + 2m,) forces to watch, or (0,)
+    stage: Ints  # (1,) of the step, which is being evaluated
     t0: float  # [s]
     T_b: float  # [s]
     knots: Floats  # of the reference motion [s]
@@ -60,16 +64,8 @@ class UnrolledProblem(NamedTuple):
     noise_step: float  # [s]
     noise_r: LaneArray  # (K, 3N)
     noise_v: LaneArray  # (K, 3N)
-    # (5, 8) addresses of each flight's steps, forces, forces at the start, samples, and times; see `lane_steps`
-    kept: Ints
-    points: LaneArray  # (5, n) control points of a step
-    bounds: LaneArray  # (rows of the trail, columns), see `lane_bounds`
-    radius: LaneArray  # (N,) [m]
-    pairs: Ints  # (P, 2) of agents
-    boxes: LaneArray  # (B, 6) obstacles [m]
-    limit: LaneArray  # (N,) of thrust [N]
-    forces: LaneArray  # (2, 3N + 2m) sizes of the forces at the ends of the last two steps
-    moments: Floats  # (2,) when these were [s]
+    samples: Ints  # (8,) addresses of each flight's samples
+    search: Search
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
@@ -93,16 +89,22 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
         The problems have branches that depend on the state, or take different ones.
     """
     first, values = problems[0], numbers(problems)
-    ready = _prepared(
-        first, flight_structure(first, values), values, lambda: FlightTrace(first, values)
-    )
     motion = interleaved(
         [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
     )
+    sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
+    moves = (sizes > _STILL).tolist()
+    description = flight_structure(first, values, moves)
+    ready = _prepared(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
         before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
         **tables._asdict(),
     )  # fmt: skip
+
+
+#: Coefficients of a component of the reference motion that does not move, in metres or radians and seconds: rounding of
+#: a turn about another axis. In 1000 s they would make 1e-15 of it.
+_STILL = 1e-30
 
 
 class Tables(NamedTuple):
@@ -160,13 +162,12 @@ def _prepared(
         simd.pack(np.broadcast_to(values, (len(values), WIDTH))),
     )
     before(given.ctypes.data, uniform.ctypes.data)
-    edges, reference = len(problem.graph.edges), problem.reference
-    none, nobody = simd.empty((0, 1)), simd.empty((0,))
+    reference, none = problem.reference, simd.empty((0, 1))
+    lanes = lambda count: simd.pack(np.zeros((count, WIDTH)))  # noqa: E731
     return UnrolledProblem(
-        address, uniform, simd.pack(np.zeros((edges, WIDTH))), np.zeros(MOMENT),
-        simd.pack(np.zeros((len(code.gauge), WIDTH))), reference.t0, reference.T_b,
-        np.zeros(0), none, 1.0, none, 1.0, none, none, np.zeros((5, WIDTH), dtype=np.int64),
-        none, none, nobody, np.zeros((0, 2), dtype=np.int64), none, nobody, none, np.zeros(2),
+        address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
+        lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,
+        1.0, none, 1.0, none, none, np.zeros(WIDTH, dtype=np.int64), lane_bounds.NO_SEARCH,
     )  # fmt: skip
 
 
@@ -175,42 +176,54 @@ def _prepared(
 _KNOWN: dict[str, tuple[Code, int, Callable[[int, int], None]]] = {}
 
 
+#: What an evaluation of the code does beside the derivative, as bits: the values of the moment, and the gauge.
+OF_MOMENT, OF_GAUGE = 1, 2
+
+
 @intrinsic
 def _call_code(
-    _context, address, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
-):
+    _context, address, wanted, y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v
+):  # fmt: skip
     """Call straight-line code with the data of arrays."""
 
     def generate(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         pointer = ir.DoubleType().as_pointer()
         data = [
             builder.bitcast(context.make_array(kind)(context, builder, value).data, pointer)
-            for kind, value in zip(sig.args[1:], arguments[1:], strict=True)
+            for kind, value in zip(sig.args[2:], arguments[2:], strict=True)
         ]
+        data.append(builder.inttoptr(arguments[1], pointer))
         kind = ir.FunctionType(ir.VoidType(), [pointer] * len(data))
         builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), data)
         return context.get_dummy_value()
 
-    arrays = y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
-    return types.void(types.int64, *arrays), generate
+    arrays = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v
+    return types.void(types.int64, types.int64, *arrays), generate
 
 
 @inlined
 def _closed_loop(t, y, dy, p, w):
-    time = p.time
-    time[0], time[1], time[2] = septic(t, p.t0, p.T_b)
+    time, stage, wanted = p.time, p.stage[0], 0
     piece = gust = noise = 0
-    if p.motion.shape[0] > 0:
-        piece, time[3], _ = piece_at(t, p.knots)
-    if p.gust.shape[0] > 0:
-        gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust.shape[0])
-    if p.noise_r.shape[0] > 0:
-        noise, time[8], time[9], time[10], time[11] = spline_weights(
-            t, p.noise_step, p.noise_r.shape[0]
-        )
+    # The last two stages are at the same moment.
+    if stage == 0 or t != time[MOMENT]:
+        wanted, time[MOMENT] = OF_MOMENT, t
+        time[0], time[1], time[2] = septic(t, p.t0, p.T_b)
+        if p.motion.shape[0] > 0:
+            piece, time[3], _ = piece_at(t, p.knots)
+        if p.gust.shape[0] > 0:
+            gust, time[4], time[5], time[6], time[7] = spline_weights(
+                t, p.gust_step, p.gust.shape[0]
+            )
+        if p.noise_r.shape[0] > 0:
+            noise, time[8], time[9], time[10], time[11] = spline_weights(
+                t, p.noise_step, p.noise_r.shape[0]
+            )
+    if stage == 0 or stage == lane_steps.STAGES - 1:  # the start and the end of a step
+        wanted += OF_GAUGE
     _call_code(
-        p.address, y, dy, p.gauge, p.uniform, p.before, time, p.motion[piece:], p.gust[gust:], p.noise_r[noise:],
-        p.noise_v[noise:],
+        p.address, wanted, y, dy, p.gauge, p.uniform, p.before, time, p.known, p.motion[piece:], p.gust[gust:],
+        p.noise_r[noise:], p.noise_v[noise:],
     )  # fmt: skip
 
 
@@ -220,32 +233,34 @@ integrate = compiled_copy(
 )
 
 
-def _lines(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+def _lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
     """Straight-line code: each copy of `_derivative` has its own."""
     raise NotImplementedError
 
 
-def _derivative(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
-    _lines(y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v)
+def _derivative(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted):
+    _lines(y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted)
 
 
-#: Number of arrays that the code takes.
-_ARRAYS = _derivative.__code__.co_argcount
+#: Number of arrays that the code takes, and ``wanted``, bits in the form of an address.
+_ARGUMENTS = _derivative.__code__.co_argcount
 
 
 def _compile(code: Code, name: str) -> int:
     """Compile straight-line code, or find it compiled on disk; return its address."""
 
     @intrinsic
-    def lines(_context, y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v):
+    def lines(
+        _context, y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
+    ):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             builder.call(_emit(builder.module, code), arguments)
             return context.get_dummy_value()
 
-        arrays = y, dy, gauge, uniform, before, time, motion, gust, noise_r, noise_v
-        return types.void(*arrays), generate
+        given = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
+        return types.void(*given), generate
 
-    return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARRAYS, _lines=lines)
+    return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARGUMENTS, _lines=lines)
 
 
 def _numbers_before(given, uniform):
@@ -310,17 +325,18 @@ def _valued(
 
 
 def _emit(module: ir.Module, code: Code) -> ir.Function:
-    """Write the code as a function of pointers to the arrays of `_derivative`."""
+    """Write the code as a function of the arguments of `_derivative`."""
     pointer = ir.DoubleType().as_pointer()
-    kind = ir.FunctionType(ir.VoidType(), [pointer] * _ARRAYS)
+    kind = ir.FunctionType(ir.VoidType(), [pointer] * _ARGUMENTS)
     function = ir.Function(module, kind, "straight_line")
     function.linkage = "internal"
     function.attributes.add("noinline")
-    for argument in function.args:
+    *arrays, wanted = function.args
+    for argument in arrays:
         argument.add_attribute("noalias")
-    y, dy, gauge, uniform, before, time, *rows = function.args
-    builder = ir.IRBuilder(function.append_basic_block())
+    y, dy, gauge, uniform, before, time, known, *rows = arrays
     inputs = {x.serial: index for index, x in enumerate(code.inputs)}
+    shared = {x.serial: index for index, x in enumerate(code.known)}
 
     def load(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
         match x.operation, *x.arguments:
@@ -335,7 +351,32 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
                 array = {"y": y, "before": before}[operation]
         return builder.load(_element(builder, array, index), align=8)
 
+    def load_known(builder: ir.IRBuilder, x: Symbol) -> ir.Value:
+        if x.serial in shared:
+            return builder.load(_element(builder, known, shared[x.serial]), align=8)
+        return load(builder, x)
+
+    names = "asked", "moment", "state", "gauge", "end"
+    asked, of_moment, of_state, of_gauge, end = map(function.append_basic_block, names)
+    bits = ir.IntType(64)
+
+    def branch(builder: ir.IRBuilder, bit: int, there: ir.Block, otherwise: ir.Block) -> None:
+        found = builder.and_(builder.ptrtoint(wanted, bits), ir.Constant(bits, bit))
+        builder.cbranch(
+            builder.icmp_unsigned("!=", found, ir.Constant(bits, 0)), there, otherwise
+        )
+
+    branch(ir.IRBuilder(asked), OF_MOMENT, of_moment, of_state)
+    builder = ir.IRBuilder(of_moment)
     value = _valued(builder, load, code.inputs)
+    for x in code.moment:
+        value(x)
+    for index, x in enumerate(code.known):
+        builder.store(value(x), _element(builder, known, index), align=8)
+    builder.branch(of_state)
+
+    builder.position_at_end(of_state)
+    value = _valued(builder, load_known, code.inputs + code.known)
     for x in code.lines:
         value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
@@ -347,7 +388,13 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
             for good in whole:
                 found = builder.select(good, found, simd.number(float("nan")))
         builder.store(found, _element(builder, dy, index), align=8)
+    branch(builder, OF_GAUGE, of_gauge, end)
+
+    builder.position_at_end(of_gauge)
+    for x in code.last:
+        value(x)
     for index, x in enumerate(code.gauge):
         builder.store(value(x), _element(builder, gauge, index), align=8)
-    builder.ret_void()
+    builder.branch(end)
+    ir.IRBuilder(end).ret_void()
     return function

@@ -120,6 +120,7 @@ def _coordinates(k, p):
 def advance(k, stage, _a, h, p):
     """As `dopri5.advance`."""
     coordinates = _coordinates(k, p)
+    p.stage[0] = stage
     if stage == 0:
         for q in range(k.shape[1]):
             k[TRIAL, q] = k[STATE, q]
@@ -189,26 +190,18 @@ def _points(k, q, coordinates, h):
 
 @compiled
 def keep_step(t, h, p, w, state):
-    """As `dopri5.keep_step`, for each flight into its own trail."""
-    k, row = state.K, (state.count[5] + state.count[4]) % state.trail.clock.shape[0]
-    n, forces = k.shape[1], p.gauge.shape[0]
-    spread(filled(t), p.kept[4], 2 * row)
-    spread(filled(h), p.kept[4], 2 * row + 1)
-    points = p.points
-    for q in range(n):
+    """As `dopri5.keep_step`, for all flights; `lane_bounds.list_steps` hands them the steps to search."""
+    k, found, rows = state.K, p.search, state.trail.clock.shape[0]
+    row = (state.count[5] + state.count[4]) % rows
+    found.clock[row, 0], found.clock[row, 1] = t, h
+    points = found.points[row]
+    for q in range(k.shape[1]):
         a, b, c, d, e = _points(k, q, _coordinates(k, p), h)
         points[0, q], points[1, q], points[2, q], points[3, q], points[4, q] = a, b, c, d, e
-        place = 5 * n * row + q
-        spread(a, p.kept[0], place)
-        spread(b, p.kept[0], place + n)
-        spread(c, p.kept[0], place + 2 * n)
-        spread(d, p.kept[0], place + 3 * n)
-        spread(e, p.kept[0], place + 4 * n)
-    for g in range(forces):
-        spread(p.gauge[g], p.kept[1], forces * row + g)
-    bound_step(points, p, row)
-    rows = state.trail.clock.shape[0]
-    bound_forces(t + h, p, row, (row + rows - 1) % rows)
+    for g in range(p.gauge.shape[0]):
+        found.gauge[row, g] = p.gauge[g]
+    bound_step(found, row)
+    bound_forces(t + h, found, row, (row + rows - 1) % rows)
     state.count[4] += 1
 
 
@@ -216,8 +209,8 @@ def keep_step(t, h, p, w, state):
 def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
     for g in range(p.gauge.shape[0]):
-        spread(p.gauge[g], p.kept[2], g)
-    begin_forces(state.clock[0], p)
+        spread(p.gauge[g], p.search.trails[2], g)
+    begin_forces(state.clock[0], p.gauge, p.search)
 
 
 @compiled
@@ -232,7 +225,7 @@ def keep_samples(t, h, t_new, times, samples, p, state):
             a, b, c, d, e = _points(k, q, _coordinates(k, p), h)
             value = (z * z) * ((z * z) * a + (4.0 * x * z) * b + (6.0 * x * x) * c)
             value += (x * x * x) * ((4.0 * z) * d + x * e)
-            spread(value, p.kept[3], n * count[3] + q)
+            spread(value, p.samples, n * count[3] + q)
         count[3] += 1
 
 

@@ -10,7 +10,7 @@ computations. Whatever depends on masses and gains alone is computed before the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import attrgetter
 from types import FunctionType, SimpleNamespace
 from typing import Any
@@ -223,8 +223,12 @@ class Trace:
     def _angle(self, x: Any) -> Any:
         """The square of an angle [rad], which must not be too wide for the series."""
         xx = x * x
-        self.positive.append(self.subtract(_WIDEST, xx))
+        self._not_too_wide(xx)
         return xx
+
+    def _not_too_wide(self, xx: Any) -> None:
+        if isinstance(xx, Symbol):
+            self.positive.append(self.subtract(_WIDEST, xx))
 
     def _sine(self, x: Any) -> Any:
         return x * self._series(self._angle(x), 1) if isinstance(x, Symbol) else math.sin(x)
@@ -234,7 +238,7 @@ class Trace:
 
     def _rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
         """As `control.rate_factors`, without its branch."""
-        self.positive.append(self.subtract(_WIDEST, xx))
+        self._not_too_wide(xx)
         a, b = self._series(xx, 2), self._series(xx, 3)
         twice = s + s
         return a, b, twice * self._series(xx, 2, 1), twice * self._series(xx, 3, 1)
@@ -286,18 +290,19 @@ class Trace:
         return rebuilt(function)
 
 
-#: Numbers in which the problems of eight flights may differ, and arrays of numbers; those of the law, and the slots'
-#: turn, are left out of the code where they are zero in all.
+#: Numbers in which the problems of eight flights may differ, and arrays of numbers. Those of the last lines are left
+#: out of the code where they are zero in all.
 _NUMBERS = (
-    "vehicles.M", "vehicles.mean", "vehicles.g", "control.k1", "control.k2", "law.alpha", "law.beta", "law.gamma",
-    "law.mu", "law.k_def",
+    "vehicles.M", "vehicles.mean", "vehicles.g", "control.k1", "control.k2", "law.alpha",
+    "law.beta", "law.gamma", "law.mu", "law.k_def",
 )  # fmt: skip
 _ARRAYS = (
     "vehicles.m", "vehicles.inverse", "vehicles.thrust_limit", "graph.weight", "graph.diagonal", "reference.d0",
-    "reference.d1", "reference.p0", "reference.dp", "motion.T1", "control.force", "disturbance.m",
-    "disturbance.inverse", "disturbance.drag", "disturbance.wind", "reference.turn",
+    "reference.d1", "reference.p0", "motion.T1", "control.force", "disturbance.m", "disturbance.inverse",
+    "disturbance.drag", "disturbance.wind",
+    "reference.dp", "reference.turn",
 )  # fmt: skip
-_MAY_BE_ZERO = (*_NUMBERS[5:], "reference.turn")
+_MAY_BE_ZERO = {*_NUMBERS[-4:], *_ARRAYS[-2:]}
 _numbers_of, _arrays_of = attrgetter(*_NUMBERS), attrgetter(*_ARRAYS)
 
 
@@ -316,6 +321,7 @@ class FlightTrace(Trace):
     ----------
     problem : one of them
     values : (U, B) `numbers` of all of them
+    moves : for each component of the reference motion, whether it is not zero in all of them
 
     Raises
     ------
@@ -323,8 +329,8 @@ class FlightTrace(Trace):
         The problem has branches that depend on the state.
     """
 
-    def __init__(self, problem: Problem, values: Floats) -> None:
-        self._values = values
+    def __init__(self, problem: Problem, values: Floats, moves: Sequence[bool]) -> None:
+        self._values, self._moves = values, moves
         super().__init__(problem)
 
     def known_positive(self, x: Symbol) -> bool:
@@ -333,19 +339,18 @@ class FlightTrace(Trace):
 
     def _with_symbols(self, problem: Problem) -> Problem:
         parts: dict[str, dict[str, Any]] = {}
-        index = 0
-        given = zip(
-            (*_NUMBERS, *_ARRAYS), (*_numbers_of(problem), *_arrays_of(problem)), strict=True
-        )
-        for name, x in given:
-            shape, size = np.shape(x), np.size(x)
-            zero = name in _MAY_BE_ZERO and not self._values[index : index + size].any()
-            made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(size)]
+        there = _there(problem, self._values)
+        for name, index, x in _places(problem):
+            zero = not there.get(name, True)
+            made = [
+                0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))
+            ]
             part, field = name.split(".")
-            found = np.array(made, dtype=object).reshape(shape)
-            parts.setdefault(part, {})[field] = found if shape else found.item()
-            index += size
-        parts["motion"]["coefficients"] = self._table(MOTION, (1, 6, 6))
+            found = np.array(made, dtype=object).reshape(np.shape(x))
+            parts.setdefault(part, {})[field] = found if np.ndim(x) else found.item()
+        motion = self._table(MOTION, (1, 6, 6))
+        motion[:, [not moving for moving in self._moves]] = 0.0
+        parts["motion"]["coefficients"] = motion
         for name, which in (("gust", GUSTS), ("noise_r", NOISE_R), ("noise_v", NOISE_V)):
             rows, *shape = getattr(problem.disturbance, name).shape
             parts["disturbance"][name] = self._table(which, (4 if rows else 0, *shape))
@@ -368,7 +373,25 @@ class FlightTrace(Trace):
         return values[np.argsort(places)].tolist()
 
 
-def flight_structure(problem: Problem, values: Floats) -> bytes:
+def _places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
+    """Name, place among `numbers` and value of each number, and of each array of numbers."""
+    index = 0
+    given = (*_numbers_of(problem), *_arrays_of(problem))
+    for name, x in zip((*_NUMBERS, *_ARRAYS), given, strict=True):
+        yield name, index, x
+        index += np.size(x)
+
+
+def _there(problem: Problem, values: Floats) -> dict[str, bool]:
+    """Whether numbers that may be zero are not zero in all of eight problems."""
+    return {
+        name: bool(values[index : index + np.size(x)].any())
+        for name, index, x in _places(problem)
+        if name in _MAY_BE_ZERO
+    }
+
+
+def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) -> bytes:
     """Everything that the code of a `FlightTrace` depends on.
 
     Raises
@@ -380,8 +403,7 @@ def flight_structure(problem: Problem, values: Floats) -> bytes:
     damps = values[_NUMBERS.index("law.k_def")].astype(bool)
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
-    of_law = values[len(_NUMBERS) - len(_MAY_BE_ZERO) + 1 : len(_NUMBERS)]
-    there = [bool(x.any()) for x in (*of_law, values[-3:])]
+    there = [*_there(problem, values).values(), *moves]
     kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
     tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
@@ -400,30 +422,36 @@ class Code:
     gauge : (3N + 2m,) symbols or numbers, or none
     coordinates : number of coordinates of positions, whose derivatives, the first outputs, are velocities
     positive : symbols that have to be positive
-    before : symbols that depend on the problem's numbers alone, each after its arguments
-    inputs : (U,) those of them that the lines use
-    lines : symbols computed in flight, each after its arguments
+    before : symbols that depend on the problem's numbers alone
+    inputs : (U,) those of them that are needed in flight
+    moment : symbols that depend on the time, but not on the state
+    known : (T,) those of them, and sources, that lines for the state need
+    lines : symbols computed for each state
+    last : symbols for the gauge alone
+
+    Lists of symbols to compute hold each of them after its arguments.
     """
 
     def __init__(self, trace: Trace) -> None:
         self.outputs, self.coordinates = trace.outputs, trace.coordinates
         self.gauge = trace.gauge
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
-        self.lines: list[Symbol] = []
-        self.before: list[Symbol] = []
         self._seen: set[int] = set()
-        for x in (*self.positive, *self.outputs, *self.gauge):
-            self._need(x)
-        self.lines = sorted(
-            (x for x in self.lines if x.operation not in SOURCES), key=lambda x: x.serial
-        )
-        used = [x for line in self.lines for x in line.arguments] + self.outputs + self.gauge
-        inputs = [x for x in used if isinstance(x, Symbol) and x.known == UNIFORM]
-        self.inputs = list({x.serial: x for x in inputs}.values())
+        needed = self._needed([*self.positive, *self.outputs])
+        last = self._needed(self.gauge)
+        self.before = [x for x in needed + last if x.known == UNIFORM]
+        self.moment = _computed(x for x in needed + last if UNIFORM < x.known < STATE)
+        self.lines = _computed(x for x in needed if x.known == STATE)
+        self.last = _computed(x for x in last if x.known == STATE)
+        of_state = [x for line in self.lines + self.last for x in line.arguments]
+        of_state += self.outputs + self.gauge + self.positive
+        self.known = _distinct(of_state, range(FLIGHT, STATE))
+        used = of_state + [x for line in self.moment for x in line.arguments]
+        self.inputs = _distinct(used, range(UNIFORM, FLIGHT))
 
-    def _need(self, wanted: Any) -> None:
-        """List everything that a symbol needs, without recursion, because chains are long."""
-        stack = [wanted]
+    def _needed(self, wanted: Sequence[Any]) -> list[Symbol]:
+        """Everything new that symbols need, each after its arguments; without recursion, because chains are long."""
+        found, stack = [], list(wanted[::-1])
         while stack:
             x = stack.pop()
             if not isinstance(x, Symbol) or x.serial in self._seen:
@@ -435,7 +463,19 @@ class Code:
                 stack += [x, *missing]
                 continue
             self._seen.add(x.serial)
-            (self.before if x.known == UNIFORM else self.lines).append(x)
+            found.append(x)
+        return found
+
+
+def _computed(symbols: Iterable[Symbol]) -> list[Symbol]:
+    """Those that are no sources, in the order in which the kernel computes them."""
+    return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
+
+
+def _distinct(values: Iterable[Any], known: range) -> list[Symbol]:
+    """The different symbols among values of which so much is known."""
+    found = (x for x in values if isinstance(x, Symbol) and x.known in known)
+    return list({x.serial: x for x in found}.values())
 
 
 def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
