@@ -393,7 +393,9 @@ def straight_line(mission: Mission) -> int:
     now = PhaseState(0.0, r, np.zeros_like(r))
     code = Code(Trace(plan_phase(mission, mission.phases[0], now).problem))
     # The last two of seven stages are at the same moment.
-    return len(code.moment) * 6 // 7 + len(code.lines) + share_of_a_step(mission, stages=7, weights=34)
+    return (
+        len(code.moment) * 6 // 7 + len(code.lines) + share_of_a_step(mission, stages=7, weights=34)
+    )
 
 
 def bound() -> float:

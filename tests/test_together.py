@@ -8,10 +8,11 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.kernel.compiler.simd import empty, pack, unpack
-from rigidfleet.kernel.engine import batch, codegen, native
-from rigidfleet.kernel.engine.tracer import UnfitError
+from rigidfleet.kernel.engine import batch, codegen, lane_bounds, lane_steps, native
+from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, numbers
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.problem import Problem, workspace
+from rigidfleet.kernel.records import ANY_STEP, LISTED
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
 from rigidfleet.simulation import together
@@ -212,7 +213,10 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
     ready = codegen.unrolled_together(problems, tables)
     random = np.random.default_rng(0)
     begin, end = plans[0][0].start, plans[0][0].t_end
-    for t in (begin, 0.7 * begin + 0.3 * end, end):
+    middle = 0.7 * begin + 0.3 * end
+    # The last stage of a step is at the moment of the one before.
+    for t, stage in ((begin, 0), (middle, 0), (middle, lane_steps.STAGES - 1), (end, 0)):
+        ready.stage[0] = stage
         y = np.array([state + 0.1 * random.normal(size=state.size) for _, state in plans])
         dy = pack(np.zeros_like(y.T))
         call(ready, pack(y.T), dy, t)
@@ -248,8 +252,8 @@ def test_arrays_of_eight_flights_become_lanes():
     assert empty((3, 2)).ctypes.data % 64 == 0
 
 
-def test_marks_of_a_phase_side_by_side_do_not_outlast_it():
-    """A phase that is flown alone later finds no step marked: it searches all of them."""
+def test_lists_of_a_phase_side_by_side_do_not_outlast_it():
+    """A phase that is flown alone later searches all of its steps."""
     flights = [Flight(mission) for mission in varied("narrow-passage", folding, 2)]
     for _ in range(3):
         for flight in flights:
@@ -261,16 +265,27 @@ def test_marks_of_a_phase_side_by_side_do_not_outlast_it():
             flight.arrive()
         for phase in phases:
             monitor = phase.extremes.monitor.monitor
-            assert len(monitor.quiet) == len(phase.state.trail.clock)
-            assert not monitor.quiet.any()
-            assert not monitor.calm.any()
+            assert monitor.listed.shape == (2, len(phase.state.trail.clock))
+            assert monitor.flags[LISTED:].tolist() == [ANY_STEP, ANY_STEP]
+
+
+def all_listed(search: Any, first: int, steps: range, monitors: Any) -> None:
+    """Hand all steps over to the monitors."""
+    before = lane_bounds.unpack(search.bounds).copy()
+    lane_bounds.unpack(search.bounds)[:, : lane_bounds.FIRST_FORCE] = -1e50
+    lane_bounds.unpack(search.bounds)[:, lane_bounds.FIRST_FORCE :] = 1e50
+    list_steps(search, first, steps, monitors)
+    lane_bounds.unpack(search.bounds)[:] = before
+
+
+list_steps = lane_bounds.list_steps
 
 
 def test_steps_that_are_left_out_hold_nothing_worse(monkeypatch):
     """Extremes of all phases are those of a search of every step: distances to 1e-9 m, forces to 1e-3 in noise."""
     missions = varied("windy-passage", windy)
     few = simulate_together(missions)
-    monkeypatch.setattr(batch.lane_bounds, "mark_quiet", lambda *_: None)
+    monkeypatch.setattr(lane_bounds, "list_steps", all_listed)
     for one, other in zip(few, simulate_together(missions), strict=True):
         for phase, whole in zip(one.phases, other.phases, strict=True):
             assert phase.extremes.keys() == whole.extremes.keys()
@@ -281,17 +296,34 @@ def test_steps_that_are_left_out_hold_nothing_worse(monkeypatch):
                 assert found.value == pytest.approx(expected, abs=close)
 
 
-def test_few_steps_are_searched():
-    """In calm and in noise most steps are marked, or the search would take as long as the flight."""
-    marked = [0, 0]
+def test_few_steps_are_searched(monkeypatch):
+    """In wind and noise few steps are listed, or the search would take as long as the flight."""
+    steps, listed = 0, np.zeros(2)
 
-    def counted(bounds: Any, rows: np.ndarray, monitors: Any) -> None:
-        original(bounds, rows, monitors)
-        marked[0] += len(rows) * len(monitors)
-        marked[1] += sum(int(m.quiet[rows].sum()) for m in monitors)
+    def counted(search: Any, first: int, new: range, monitors: Any) -> None:
+        nonlocal steps, listed
+        list_steps(search, first, new, monitors)
+        steps += len(new) * len(monitors)
+        listed += sum(m.flags[LISTED:] for m in monitors)
 
-    original = batch.lane_bounds.mark_quiet
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch.lane_bounds, "mark_quiet", counted)
-        simulate_together(varied("windy-passage", windy))
-    assert marked[1] > 0.7 * marked[0]
+    monkeypatch.setattr(lane_bounds, "list_steps", counted)
+    simulate_together(varied("windy-passage", windy))
+    assert (0 < listed).all()
+    assert (listed < 0.1 * steps).all()
+
+
+def test_components_that_do_not_move_are_left_out():
+    """A flight straight on needs fewer operations than one that turns; one whose shape rests, fewer than a reshaping."""
+    flight = Flight(load_mission("windy-passage"))
+    sizes = []
+    for _ in range(9):
+        flight.begin()
+        p = flight.plan.problem
+        values = numbers([p])
+        moves = np.abs(p.motion.coefficients).max(axis=(0, 2)) > 0.0
+        sizes.append(len(Code(FlightTrace(p, values, moves.tolist())).moment))
+        flight.advance()
+    establish, straight, turning, *_ = sizes
+    fold = sizes[6]
+    assert straight < establish < fold
+    assert straight < 0.6 * turning < 0.6 * fold

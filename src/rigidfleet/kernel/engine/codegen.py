@@ -362,9 +362,7 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
 
     def branch(builder: ir.IRBuilder, bit: int, there: ir.Block, otherwise: ir.Block) -> None:
         found = builder.and_(builder.ptrtoint(wanted, bits), ir.Constant(bits, bit))
-        builder.cbranch(
-            builder.icmp_unsigned("!=", found, ir.Constant(bits, 0)), there, otherwise
-        )
+        builder.cbranch(builder.icmp_unsigned("!=", found, ir.Constant(bits, 0)), there, otherwise)
 
     branch(ir.IRBuilder(asked), OF_MOMENT, of_moment, of_state)
     builder = ir.IRBuilder(of_moment)

@@ -342,9 +342,7 @@ class FlightTrace(Trace):
         there = _there(problem, self._values)
         for name, index, x in _places(problem):
             zero = not there.get(name, True)
-            made = [
-                0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))
-            ]
+            made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))]
             part, field = name.split(".")
             found = np.array(made, dtype=object).reshape(np.shape(x))
             parts.setdefault(part, {})[field] = found if np.ndim(x) else found.item()
