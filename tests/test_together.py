@@ -308,12 +308,12 @@ def test_few_steps_are_searched(monkeypatch):
 
     monkeypatch.setattr(lane_bounds, "list_steps", counted)
     simulate_together(varied("windy-passage", windy))
-    assert (0 < listed).all()
+    assert (listed > 0).all()
     assert (listed < 0.1 * steps).all()
 
 
 def test_components_that_do_not_move_are_left_out():
-    """A flight straight on needs fewer operations than one that turns; one whose shape rests, fewer than a reshaping."""
+    """A flight straight on needs fewer operations than one that turns, and a shape at rest fewer than a reshaping."""
     flight = Flight(load_mission("windy-passage"))
     sizes = []
     for _ in range(9):

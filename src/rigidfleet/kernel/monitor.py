@@ -671,8 +671,8 @@ def watch(p, w, state, monitor):
     because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail. With 3 for ``flags[2]``, nothing is
     monitored: the first step's bounds are computed (`bound_moves`).
 
-    ``flags[LISTED]`` and the next one are the numbers of steps in ``monitor.listed`` that alone can hold worse distances
-    and forces, or `ANY_STEP`. Lists count once. That of forces has the first and the last step of the trail.
+    ``flags[LISTED]`` and the next one are the numbers of steps in ``monitor.listed`` that alone can hold worse
+    distances and forces, or `ANY_STEP`. Lists count once. That of forces has the first and the last step of the trail.
     """
     trail, flags = state.trail, monitor.flags
     if flags[2] == 3:

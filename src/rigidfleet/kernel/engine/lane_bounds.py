@@ -92,7 +92,7 @@ NO_SEARCH = Search(
 
 
 def search(monitors: Sequence[Monitor], trails: Sequence[Trail], clock: Floats) -> Search:
-    """A search of eight flights with monitors for the same pairs, and trails of the same size; with a clock (rows, 2)."""
+    """A search of eight flights: of monitors for the same pairs and trails of the same size, with a clock (rows, 2)."""
     (rows, _, n), (_, forces) = trails[0].points.shape, trails[0].gauge.shape
     lanes = lambda name: pack(np.stack([getattr(x, name) for x in monitors], axis=-1))  # noqa: E731
     names = "points", "gauge", "start", "clock"
@@ -128,7 +128,7 @@ def _outside(below, above):
 
 @inlined
 def _keep(out, least, c, bound, end):
-    """Write the bound of a distance over a step, at whose end it is ``end``; far, if an earlier step has come as near."""
+    """Write the bound of a distance over a step, ``end`` at its end; far, if an earlier step has come as near."""
     before = least[c]
     out[c] = where_positive(bound - (before - _SAME), filled(_FAR), bound)
     least[c] = min(before, end)
