@@ -1,5 +1,7 @@
 """Content of a sample: forces and references at a state."""
 
+import math
+
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.dynamics import closed_loop
@@ -16,6 +18,14 @@ def copy(a, out):
 
 
 @compiled
+def unknown(out):
+    """Write NaN into a two-dimensional array."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = math.nan
+
+
+@compiled
 def record(times, samples, p, w, dy, out, first):
     """Evaluate the closed loop at the sampled states, and record its forces and references from row ``first`` on.
 
@@ -29,7 +39,8 @@ def record(times, samples, p, w, dy, out, first):
 
 @compiled
 def record_sample(t, p, w, k, out):
-    """Copy the values of the closed loop at time t [s] from the workspace into row k of a record."""
+    """Copy the values of the closed loop at time t [s] from the workspace into row k of a record; NaN, if there is none.
+    """
     kind = p.control.kind
     find_multipliers(p.graph)
     for i in range(w.c.shape[0]):
@@ -41,24 +52,36 @@ def record_sample(t, p, w, k, out):
     copy(w.f_E, out.f_E[k])
     copy(w.f_u, out.f_u[k])
     copy(w.f_C, out.f_C[k])
-    if p.disturbance.active:
-        copy(w.f_D, out.f_D[k])
+    if out.f_D.shape[0] > 0:
+        if p.disturbance.active:
+            copy(w.f_D, out.f_D[k])
+        else:
+            unknown(out.f_D[k])
         if p.disturbance.noise_r.shape[0] > 0:
             copy(w.r_seen, out.r_seen[k])
             copy(w.v_seen, out.v_seen[k])
+        else:
+            unknown(out.r_seen[k])
+            unknown(out.v_seen[k])
     for q in range(6):
         out.wrench[k, q] = w.wrench[q]
     # Even if only distances are blended, the slots give the formation's attitude.
     blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     copy(w.p, out.p[k])
-    if kind != OPEN:
+    if kind == OPEN:
+        unknown(out.T_ref[k])
+    else:
         copy(w.T_ref, out.T_ref[k])
     if kind == TRACKING:
         copy(w.r_ref, out.r_ref[k])
         for q in range(3):
             out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
             out.rates[k, q] = w.body[3, q]
-    elif kind == BODY:
+        return
+    unknown(out.r_ref[k])
+    for q in range(3):
+        out.motion[k, q] = out.motion[k, 3 + q] = out.rates[k, q] = math.nan
+    if kind == BODY:
         since = t - p.feedback.arrival
         for q in range(3):
             out.motion[k, q] = p.feedback.r[q] + p.feedback.v[q] * since

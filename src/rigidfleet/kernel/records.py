@@ -214,16 +214,13 @@ class Record(NamedTuple):
 
 
 def recorder(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
-    """Allocate a record of ``k`` samples, NaN where the kernel does not write in every phase.
+    """Allocate a record of ``k`` samples, to be written.
 
     Unless ``disturbed``, there are no rows of what disturbances alone give.
     """
     agent, edge, given = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
     shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(given,) * 3
-    out = Record._make([np.empty(shape) for shape in shapes])
-    for values in (out.r_ref, out.motion, out.rates, out.T_ref, out.r_seen, out.v_seen, out.f_D):
-        values.fill(np.nan)
-    return out
+    return Record._make([np.empty(shape) for shape in shapes])
 
 
 class Recursion(NamedTuple):
