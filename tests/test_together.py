@@ -209,10 +209,10 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
         plans.append((flight.plan, flight.plan.state()))
     problems = [plan.problem for plan, _ in plans]
     assert batch.fit_together(problems)
-    tables = codegen.tables([p.disturbance for p in problems])
+    begin, end = plans[0][0].start, plans[0][0].t_end
+    tables = codegen.Tables([p.disturbance for p in problems]).between(begin, end)
     ready = codegen.unrolled_together(problems, tables)
     random = np.random.default_rng(0)
-    begin, end = plans[0][0].start, plans[0][0].t_end
     middle = 0.7 * begin + 0.3 * end
     # The last stage of a step is at the moment of the one before.
     for t, stage in ((begin, 0), (middle, 0), (middle, lane_steps.STAGES - 1), (end, 0)):
@@ -240,7 +240,7 @@ def test_problems_that_branch_differently_share_no_code():
         problems.append(p._replace(law=p.law._replace(k_def=0.0)) if k == 3 else p)
     assert batch.fit_together(problems)
     with pytest.raises(UnfitError):
-        codegen.unrolled_together(problems, codegen.tables([p.disturbance for p in problems]))
+        codegen.unrolled_together(problems, {})
 
 
 def test_arrays_of_eight_flights_become_lanes():

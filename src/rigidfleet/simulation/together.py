@@ -93,11 +93,9 @@ def _kind(phase: ActivePhase) -> tuple[object, ...]:
 
 def _vector(active: Sequence[ActivePhase]) -> Vector:
     """A vector for flights whose first phases these are."""
-    from rigidfleet.kernel.engine import batch, codegen
+    from rigidfleet.kernel.engine import batch
 
-    return batch.Vector(
-        codegen.tables(_filled([phase.plan.problem.disturbance for phase in active]))
-    )
+    return batch.Vector(_filled([phase.plan.problem.disturbance for phase in active]))
 
 
 def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
@@ -112,6 +110,7 @@ def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
             _filled([stretch.problem for stretch in stretches]),
             _filled([phase.state for phase in active]),
             _filled([phase.extremes.monitor.monitor for phase in active]),
+            t_end,
             times,
             _filled([stretch.samples for stretch in stretches]),
         )
@@ -119,7 +118,7 @@ def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
         return False
     status = records.PAUSED
     while status == records.PAUSED:
-        status = vector(t_end, _STEPS)
+        status = vector(_STEPS)
         if status == records.PAUSED:
             for phase in active:
                 phase.watch(last=False)

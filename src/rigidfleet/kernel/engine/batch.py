@@ -164,11 +164,11 @@ class Vector:
 
     Parameters
     ----------
-    given : tables of the flights' disturbances
+    given : disturbances of the flights
     """
 
-    def __init__(self, given: Tables) -> None:
-        self._given = given
+    def __init__(self, given: Sequence[Disturbance]) -> None:
+        self._tables = Tables(given)
         self._trails: list[Trail] = []
 
     def begin(
@@ -176,10 +176,11 @@ class Vector:
         problems: Sequence[Problem],
         states: Sequence[IntegratorState],
         monitors: Sequence[Monitor],
+        t_end: float,
         times: Floats,
         samples: Sequence[Floats],
     ) -> None:
-        """Begin a phase.
+        """Begin a phase that ends at ``t_end`` [s].
 
         Parameters
         ----------
@@ -193,13 +194,14 @@ class Vector:
         UnfitError
             The problems take different branches.
         """
-        self._states, self._monitors, self._times = states, monitors, times
+        self._states, self._monitors, self._t_end, self._times = states, monitors, t_end, times
         if len(self._trails) != len(states) or any(
             state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
         ):
             self._allocate()
         limits = [np.minimum(p.vehicles.thrust_limit, _NO_LIMIT) for p in problems]
-        ready = unrolled_together(_alike(problems), self._given)
+        tables = self._tables.between(float(states[0].clock[0]), t_end)
+        ready = unrolled_together(_alike(problems), tables)
         found = self._search._replace(limit=packed(limits))
         lane_bounds.begin(found, monitors)
         places = np.array([x.ctypes.data for x in samples])
@@ -222,13 +224,13 @@ class Vector:
         self._length = NO_TRAIL._replace(clock=np.empty((rows, 2)))
         self._search = lane_bounds.search(monitors, trails, self._length.clock)
 
-    def __call__(self, t_end: float, max_steps: int) -> int:
-        """Go on to ``t_end`` [s]; return what `dopri5.integrate` returns. States, trails and samples are then known."""
+    def __call__(self, max_steps: int) -> int:
+        """Go on to the end of the phase; return what `dopri5.integrate` returns. States, trails and samples are then known."""
         state = self._state
         state.count[4:] = self._states[0].count[4:]
         before = int(state.count[4])
         status = fly_on(
-            self._problem, state, t_end, self._fresh, self._times, _UNSAMPLED, max_steps
+            self._problem, state, self._t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
         self._fresh = False
         y = unpack(state.y)

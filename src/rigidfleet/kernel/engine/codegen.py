@@ -59,9 +59,14 @@ class UnrolledProblem(NamedTuple):
     T_b: float  # [s]
     knots: Floats  # of the reference motion [s]
     motion: LaneArray  # (pieces, 36) its coefficients
+    # Rows of gusts and noise that count in the phase, the first of them, and the number of all: see `Tables`.
     gust_step: float  # [s]
+    gust_first: int
+    gust_rows: int
     gust: LaneArray  # (K, 3N)
     noise_step: float  # [s]
+    noise_first: int
+    noise_rows: int
     noise_r: LaneArray  # (K, 3N)
     noise_v: LaneArray  # (K, 3N)
     samples: Ints  # (8,) addresses of each flight's samples
@@ -80,8 +85,8 @@ def unrolled(problem: Problem) -> UnrolledProblem:
     return _prepared(problem, description, values[:, None], lambda: Trace(problem))
 
 
-def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledProblem:
-    """Prepare eight problems, which `batch.fit_together`, of one flight each; with their tables of disturbances.
+def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
+    """Prepare eight problems, which `batch.fit_together`, of one flight each; with rows of their `Tables`.
 
     Raises
     ------
@@ -98,7 +103,7 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
     ready = _prepared(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
         before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
-        **tables._asdict(),
+        **tables,
     )  # fmt: skip
 
 
@@ -107,27 +112,44 @@ def unrolled_together(problems: Sequence[Problem], tables: Tables) -> UnrolledPr
 _STILL = 1e-30
 
 
-class Tables(NamedTuple):
-    """Gusts and noise of eight flights, as in `UnrolledProblem`."""
+class Tables:
+    """Gusts and noise of eight flights, of which a phase needs some rows.
 
-    gust_step: float
-    gust: LaneArray
-    noise_step: float
-    noise_r: LaneArray
-    noise_v: LaneArray
+    These rows alone become lanes, in the same memory for each phase: they stay in the cache while it is flown.
+    """
+
+    def __init__(self, given: Sequence[Disturbance]) -> None:
+        self._given, first = given, given[0]
+        self._steps = {"gust": first.gust_step, "noise": first.noise_step}
+        self._whole = {
+            name: [np.ascontiguousarray(getattr(x, name)) for x in given] for name in _TABLES
+        }
+        self._addresses = {name: _addresses(parts) for name, parts in self._whole.items()}
+        self._lanes = dict.fromkeys(_TABLES, simd.empty((0,)))
+
+    def between(self, begin: float, end: float) -> dict[str, Any]:
+        """Fields of an `UnrolledProblem` for a phase from ``begin`` to ``end`` [s]."""
+        fields: dict[str, Any] = {}
+        for name, (parts, *_) in self._whole.items():
+            rows, agents, _ = parts.shape
+            kind = name.split("_")[0]
+            step = self._steps[kind]
+            # A row more on both sides than counts by `spline_weights`, whose rounding is not looked at here.
+            first = max(min(int(begin / step) - 1, rows - 4), 0)
+            count = min(int(end / step) + 5, rows) - first
+            made = self._room(name, count * 3 * agents)
+            _interleave(self._addresses[name], first * 3 * agents, made)
+            fields |= {f"{kind}_step": step, f"{kind}_first": first, f"{kind}_rows": rows}
+            fields[name] = made.reshape(count, 3 * agents)
+        return fields
+
+    def _room(self, name: str, size: int) -> LaneArray:
+        if len(self._lanes[name]) < size:
+            self._lanes[name] = simd.empty((size,))
+        return self._lanes[name][:size]
 
 
-def tables(given: Sequence[Disturbance]) -> Tables:
-    """The tables of the disturbances of eight flights."""
-
-    def table(name: str) -> LaneArray:
-        parts = [getattr(x, name) for x in given]
-        rows, agents, _ = parts[0].shape
-        return interleaved(parts, (rows, 3 * agents))
-
-    return Tables(
-        given[0].gust_step, table("gust"), given[0].noise_step, table("noise_r"), table("noise_v")
-    )
+_TABLES = "gust", "noise_r", "noise_v"
 
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
@@ -139,14 +161,18 @@ def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
     """Lanes of eight large arrays, in C order, as an array of some shape."""
     parts = [np.ascontiguousarray(x) for x in parts]
     made = simd.empty(shape)
-    _interleave(np.array([x.ctypes.data for x in parts]), made.reshape(-1))
+    _interleave(_addresses(parts), 0, made.reshape(-1))
     return made
 
 
+def _addresses(arrays: Sequence[Floats]) -> Ints:
+    return np.array([x.ctypes.data for x in arrays])
+
+
 @compiled
-def _interleave(addresses, made):
+def _interleave(addresses, first, made):
     for k in range(made.shape[0]):
-        made[k] = collected(addresses, k)
+        made[k] = collected(addresses, first + k)
 
 
 def _prepared(
@@ -167,7 +193,7 @@ def _prepared(
     return UnrolledProblem(
         address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
         lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,
-        1.0, none, 1.0, none, none, np.zeros(WIDTH, dtype=np.int64), lane_bounds.NO_SEARCH,
+        1.0, 0, 0, none, 1.0, 0, 0, none, none, np.zeros(WIDTH, dtype=np.int64), lane_bounds.NO_SEARCH,
     )  # fmt: skip
 
 
@@ -212,13 +238,13 @@ def _closed_loop(t, y, dy, p, w):
         if p.motion.shape[0] > 0:
             piece, time[3], _ = piece_at(t, p.knots)
         if p.gust.shape[0] > 0:
-            gust, time[4], time[5], time[6], time[7] = spline_weights(
-                t, p.gust_step, p.gust.shape[0]
-            )
+            gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust_rows)
+            gust -= p.gust_first
         if p.noise_r.shape[0] > 0:
             noise, time[8], time[9], time[10], time[11] = spline_weights(
-                t, p.noise_step, p.noise_r.shape[0]
+                t, p.noise_step, p.noise_rows
             )
+            noise -= p.noise_first
     if stage == 0 or stage == lane_steps.STAGES - 1:  # the start and the end of a step
         wanted += OF_GAUGE
     _call_code(
