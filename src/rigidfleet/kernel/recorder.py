@@ -39,8 +39,7 @@ def record(times, samples, p, w, dy, out, first):
 
 @compiled
 def record_sample(t, p, w, k, out):
-    """Copy the values of the closed loop at time t [s] from the workspace into row k of a record; NaN, if there is none.
-    """
+    """Copy the values of the closed loop at time t [s] from the workspace into row k of a record; NaN for none."""
     kind = p.control.kind
     find_multipliers(p.graph)
     for i in range(w.c.shape[0]):

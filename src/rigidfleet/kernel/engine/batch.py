@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
@@ -143,10 +144,15 @@ def fit_together(problems: Sequence[Problem]) -> bool:
         and x.control.kind == first.control.kind
         and _blend(x.reference) == _blend(first.reference)
         and _tables(x.disturbance) == _tables(first.disturbance)
-        and np.array_equal(x.graph.edges, first.graph.edges)
-        and np.array_equal(x.motion.knots, first.motion.knots)
+        and _same(x.graph.edges, first.graph.edges)
+        and _same(x.motion.knots, first.motion.knots)
         for x in problems
     )
+
+
+def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Whether two small arrays have the same numbers, of one kind."""
+    return a is b or (a.shape == b.shape and a.tobytes() == b.tobytes())
 
 
 def _blend(reference: Reference) -> tuple[int, float, float]:
@@ -225,7 +231,10 @@ class Vector:
         self._search = lane_bounds.search(monitors, trails, self._length.clock)
 
     def __call__(self, max_steps: int) -> int:
-        """Go on to the end of the phase; return what `dopri5.integrate` returns. States, trails and samples are then known."""
+        """Go on to the end of the phase; return what `dopri5.integrate` returns.
+
+        States and samples are then known, and the steps that monitors have to search.
+        """
         state = self._state
         state.count[4:] = self._states[0].count[4:]
         before = int(state.count[4])

@@ -267,8 +267,20 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
             for near, x in zip(nearest, monitors, strict=True)
         ]
     )
-    _list(s, first, steps.start, steps.stop, landed, limits, margins, unpack(margins), found, count)
-    _hand_over(s, unpack(s.points), unpack(s.gauge), first, steps.stop, found, count)
+    _list(
+        s,
+        first,
+        steps.start,
+        steps.stop,
+        landed,
+        limits,
+        margins,
+        unpack(margins),
+        found,
+        count,
+        unpack(s.points),
+        unpack(s.gauge),
+    )
     for lane, monitor in enumerate(monitors):
         distances, forces = count[lane].tolist()
         monitor.listed[0, :distances] = found[lane, 0, :distances]
@@ -277,11 +289,34 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
 
 
 @compiled
-def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count):
+def _hand_over(s, points, gauge, first, stop, found, count):
+    """Write into each flight's trail its listed steps, and what a search for forces asks of their neighbours."""
+    rows, states, forces = s.bounds.shape[0], points.shape[2], gauge.shape[1]
+    for lane in range(found.shape[0]):
+        trail = s.trails[:, lane]
+        for kind in range(2):
+            for k in range(count[lane, kind]):
+                step = found[lane, kind, k]
+                for near in range(max(step - kind, 0), min(step + kind + 1, stop)):
+                    row = (first + near) % rows
+                    for q in range(2):
+                        put(s.clock[row, q], trail[3], 2 * row + q)
+                    if near >= step:
+                        for i in range(5):
+                            for q in range(states):
+                                place = (5 * row + i) * states + q
+                                put(points[row, i, q, lane], trail[0], place)
+                    for g in range(forces):
+                        put(gauge[row, g, lane], trail[1], forces * row + g)
+
+
+@compiled
+def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count, points, gauge):
     """Write the steps to search, for distances and for forces, into ``found`` (8, 2, S), their number into ``count``.
 
     Of flights with ``every`` (8,), distances of all steps. ``limits`` (11,) and ``margins`` (2,) are lanes to work
-    with; ``of_lanes`` (2, 8) is a view of the latter.
+    with; ``of_lanes`` (2, 8) is a view of the latter, ``points`` (rows, 5, n, 8) and ``gauge`` (rows, 3N + 2m, 8) are
+    views of those of the search.
     """
     rows = s.bounds.shape[0]
     for c in range(DISTANCES):
@@ -311,28 +346,4 @@ def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count)
                 found[lane, 1, count[lane, 1]] = step
                 count[lane, 1] += 1
         row = row + 1 if row + 1 < rows else 0
-
-
-@compiled
-def _hand_over(s, points, gauge, first, stop, found, count):
-    """Write into each flight's trail its listed steps, and what a search for forces asks of their neighbours.
-
-    ``points`` (rows, 5, n, 8) and ``gauge`` (rows, 3N + 2m, 8) are views of those of the search.
-    """
-    rows, states, forces = s.bounds.shape[0], points.shape[2], gauge.shape[1]
-    for lane in range(found.shape[0]):
-        trail = s.trails[:, lane]
-        for kind in range(2):
-            for k in range(count[lane, kind]):
-                step = found[lane, kind, k]
-                for near in range(max(step - kind, 0), min(step + kind + 1, stop)):
-                    row = (first + near) % rows
-                    for q in range(2):
-                        put(s.clock[row, q], trail[3], 2 * row + q)
-                    if near >= step:
-                        for i in range(5):
-                            for q in range(states):
-                                place = (5 * row + i) * states + q
-                                put(points[row, i, q, lane], trail[0], place)
-                    for g in range(forces):
-                        put(gauge[row, g, lane], trail[1], forces * row + g)
+    _hand_over(s, points, gauge, first, stop, found, count)

@@ -380,13 +380,20 @@ def _places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
         index += np.size(x)
 
 
+#: Places of the numbers that may be zero, by the numbers of agents and edges.
+_PLACES: dict[tuple[int, int], dict[str, slice]] = {}
+
+
 def _there(problem: Problem, values: Floats) -> dict[str, bool]:
     """Whether numbers that may be zero are not zero in all of eight problems."""
-    return {
-        name: bool(values[index : index + np.size(x)].any())
-        for name, index, x in _places(problem)
-        if name in _MAY_BE_ZERO
-    }
+    size = len(problem.vehicles.m), len(problem.graph.edges)
+    if size not in _PLACES:
+        _PLACES[size] = {
+            name: slice(index, index + np.size(x))
+            for name, index, x in _places(problem)
+            if name in _MAY_BE_ZERO
+        }
+    return {name: bool(values[place].any()) for name, place in _PLACES[size].items()}
 
 
 def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) -> bytes:
