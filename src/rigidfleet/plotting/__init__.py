@@ -190,25 +190,12 @@ def rendered(
     with settings():
         figure = _drawn(result, name, titles=titles)
         keep_layout(figure)
-        return {kind: _rendered(figure, kind, close=not titles) for kind in formats}
+        return contents(figure, formats, close=not titles)
 
 
-def write_figure(
-    figure: Figure, folder: Path, name: str, formats: Iterable[str], *, close: bool = False
-) -> list[Path]:
-    """Write a figure to ``folder/NAME.FORMAT``, each file completely or not at all; return the files.
-
-    With ``close``, the figure is cropped to its content.
-
-    Raises
-    ------
-    ResultError
-        A file cannot be written.
-    """
-    paths = {kind: folder / f"{name}.{kind}" for kind in formats}
-    for kind, path in paths.items():
-        write(path, _rendered(figure, kind, close=close))
-    return list(paths.values())
+def contents(figure: Figure, formats: Iterable[str], *, close: bool = False) -> dict[str, bytes]:
+    """Contents of a figure's files by format; with ``close``, cropped to what is drawn."""
+    return {kind: _rendered(figure, kind, close=close) for kind in formats}
 
 
 def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
