@@ -294,9 +294,7 @@ class SweepWatch(_Screen):
     def update(self, progress: SweepProgress) -> None:
         """Receive the progress of the sweep."""
         before = 0 if self.last is None else self.last.flown
-        if progress.flown > before and (
-            self.base is None or self.base.workers != progress.workers
-        ):
+        if progress.flown > before and (self.base is None or self.base.workers != progress.workers):
             self.base = progress  # measure the rate of these workers without their start-up
         if progress.flown and progress.workers > 1:
             self.stand_still()  # the cores are for the workers, and these may be forks, which want no thread

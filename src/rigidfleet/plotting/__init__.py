@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import os
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -172,9 +172,7 @@ def plot(
         return Figures(_drawn(result, name, titles=titles) for name in names)
     paths = []
     for name in names:
-        for kind, data in rendered(result, name, formats, titles=titles).items():
-            paths.append(target / f"{name}.{kind}")
-            write(paths[-1], data)
+        paths += write_files(target / name, rendered(result, name, formats, titles=titles))
     return paths
 
 
@@ -235,6 +233,23 @@ def _ink(figure: Figure) -> Bbox:
     across, down = (np.flatnonzero(np.any(drawn, axis=axis)) for axis in (0, 1))
     ends = [[across[0], height - down[-1] - 1], [across[-1] + 1, height - down[0]]]
     return Bbox(np.array(ends) / figure.dpi).padded(_MARGIN)
+
+
+def write_files(path: Path, drawn: Mapping[str, bytes]) -> list[Path]:
+    """Write a figure's files, PATH.FORMAT, and return them; where nothing is drawn, remove those of an earlier figure.
+
+    Raises
+    ------
+    ResultError
+        A file cannot be written.
+    """
+    paths = {kind: path.with_name(f"{path.name}.{kind}") for kind in drawn or FORMATS}
+    for kind, there in paths.items():
+        if drawn:
+            write(there, drawn[kind])
+        else:
+            there.unlink(missing_ok=True)
+    return list(paths.values()) if drawn else []
 
 
 def write(path: Path, data: bytes) -> None:

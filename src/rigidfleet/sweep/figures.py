@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.plotting import FORMATS, contents, write
+from rigidfleet.plotting import contents, write_files
 from rigidfleet.plotting import style as st
 from rigidfleet.sweep.dataset import explained
 from rigidfleet.sweep.metrics import METRICS, readable
@@ -76,24 +76,6 @@ def plot(
         drawn = rendered(table, name, formats, over=over, metric=metric, titles=titles)
         files += write_files(Path(folder, name), drawn)
     return files
-
-
-def write_files(path: Path, drawn: Mapping[str, bytes]) -> list[Path]:
-    """Write a figure's files, PATH.FORMAT, and return their paths; without any, remove those of an earlier figure.
-
-    Raises
-    ------
-    ResultError
-        A file cannot be written.
-    """
-    paths = {kind: path.with_name(f"{path.name}.{kind}") for kind in drawn or FORMATS}
-    if not drawn:
-        for there in paths.values():
-            there.unlink(missing_ok=True)
-        return []
-    for kind, data in drawn.items():
-        write(paths[kind], data)
-    return list(paths.values())
 
 
 def rendered(

@@ -223,7 +223,7 @@ def _ranks(x: Floats) -> Floats:
 
 
 def _correlated(x: Floats, y: Floats) -> tuple[float, float]:
-    """Correlation of ranks, and the probability of a larger one by chance: Student's t with n - 2 degrees of freedom."""
+    """Correlation of ranks, and the chance of a larger one: Student's t with n - 2 degrees of freedom."""
     from scipy.special import stdtr
 
     r = float(np.clip(x @ y / math.sqrt(x @ x * (y @ y)), -1.0, 1.0))

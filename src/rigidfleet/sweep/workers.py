@@ -60,7 +60,10 @@ def processes(count: int) -> Generator[Pool]:
     context: Any = _forks() if forked else _Context()
     with safe_path():  # for multiprocessing's resource tracker
         pool = ProcessPoolExecutor(
-            count, mp_context=context, initializer=_begin, initargs=(None if forked else bequeath(),)
+            count,
+            mp_context=context,
+            initializer=_begin,
+            initargs=(None if forked else bequeath(),),
         )
     try:
         yield pool, lambda: count
