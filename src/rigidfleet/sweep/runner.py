@@ -23,7 +23,7 @@ from rigidfleet.sweep.store import Store, Table, read
 
 #: Approximate duration of a chunk [s]: the work that kill -9 loses per worker, and the interval of progress.
 _CHUNK = 1.0
-#: Work below which no further processes are started, as starting them takes one or two seconds [s].
+#: Work below which no further processes are started, as starting them may take one or two seconds [s].
 _WORTH = 6.0
 #: Number of chunks per worker: one in work and one waiting.
 _AHEAD = 2
