@@ -19,7 +19,7 @@ from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.formation import outlines
 from rigidfleet.formation.point_files import Points
 from rigidfleet.mission import Mission, show_draft
-from rigidfleet.plotting import write_figure
+from rigidfleet.plotting import contents
 from rigidfleet.plotting.style import settings
 from rigidfleet.simulation.trajectories import of_curves
 from rigidfleet.sweep import Sweep, fly
@@ -69,11 +69,10 @@ def study() -> None:
         table = fly(sweep, folder, workers=1)
         figure = over_two(table, ["constraint.alpha", "constraint.gamma"], "shape_end")
         assert figure is not None
-        (path,) = write_figure(figure, Path(folder), "map", ["png"])
-        _save_with_few_colours(path, "gain-study")
+    _save_with_few_colours(io.BytesIO(contents(figure, ["png"])["png"]), "gain-study")
 
 
-def _save_with_few_colours(path: Path, name: str) -> None:
+def _save_with_few_colours(path: Path | io.BytesIO, name: str) -> None:
     # A palette makes a third of the size; without refining it (kmeans), greys come out tinted.
     picture = Image.open(path).convert("RGB").quantize(256, kmeans=5, dither=Image.Dither.NONE)
     buffer = io.BytesIO()

@@ -1,5 +1,4 @@
 import io
-import itertools
 import json
 import os
 import pty
@@ -11,6 +10,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -20,12 +20,13 @@ from rich.console import Console
 
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console, drawing
+from rigidfleet.cli.run import write_figures
 from rigidfleet.errors import FlightError, ResultError
 from rigidfleet.formation.graphs import neighbours
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.formation.shapes import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
-from rigidfleet.plotting import figure_names
+from rigidfleet.plotting import figure_names, rendered
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian, spectrum
 from rigidfleet.rigidity.design import design
@@ -678,7 +679,7 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
-@pytest.mark.parametrize(("at_once", "during"), [(1, "plotting.plot"), (2, "plotting.write")])
+@pytest.mark.parametrize(("at_once", "during"), [(1, "plotting.rendered"), (2, "plotting.write")])
 def test_interrupt_of_drawing(capsys, monkeypatch, at_once: int, during: str):
     """Ctrl-C while figures are drawn, here or by processes, leaves the flight as it is, and says so."""
 
@@ -718,12 +719,10 @@ def test_interrupt_inside_the_compiler(capsys, simulate):
 def plot(monkeypatch):
     """Draw figures in no time."""
 
-    def draw(result, folder, *, formats, names, titles=True):
-        Path(folder).mkdir(exist_ok=True)
-        for name, kind in itertools.product(names, formats):
-            write(Path(folder, f"{name}.{kind}"), "drawn" if titles else "bare")
+    def draw(result, name, formats, *, titles=True):
+        return dict.fromkeys(formats, b"drawn" if titles else b"bare")
 
-    monkeypatch.setattr("rigidfleet.plotting.plot", draw)
+    monkeypatch.setattr("rigidfleet.plotting.rendered", draw)
     monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: 1)  # others would not know of it
 
 
@@ -770,8 +769,9 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
             folder / str(count) / name: ["png", "svg"] for name in ("cm", "inputs", "clearance")
         }
         drawing.prepare()
-        with drawing.Drawings(result, figures, titles=True) as pictures:
-            assert set(pictures) == set(figures)
+        with drawing.Drawings(figures, partial(rendered, result)) as pictures:
+            written = write_figures(pictures)
+            assert {path.with_suffix("") for path in written} == set(figures)
             assert len(pictures._processes) == (count if count > 1 else 0)
         drawn[count] = {p.name: p.read_bytes() for p in (folder / str(count)).iterdir()}
     assert len(drawn[1]) == 6
@@ -781,9 +781,9 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
     drawing.prepare()
     with (
         pytest.raises(ResultError, match="cannot be written"),
-        drawing.Drawings(result, there, titles=True) as pictures,
+        drawing.Drawings(there, partial(rendered, result)) as pictures,
     ):
-        list(pictures)
+        write_figures(pictures)
 
 
 @pytest.mark.parametrize(
@@ -792,7 +792,7 @@ def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
         ("multiprocessing.connection.Pipe", OSError("too many open files")),
         ("multiprocessing.context.ForkProcess.start", BlockingIOError("too many processes")),
         ("rigidfleet.cli.drawing._serve", None),
-        ("rigidfleet.cli.drawing._draw", None),
+        ("rigidfleet.cli.drawing._answer", None),
     ],
 )
 def test_figures_are_drawn_where_processes_fail(folder, monkeypatch, what: str, does):

@@ -599,6 +599,36 @@ def test_workers_end_with_what_started_them(tmp_path):
     assert not any(Path(f"/proc/{pid}").exists() for pid in children)
 
 
+STARTED = """
+import os, sys, threading
+from rigidfleet.sweep import workers
+
+mark = "here"
+
+def of_a_fork() -> bool:
+    return mark == "changed"
+
+if __name__ == "__main__":
+    mark = "changed"
+    if sys.argv[1] == "threads":
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
+    with workers.processes(2) as (pool, _):
+        print(pool.submit(of_a_fork).result())
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the threads of a process")
+@pytest.mark.parametrize(("threads", "forked"), [("none", "True"), ("threads", "False")])
+def test_workers_are_forks_of_a_process_without_threads(tmp_path, threads: str, forked: str):
+    """Workers have what the process has computed where a fork is safe, and start on their own where it is not."""
+    (tmp_path / "script.py").write_text(STARTED)
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py", threads], env=environment, capture_output=True, text=True, check=True
+    )  # fmt: skip
+    assert done.stdout.strip() == forked
+
+
 @pytest.mark.long
 def test_a_killed_worker_is_replaced(flown, tmp_path, monkeypatch):
     """A worker process killed in mid-run costs its chunk some time, and nothing else."""
@@ -823,6 +853,23 @@ def test_dataset(flown, tmp_path):
 def fly_into(folder: Path) -> Path:
     fly(sweep(), folder, workers=1)
     return folder
+
+
+def test_rank_correlations_are_those_of_scipy():
+    """Correlations and their chances are SciPy's, where values are equal or missing, too."""
+    noise = np.random.default_rng(1)
+    table = made()
+    thrust = np.round(table.metrics["thrust"] + noise.normal(0, 5, len(table.run)), 0)
+    thrust[::7] = np.nan
+    table = replace(table, metrics=table.metrics | {"thrust": thrust})
+    found = [d for d in drivers(table) if d.outcome == "thrust"]
+    there = np.isfinite(thrust)
+    assert len(found) == len(table.sweep.columns)
+    for d in found:
+        k = [column.name for column in table.sweep.columns].index(d.varied)
+        known = stats.spearmanr(table.codes[there, k], thrust[there])
+        assert d.correlation == pytest.approx(known.statistic, rel=1e-12)
+        assert d.chance == pytest.approx(known.pvalue, rel=1e-9)
 
 
 def test_figures(tmp_path):

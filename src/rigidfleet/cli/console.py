@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 _WIDE = 1000
 #: Time between lines of progress if there is no terminal for a progress bar [s].
 _SELDOM = 10.0
+#: Time between pictures of a progress bar: animated; and without a thread, at least [s].
+_FRAME, _OFTEN = 0.1, 0.5
 #: Time between lines of progress of a check [s].
 _PATIENCE = 5.0
 #: A flight reports its progress several times a second. Without a report for this time, it is compiling [s].
@@ -145,6 +147,8 @@ class _Screen:
         self.progress: Progress | None = None
         self.begun = self.told = perf_counter()
         self.cold = False
+        self.still = threading.Event()
+        self.animation = threading.Thread(target=self._animate, daemon=True)
 
     def __enter__(self) -> Self:
         if self.console.is_interactive:
@@ -162,14 +166,27 @@ class _Screen:
                 words,
                 console=self.console,
                 transient=True,
+                auto_refresh=False,
             )
             self.task = self.progress.add_task("", total=None, screen=self)
             self.progress.start()
+            self.animation.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         if self.progress is not None:
+            self.stand_still()
             self.progress.stop()
+
+    def stand_still(self) -> None:
+        """Draw only what is shown from now on, without a thread."""
+        self.still.set()
+        if self.animation.is_alive():
+            self.animation.join()
+
+    def _animate(self) -> None:
+        while not self.still.wait(_FRAME) and self.progress is not None:
+            self.progress.refresh()
 
     def compiling(self) -> None:
         """Announce that the simulator will be compiled, in several parts during the flight."""
@@ -188,6 +205,9 @@ class _Screen:
         """Show the progress; without animation as a line, if the last line was long ago."""
         if self.progress is not None:
             self.progress.update(self.task, total=total, completed=done)
+            if self.still.is_set() and now - self.told > _OFTEN:
+                self.told = now
+                self.progress.refresh()
         elif now - self.told > _SELDOM:
             self.told = now
             self.console.print(self._words())
@@ -273,8 +293,11 @@ class SweepWatch(_Screen):
 
     def update(self, progress: SweepProgress) -> None:
         """Receive the progress of the sweep."""
-        if progress.flown and (self.base is None or self.base.workers != progress.workers):
+        before = 0 if self.last is None else self.last.flown
+        if progress.flown > before and (self.base is None or self.base.workers != progress.workers):
             self.base = progress  # measure the rate of these workers without their start-up
+        if progress.flown and progress.workers > 1:
+            self.stand_still()  # the cores are for the workers, and these may be forks, which want no thread
         self.last = progress
         if not self._waits():
             self.show(progress.runs, progress.done, perf_counter())

@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,6 +25,8 @@ from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
 Format = Literal["png", "svg", "pdf"]
 #: Default formats of figures.
 DRAWN: tuple[Format, ...] = ("png",)
+#: Each drawing process holds a copy of the result: larger positions [bytes] are drawn in this process.
+_LARGEST = 50_000_000
 
 
 def run(
@@ -205,24 +208,31 @@ def drawings(
     result: Result, figures: Iterable[Path], kinds: Iterable[Format] | None, *, titles: bool
 ) -> drawing.Drawings:
     """Begin to draw the figures that apply to the flight, each for the file of its name."""
-    from rigidfleet.plotting import figure_names
+    from rigidfleet.plotting import figure_names, rendered
 
     formats: dict[Path, list[str]] = {}
     if paths := of_formats(figures, kinds):
+        result.evaluate()  # by the kernel, which is loaded in this process alone
         names = figure_names(result)
         for path in paths:
             if path.stem in names:
                 formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
-    return drawing.Drawings(result, formats, titles=titles)
+    draw = partial(rendered, result, titles=titles)
+    return drawing.Drawings(formats, draw, alone=result.position.nbytes > _LARGEST)
 
 
-def write_figures(pictures: drawing.Drawings, *, quiet: bool = False) -> None:
-    """Write figures as they are drawn."""
+def write_figures(pictures: drawing.Drawings, *, quiet: bool = False) -> list[Path]:
+    """Write figures as they are drawn, and return their files."""
+    from rigidfleet.plotting import write_files
+
+    files: list[Path] = []
     shown = console.err().is_interactive and not quiet
     with console.err().status("Drawing the figures") if shown else nullcontext() as status:
-        for n, path in enumerate(pictures, start=1):
+        for n, (path, drawn) in enumerate(pictures, start=1):
+            files += write_files(path, drawn)
             if status is not None:
                 status.update(f"Drawing the figures: {path.name}, {n} of {len(pictures.figures)}")
+    return files
 
 
 def write_replay(result: Result, path: Path) -> None:

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import os
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from rigidfleet.cli import console
+from rigidfleet.cli import console, drawing
 from rigidfleet.cli.arguments import check_workers, exact
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
     from rigidfleet.sweep import Sweep
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
-from rigidfleet.cli.run import DRAWN, Format, heeding_interrupts
+from rigidfleet.cli.run import DRAWN, Format, heeding_interrupts, write_figures
 
 
 def sweep(
@@ -83,10 +84,13 @@ def sweep(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    from rigidfleet.sweep import store
+    check_workers(workers)
+    if not no_figures:
+        drawing.prepare("rigidfleet.sweep.figures")
+    from rigidfleet._common.files import write_file
+    from rigidfleet.sweep import figures, store
     from rigidfleet.sweep.summary import summarise
 
-    check_workers(workers)
     if summary:
         folder = Path(mission)
         table = store.read(folder)
@@ -102,24 +106,17 @@ def sweep(
             again = f"To resume: rigidfleet sweep {folder}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
-    found = summarise(table)
-    from rigidfleet._common.files import write_file
-
-    write_file(folder / "summary.json", (found.json() + "\n").encode())
-    if json:
-        console.print_exactly(found.json() + "\n")
-    elif not quiet:
-        console.print_table(found)
-    drawn: list[Path] = []
-    if not no_figures:
-        from rigidfleet.sweep.figures import plot
-
-        shown = console.err().is_interactive and not quiet
-        with console.err().status("Drawing the figures") if shown else nullcontext():
-            drawn = plot(
-                table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
-                titles=not no_titles,
-            )  # fmt: skip
+    names = [] if no_figures else figures.NAMES
+    draw = partial(figures.rendered, table, over=map_ or (), metric=metric, titles=not no_titles)
+    asked_for = {folder / "figures" / name: format or DRAWN for name in names}
+    with drawing.Drawings(asked_for, draw) as pictures:
+        found = summarise(table)
+        write_file(folder / "summary.json", (found.json() + "\n").encode())
+        if json:
+            console.print_exactly(found.json() + "\n")
+        elif not quiet:
+            console.print_table(found)
+        drawn = write_figures(pictures, quiet=quiet)
     if not (json or quiet):
         console.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
         console.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 import os
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -172,9 +172,7 @@ def plot(
         return Figures(_drawn(result, name, titles=titles) for name in names)
     paths = []
     for name in names:
-        for kind, data in rendered(result, name, formats, titles=titles).items():
-            paths.append(target / f"{name}.{kind}")
-            write(paths[-1], data)
+        paths += write_files(target / name, rendered(result, name, formats, titles=titles))
     return paths
 
 
@@ -190,25 +188,12 @@ def rendered(
     with settings():
         figure = _drawn(result, name, titles=titles)
         keep_layout(figure)
-        return {kind: _rendered(figure, kind, close=not titles) for kind in formats}
+        return contents(figure, formats, close=not titles)
 
 
-def write_figure(
-    figure: Figure, folder: Path, name: str, formats: Iterable[str], *, close: bool = False
-) -> list[Path]:
-    """Write a figure to ``folder/NAME.FORMAT``, each file completely or not at all; return the files.
-
-    With ``close``, the figure is cropped to its content.
-
-    Raises
-    ------
-    ResultError
-        A file cannot be written.
-    """
-    paths = {kind: folder / f"{name}.{kind}" for kind in formats}
-    for kind, path in paths.items():
-        write(path, _rendered(figure, kind, close=close))
-    return list(paths.values())
+def contents(figure: Figure, formats: Iterable[str], *, close: bool = False) -> dict[str, bytes]:
+    """Contents of a figure's files by format; with ``close``, cropped to what is drawn."""
+    return {kind: _rendered(figure, kind, close=close) for kind in formats}
 
 
 def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
@@ -248,6 +233,23 @@ def _ink(figure: Figure) -> Bbox:
     across, down = (np.flatnonzero(np.any(drawn, axis=axis)) for axis in (0, 1))
     ends = [[across[0], height - down[-1] - 1], [across[-1] + 1, height - down[0]]]
     return Bbox(np.array(ends) / figure.dpi).padded(_MARGIN)
+
+
+def write_files(path: Path, drawn: Mapping[str, bytes]) -> list[Path]:
+    """Write a figure's files, PATH.FORMAT, and return them; where nothing is drawn, remove those of an earlier figure.
+
+    Raises
+    ------
+    ResultError
+        A file cannot be written.
+    """
+    paths = {kind: path.with_name(f"{path.name}.{kind}") for kind in drawn or FORMATS}
+    for kind, there in paths.items():
+        if drawn:
+            write(there, drawn[kind])
+        else:
+            there.unlink(missing_ok=True)
+    return list(paths.values()) if drawn else []
 
 
 def write(path: Path, data: bytes) -> None:

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.plotting import FORMATS, write_figure
+from rigidfleet.plotting import contents, write_files
 from rigidfleet.plotting import style as st
 from rigidfleet.sweep.dataset import explained
 from rigidfleet.sweep.metrics import METRICS, readable
 from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table
-from rigidfleet.sweep.summary import drivers, outcomes, rate, summarise, varied
+from rigidfleet.sweep.summary import drivers, failures, interval, outcomes, varied
 from rigidfleet.sweep.variation import Geomspace, LogUniform
 from rigidfleet.typing import Floats, Ints
 
@@ -42,7 +42,8 @@ _VALUES = 20
 _ROWS = 14
 #: Ratio of the largest to the smallest value beyond which an axis is logarithmic.
 _LOGARITHMIC = 100.0
-_NAMES = ("outcome", "histograms", "envelopes", "drivers", "map")
+#: Names of the figures, from the one that takes longest to draw.
+NAMES = ("histograms", "envelopes", "outcome", "drivers", "map")
 
 
 def plot(
@@ -70,6 +71,23 @@ def plot(
     ResultError
         A file cannot be written.
     """
+    files = []
+    for name in NAMES:
+        drawn = rendered(table, name, formats, over=over, metric=metric, titles=titles)
+        files += write_files(Path(folder, name), drawn)
+    return files
+
+
+def rendered(
+    table: Table,
+    name: str,
+    formats: Iterable[str],
+    *,
+    over: Sequence[str] = (),
+    metric: str = "",
+    titles: bool = True,
+) -> dict[str, bytes]:
+    """Contents of a figure's files by format, none if it would be empty; parameters are those of `plot`."""
     draw = {
         "outcome": outcome,
         "histograms": histograms,
@@ -77,16 +95,9 @@ def plot(
         "drivers": correlations,
         "map": partial(over_two, over=over, metric=metric),
     }
-    files = []
-    for name in _NAMES:
-        with st.settings(), st.titles(shown=titles):
-            figure = draw[name](table)
-        if figure is None:
-            for kind in FORMATS:
-                Path(folder, f"{name}.{kind}").unlink(missing_ok=True)
-            continue
-        files += write_figure(figure, Path(folder), name, formats, close=not titles)
-    return files
+    with st.settings(), st.titles(shown=titles):
+        figure = draw[name](table)
+    return {} if figure is None else contents(figure, formats, close=not titles)
 
 
 def outcome(table: Table) -> Figure | None:
@@ -95,21 +106,20 @@ def outcome(table: Table) -> Figure | None:
         return None
     from rigidfleet.plotting.figure import Figure
 
-    reasons = summarise(table).reasons
+    reasons = failures(table)
     fig = Figure(figsize=(st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6)), layout="constrained")
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     _head(fig, table, "Outcome")
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
-    rates = [rate(table.passed[:k]) for k in n.tolist()]
-    low, high = (100 * np.array([getattr(r, end) for r in rates]) for end in ("low", "high"))
-    left.fill_between(n, low, high, color=st.BAND, label="95 % interval")
-    left.plot(n, [100 * r.rate for r in rates], color=st.PALETTE[0])
+    passed = np.cumsum(table.passed)[n - 1]
+    low, high = interval(passed, n)
+    left.fill_between(n, 100 * low, 100 * high, color=st.BAND, label="95 % interval")
+    left.plot(n, 100 * passed / n, color=st.PALETTE[0])
     left.set(xlabel="runs", ylabel="passed [%]", ylim=(-3, 103))
     if len(table.run) > 1:
         left.set(xscale="log", xlim=(1, len(table.run)))
-    last = rates[-1]
     left.set_title(
-        f"{100 * last.rate:.3g} % passed, 95 % interval {100 * last.low:.3g} to {100 * last.high:.3g} %",
+        f"{100 * passed[-1] / n[-1]:.3g} % passed, 95 % interval {100 * low[-1]:.3g} to {100 * high[-1]:.3g} %",
         loc="left",
     )
     right.set_title("failed checks", loc="left")
@@ -141,8 +151,11 @@ def histograms(table: Table) -> Figure | None:
         scale = _scale(x[finite])
         low, high = float(x[finite].min()), float(x[finite].max())
         edges = (np.geomspace if scale == "log" else np.linspace)(low, high, _BINS + 1)
-        parts = [x[finite & table.passed], x[finite & ~table.passed]]
-        ax.hist(parts, bins=edges.tolist(), stacked=True, color=[PASSED, FAILED], linewidth=0)
+        below = np.zeros(_BINS)
+        for some, colour in ((table.passed, PASSED), (~table.passed, FAILED)):
+            top = below + np.histogram(x[finite & some], edges)[0]
+            ax.stairs(top, edges, baseline=below, fill=True, color=colour, linewidth=0)
+            below = top
         ax.set_xscale(scale)
         ax.set_xlim(low, high)
         ax.grid(visible=False, axis="x")
@@ -230,13 +243,13 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     RigidfleetError
         The sweep has no such path or metric.
     """
-    numbers = varied(table)
+    numbers, found = varied(table), drivers(table)
     if not metric:
         judged = outcomes(table)
-        strongest = [d.outcome for d in drivers(table)]
+        strongest = [d.outcome for d in found]
         metric = "success" if "success" in judged or not strongest else strongest[0]
     if not over:
-        ranked = [d.varied for d in drivers(table) if d.outcome == metric]
+        ranked = [d.varied for d in found if d.outcome == metric]
         over = list(dict.fromkeys([*ranked, *numbers]))[:2]
         if len(over) < 2:
             return None

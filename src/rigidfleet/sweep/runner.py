@@ -23,7 +23,7 @@ from rigidfleet.sweep.store import Store, Table, read
 
 #: Approximate duration of a chunk [s]: the work that kill -9 loses per worker, and the interval of progress.
 _CHUNK = 1.0
-#: Work below which no further processes are started, as starting them takes one or two seconds [s].
+#: Work below which no further processes are started, as starting them may take one or two seconds [s].
 _WORTH = 6.0
 #: Number of chunks per worker: one in work and one waiting.
 _AHEAD = 2
@@ -74,7 +74,7 @@ def fly(
         process. A script that starts processes needs `if __name__ == "__main__":`
     cluster : address of a Dask scheduler, whose workers fly the runs
     replace : overwrite a sweep that is in the folder
-    progress : called after each chunk
+    progress : called after each chunk, and each second at least
     pool : instead of workers: returns processes that are kept for several sweeps, called if there is anything to fly
 
     Raises
@@ -101,6 +101,7 @@ def fly(
             deaths = 0
             while flight.missing:
                 before = flight.flown
+                flight.report(count)
                 try:
                     with pools.processes(count) as there:
                         flight.hand_out(there)
@@ -122,9 +123,9 @@ class _Sweeping:
         # A group is flown as a whole, so that its records do not depend on when the sweep was stopped.
         self.missing = deque(np.unique(np.flatnonzero(~self.there) // GROUP).tolist())
         self.flown, self.failed = 0, 0
-        self.begun, self.workers = perf_counter(), 1
+        self.begun = perf_counter()
         self.pace = 0.0  # [s] a run
-        self._report()
+        self.report(1)
 
     def alone(self, *, until_worth: bool) -> None:
         """Fly in this process: all runs, or until the remaining work justifies more processes."""
@@ -132,6 +133,7 @@ class _Sweeping:
             if until_worth and self.pace * GROUP * len(self.missing) > _WORTH:
                 return
             self.keep(fly_runs(self.sweep, self.take(1)))
+            self.report(1)
 
     def hand_out(self, pool: pools.Pool) -> None:
         """Fly all missing runs by a pool of workers. Runs that do not come back are missing again."""
@@ -140,13 +142,14 @@ class _Sweeping:
         text = self.sweep.json()
         try:
             while self.missing or flying:
-                self.workers = capacity()
-                while self.missing and len(flying) < _AHEAD * self.workers:
-                    runs = self.take(self.workers)
+                workers = capacity()
+                while self.missing and len(flying) < _AHEAD * workers:
+                    runs = self.take(workers)
                     flying[executor.submit(pools.chunk, text, __version__, runs)] = runs
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
                     self.keep(future.result())
                     del flying[future]
+                self.report(workers)
         finally:
             lost = {run // GROUP for runs in flying.values() for run in runs}
             self.missing.extendleft(sorted(lost, reverse=True))
@@ -166,14 +169,14 @@ class _Sweeping:
         self.flown += len(rows)
         self.failed += sum(not row.passed for row in rows)
         self.pace = max(median(row.wall for row in rows), 1e-9)
-        self._report()
 
-    def _report(self) -> None:
+    def report(self, workers: int) -> None:
+        """Tell the progress."""
         if self.progress is not None:
             wall = perf_counter() - self.begun
             done = int(self.there.sum())
             self.progress(
-                SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, self.workers)
+                SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, workers)
             )
 
 

@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from rigidfleet.sweep.metrics import METRICS, readable
 from rigidfleet.sweep.record import called
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.variation import is_number
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
@@ -113,15 +114,16 @@ class Summary:
 
 def summarise(table: Table) -> Summary:
     """Summarise the finished runs of a sweep."""
-    failed = [reason for reasons in table.reason for reason in reasons.split(", ") if reason]
     percentiles = {}
     for name, values in table.metrics.items():
         if len(finite := values[np.isfinite(values)]):
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
-    by_value = {}
+    by_value, worded = {}, _worded(table)
     for k, column in enumerate(table.sweep.columns):
+        if column.name not in worded:
+            continue
         values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
-        if values and not all(map(is_number, values)):
+        if not all(map(is_number, values)):
             words = np.array([str(value) for value in values])
             by_value[column.name] = {
                 word: rate(table.passed[words == word]) for word in dict.fromkeys(words.tolist())
@@ -132,12 +134,18 @@ def summarise(table: Table) -> Summary:
         table.sweep.runs,
         len(table.run),
         rate(table.passed),
-        dict(Counter(failed).most_common()),
+        failures(table),
         _examples(table),
         percentiles,
         drivers(table),
         by_value,
     )
+
+
+def failures(table: Table) -> dict[str, int]:
+    """Number of runs that failed each check, most frequent first."""
+    failed = [reason for reasons in table.reason for reason in reasons.split(", ") if reason]
+    return dict(Counter(failed).most_common())
 
 
 def _examples(table: Table) -> dict[str, Example]:
@@ -155,13 +163,19 @@ def _examples(table: Table) -> dict[str, Example]:
 
 def rate(passed: Bools) -> Rate:
     """Success rate with its Wilson interval; NaN with the interval 0 to 1 if there are no runs."""
-    from scipy.stats import binomtest
-
     n, k = len(passed), int(passed.sum())
     if n == 0:
         return Rate(0, 0, math.nan, 0.0, 1.0)
-    interval = binomtest(k, n).proportion_ci(CONFIDENCE, method="wilson")
-    return Rate(k, n, k / n, float(interval.low), float(interval.high))
+    low, high = interval(np.array([k]), np.array([n]))
+    return Rate(k, n, k / n, float(low[0]), float(high[0]))
+
+
+def interval(k: Ints, n: Ints) -> tuple[Floats, Floats]:
+    """Ends of the Wilson interval of each rate: k (m,) of n (m,)."""
+    p, z = k / n, NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
+    middle = (2 * n * p + z**2) / (2 * (n + z**2))
+    half = z / (2 * (n + z**2)) * np.sqrt(4 * n * p * (1 - p) + z**2)
+    return np.where(k == 0, 0.0, middle - half), np.where(k == n, 1.0, middle + half)
 
 
 def outcomes(table: Table) -> dict[str, Floats]:
@@ -176,26 +190,47 @@ def outcomes(table: Table) -> dict[str, Floats]:
 
 def varied(table: Table) -> dict[str, Floats]:
     """Varied numbers by path, without variations that are not numeric."""
+    worded = _worded(table)
     return {
         column.name: table.codes[:, k]
         for k, column in enumerate(table.sweep.columns)
-        if column.name not in _worded(table) and _differs(table.codes[:, k])
+        if column.name not in worded and _differs(table.codes[:, k])
     }
 
 
 def drivers(table: Table) -> list[Driver]:
     """Rank correlation of every varied number with every outcome, strongest first."""
-    from scipy.stats import spearmanr
-
     found = []
+    numbers = varied(table)
+    ranked = {name: _ranks(x) for name, x in numbers.items()}
     for outcome, y in outcomes(table).items():
         there = np.isfinite(y)
-        for name, x in varied(table).items():
-            if there.sum() < 4 or not (_differs(x[there]) and _differs(y[there])):
-                continue
-            result: Any = spearmanr(x[there], y[there])
-            found.append(Driver(name, outcome, float(result.statistic), float(result.pvalue)))
+        if (n := int(there.sum())) < 4:
+            continue
+        every = n == len(y)
+        y_ranked = _ranks(y[there])
+        for name, x in numbers.items():
+            if every or _differs(x[there]):
+                x_ranked = ranked[name] if every else _ranks(x[there])
+                found.append(Driver(name, outcome, *_correlated(x_ranked, y_ranked)))
     return sorted(found, key=lambda d: -abs(d.correlation))
+
+
+def _ranks(x: Floats) -> Floats:
+    """Ranks (n,) of values, centred; equal values have their mean rank."""
+    _, which, counts = np.unique(x, return_inverse=True, return_counts=True)
+    return (np.cumsum(counts) - 0.5 * counts)[which] - 0.5 * len(x)
+
+
+def _correlated(x: Floats, y: Floats) -> tuple[float, float]:
+    """Correlation of ranks, and the chance of a larger one: Student's t with n - 2 degrees of freedom."""
+    from scipy.special import stdtr
+
+    r = float(np.clip(x @ y / math.sqrt(x @ x * (y @ y)), -1.0, 1.0))
+    if abs(r) == 1.0:
+        return r, 0.0
+    free = len(x) - 2
+    return r, float(2.0 * stdtr(free, -abs(r) * math.sqrt(free / ((1.0 + r) * (1.0 - r)))))
 
 
 def _worded(table: Table) -> set[str]:

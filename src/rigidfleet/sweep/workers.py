@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -47,13 +48,22 @@ def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
 
 @contextmanager
 def processes(count: int) -> Generator[Pool]:
-    """Start persistent processes on this machine. They end with this process, even if it is killed."""
+    """Start persistent processes on this machine. They end with this process, even if it is killed.
+
+    They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
+    starts on its own.
+    """
     from rigidfleet.kernel.engine.native import bequeath
 
     before = set(multiprocessing.active_children())
+    forked = _has_one_thread()
+    context: Any = _forks() if forked else _Context()
     with safe_path():  # for multiprocessing's resource tracker
         pool = ProcessPoolExecutor(
-            count, mp_context=_Context(), initializer=_begin, initargs=(bequeath(),)
+            count,
+            mp_context=context,
+            initializer=_begin,
+            initargs=(None if forked else bequeath(),),
         )
     try:
         yield pool, lambda: count
@@ -61,6 +71,37 @@ def processes(count: int) -> Generator[Pool]:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - before:
             process.terminate()
+
+
+def _has_one_thread() -> bool:
+    """Whether a fork of this process is whole: another thread would be missing, and a lock that it holds never free.
+
+    Linux tells; other systems do not, and on some of them libraries forbid forks.
+    """
+    try:
+        return len(os.listdir("/proc/self/task")) == 1
+    except OSError:
+        return False
+
+
+def _forks() -> Any:
+    """Context of forks, for which Ctrl-C waits from the start."""
+    from multiprocessing.context import ForkContext, ForkProcess
+
+    class Process(ForkProcess):
+        @staticmethod
+        def _Popen(process_obj: Any) -> Any:  # noqa: N802
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                return ForkProcess._Popen(process_obj)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+    class Context(ForkContext):
+        pass
+
+    Context.Process = Process
+    return Context()
 
 
 class _Process(SpawnProcess):
@@ -80,13 +121,17 @@ class _Context(SpawnContext):
     Process = _Process
 
 
-def _begin(given: Inheritance) -> None:
-    """Prepare a worker: ignore Ctrl-C, end with the parent process, and take compiled code from it."""
+def _begin(given: Inheritance | None) -> None:
+    """Prepare a worker: ignore Ctrl-C, end with the parent process, and take compiled code that it gives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow, daemon=True).start()
-    from rigidfleet.kernel.engine.native import inherit
+    # A run makes thousands of arrays and leaves hardly any cycle: to search for them takes a twentieth of its time.
+    gc.freeze()
+    gc.set_threshold(100_000)
+    if given is not None:
+        from rigidfleet.kernel.engine.native import inherit
 
-    inherit(given)
+        inherit(given)
 
 
 def _follow() -> None:
