@@ -73,6 +73,20 @@ _STORED = [(name, k, -1.0 if name in _GREATEST else 1.0) for name, k in _NAMES.i
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
+#: Size of an integrator: states, states in its trail, agents, edges.
+_Size = tuple[int, int, int, int]
+#: Integrators that no flight uses, by size, because their trails are large; how many of each.
+_idle: dict[_Size, list[records.IntegratorState]] = {}
+_KEPT = 8
+
+
+def _idle_integrator(size: _Size) -> records.IntegratorState | None:
+    try:
+        return _idle[size].pop()
+    except (KeyError, IndexError):
+        return None
+
+
 class _Thing(NamedTuple):
     """An obstacle, as its arrays alone."""
 
@@ -107,7 +121,8 @@ class Extremes:
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
-        self.trail = records.NO_TRAIL
+        self.state: records.IntegratorState | None = None  # of the integrator that is monitored
+        self.size: _Size | None = None  # for which there is a monitor
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
         self._touching: Future[None] | None = None
@@ -127,7 +142,7 @@ class Extremes:
     def among(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
         self._take_obstacles(obstacles)
-        if len(self.trail.points):
+        if self.size is not None:
             found = self.monitor.monitor
             self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
 
@@ -150,7 +165,7 @@ class Extremes:
         self.who.fill(-1)
         self.standing[:] = self.stood
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
-        if len(self.trail.points):
+        if self.size is not None:
             for marks in (
                 self.monitor.monitor.flags,
                 self.monitor.monitor.quiet,
@@ -158,32 +173,54 @@ class Extremes:
             ):
                 marks.fill(0)
 
-    def begin(self, states: int, edges: int, *, aside: bool = False) -> records.Trail:
-        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail.
+    def begin(
+        self, y: Floats, t: float, edges: int, *, rtol: float, atol: Floats, states: int | None = None,
+        aside: bool = False,
+    ) -> records.IntegratorState:
+        """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
 
-        ``aside``: they will be handed over to another thread.
-        """
-        if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
-            return self.trail
-        self.trail = trail = records.trail(states, self.n, edges)
-        found = records.monitor(
-            self.radius, self.boxes, self.fence, states, len(trail.start),
-            worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
-            standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-            struck=self.struck, quiet=np.zeros(len(trail.clock), dtype=np.bool_),
-            calm=np.zeros(len(trail.clock), dtype=np.bool_),
-        )  # fmt: skip
-        self.monitor = native.Watch(found)
-        if aside:
-            # Memory costs far more time when it is first touched than ever after. The rows that the integrator reaches
-            # after it has handed over steps are touched while it flies these.
-            self._touching = self._beside().submit(trail.points[self._half :].fill, 0.0)
-        return trail
+        ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
+        thread.
+        """  # fmt: skip
+        size = len(y), states or len(y), self.n, edges
+        known = size == self.size
+        if not known:
+            self.let_go()
+        state = self.state or _idle_integrator(size)
+        if state is None:
+            trail = records.trail(*size[1:])
+            state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
+        else:
+            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
+        self.state, self.size = state, size
+        if not known:
+            steps, gauge = state.trail.gauge.shape
+            found = records.monitor(
+                self.radius, self.boxes, self.fence, size[1], gauge,
+                worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
+                standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
+                struck=self.struck, quiet=np.zeros(steps, dtype=np.bool_), calm=np.zeros(steps, dtype=np.bool_),
+            )  # fmt: skip
+            self.monitor = native.Watch(found)
+            if aside:
+                # Memory costs far more time when it is first touched than ever after. The rows that the integrator
+                # reaches after it has handed over steps are touched while it flies these.
+                half = self._half(state)
+                self._touching = self._beside().submit(state.trail.points[half:].fill, 0.0)
+        return state
 
-    @property
-    def _half(self) -> int:
+    def let_go(self) -> None:
+        """Let the monitors of other flights use the integrator."""
+        if self.state is not None and self.size is not None and self.n <= _FEW:
+            idle = _idle.setdefault(self.size, [])
+            if len(idle) < _KEPT:
+                idle.append(self.state)
+        self.state = None
+
+    @staticmethod
+    def _half(state: records.IntegratorState) -> int:
         """Steps that fit into the trail beside as many others and one that has stayed."""
-        return (len(self.trail.clock) - 1) // 2
+        return (len(state.trail.clock) - 1) // 2
 
     def _beside(self) -> ThreadPoolExecutor:
         """The other thread."""
@@ -207,7 +244,7 @@ class Extremes:
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
         self._list_all()
-        self.trail = records.NO_TRAIL  # other vehicles are monitored from now on
+        self.state = self.size = None  # other vehicles are monitored from now on
 
     def take(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
@@ -226,7 +263,7 @@ class Extremes:
 
     def room(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
-        half, steps = self._half, int(state.count[4])
+        half, steps = self._half(state), int(state.count[4])
         if self._touching is not None:
             if not steps:
                 return half

@@ -45,7 +45,8 @@ class Preparation:
         return found
 
     def give_back(self, extremes: Extremes) -> None:
-        """Let another flight use the monitor of one that is finished."""
+        """Let other flights use the monitor of one that is finished."""
+        extremes.let_go()
         if extremes.reusable and len(self._idle) < _KEPT:
             self._idle.append(extremes)
 
