@@ -6,6 +6,7 @@ kernel only evaluates. A `PhaseState` holds what the next phase inherits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -103,6 +104,7 @@ class PhasePlan:
     radius: Floats  # (N,) [m]
     before: PhaseState  # the state that the phase starts from
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
+    loses: bool  # whether vehicles or links are lost at any time of the mission
     blend: Reference  # of all edges, before any is released
     through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
@@ -151,11 +153,6 @@ class PhasePlan:
         x, y = about_cm(now.r, masses) @ self.frame.T, about_cm(now.v, masses) @ self.frame.T
         cm = (masses @ now.r / masses.sum(), masses @ now.v / masses.sum())
         return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
-
-    @cached_property
-    def loses(self) -> bool:
-        """Whether vehicles or links are lost at any time."""
-        return bool(len(self.links_lost[1]) or np.isfinite(self.lost_at).any())
 
     @cached_property
     def tolerances(self) -> Floats:
@@ -311,8 +308,8 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
-        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost, blend=reference,
-        through=passed(trajectory), smooth=mission.smooth or mission.on_loss != "continue",
+        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost,
+        loses=mission.first_loss < math.inf, blend=reference, through=passed(trajectory), smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -440,10 +441,8 @@ class Extremes:
         """List all pairs of a small fleet; none of a large one yet."""
         self.moved[:] = np.inf
         if self.n <= _FEW:
-            i, j = np.triu_indices(self.n, 1)
-            both = self.left[i] & self.left[j]
-            self.pairs = np.stack([i[both], j[both]], axis=1)
-            self.columns = self.pairs
+            pairs = _all_pairs(self.n)
+            self.pairs = self.columns = pairs[self.left[pairs].all(axis=1)]
 
     def _step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
@@ -523,6 +522,12 @@ class Extremes:
         self.monitor = native.Watch(
             before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
+
+
+@cache
+def _all_pairs(n: int) -> Ints:
+    """All pairs (P, 2) of n agents."""
+    return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 def _row(state: records.IntegratorState, step: int) -> int:

@@ -66,7 +66,7 @@ class Preparation:
         found = self._plans.get(key)
         if found is None or found.phase is not phase:
             found = plan_phase(self.mission, phase, now, disturbance=given, external=external)
-            _ = found.certificate, found.tolerances, found.loses  # once for all flights
+            _ = found.certificate, found.tolerances  # once for all flights
             self._plans = {key: found}
         plan = changed(found)
         plan.before = changed(found.before)
