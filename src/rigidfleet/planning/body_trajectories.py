@@ -59,14 +59,14 @@ class RegulatedTrajectory:
         phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
         length, rest = self.arrival - self.t0, self.t_end - self.arrival
         times, responses = _responses(self.lqr, self.tracking, length, rest)
-        rate = att.rotation_vector_rate(phi, start.omega)
-        ends = np.zeros((2, 4, 3))  # of CM and attitude
-        ends[0, 0], ends[0, 1], ends[1, 0], ends[1, 1] = start.r, start.v, phi, rate
-        ends[0, 2], ends[0, 3], ends[1, 3] = goal.r, goal.v, goal.omega
-        ends[:, :2] -= ends[:, 2:]
-        ends[:, 0] += length * ends[:, 3]
+        x = [*start.r.tolist(), *phi.tolist()]
+        v = [*start.v.tolist(), *att.rotation_vector_rate(phi, start.omega).tolist()]
+        x1, v1 = [*goal.r.tolist(), 0.0, 0.0, 0.0], [*goal.v.tolist(), *goal.omega.tolist()]
+        ends = [
+            (a - c + length * d, b - d, c, d) for a, b, c, d in zip(x, v, x1, v1, strict=True)
+        ]
         n = len(times) - 1
-        pieces = (ends.swapaxes(1, 2) @ responses).reshape(6, n, 6).swapaxes(0, 1)
+        pieces = (np.array(ends).reshape(2, 3, 4) @ responses).reshape(6, n, 6).swapaxes(0, 1)
         return as_motion(self.t0 + times, pieces, goal.T.copy())
 
 

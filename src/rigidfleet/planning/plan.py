@@ -61,7 +61,11 @@ from rigidfleet.planning.reference import (
     reference_kind,
     slots_before,
 )
-from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
+from rigidfleet.planning.tolerances import (
+    absolute_tolerances,
+    tolerance_of_velocity,
+    tolerances_of_small,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
@@ -157,11 +161,13 @@ class PhasePlan:
     @cached_property
     def tolerances(self) -> Floats:
         """Absolute tolerances (n,) of the states."""
-        velocity, size = self.velocity_tolerance(), 6 * len(self.masses) + len(self.edges)
+        n, m = len(self.masses), len(self.edges)
+        size = 6 * n + m
         size += 0 if self.frame is None else 10 if self.problem.body_formulation else 4
-        return absolute_tolerances(
-            self.integrator, size, velocity, self.distances, large=self.large
-        )
+        if not self.large:
+            return tolerances_of_small(self.integrator, n, m, size)
+        velocity = self.velocity_tolerance()
+        return absolute_tolerances(self.integrator, size, velocity, self.distances, large=True)
 
     def velocity_tolerance(self) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
@@ -374,7 +380,7 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     if len(slots) < 2:
         return None
     pairs, wanted, most = _wanted(slots)
-    near = np.abs(distance_geometry.distances(r, pairs) - wanted).max() <= most
+    near = np.maximum.reduce(np.abs(distance_geometry.distances(r, pairs) - wanted)) <= most
     return name if near else None
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -88,14 +88,8 @@ def _idle_integrator(size: _Size) -> records.IntegratorState | None:
         return None
 
 
-class _Thing(NamedTuple):
-    """An obstacle, as its arrays alone."""
-
-    solid: Solids
-
-
 @kept
-def _stood(position: Floats, radius: Floats, obstacles: tuple[_Thing, ...]) -> Ints:
+def _stood(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...]) -> Ints:
     """Whether agents stand on obstacles at the start (N,)."""
     start, _ = proximity.obstacle_clearances(position, radius, obstacles)
     return (start <= PAD).astype(np.int64)
@@ -117,8 +111,9 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        things = tuple(_Thing(thing.solid) for thing in mission.obstacles)
-        self.stood = _stood(mission.fleet.position, self.radius, things)
+        # Obstacles that are not boxes may be large, and are not to be kept.
+        stood = _stood if self.solids is None else _stood.__wrapped__
+        self.stood = stood(mission.fleet.position, self.radius, mission.obstacles)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
@@ -390,9 +385,9 @@ class Extremes:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
         found = {
-            name: Extremum(sign * value, when[k], *who[k])
+            name: Extremum(sign * worst[k], when[k], *who[k])
             for name, k, sign in _STORED
-            if math.isfinite(value := worst[k])
+            if -math.inf < worst[k] < math.inf
         }
         if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
             found["tension"] = tension._replace(value=-tension.value)
