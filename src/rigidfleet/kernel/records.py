@@ -17,6 +17,8 @@ PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
 Corners = Annotated[Floats, Extents((None, 6))]
 Pairs = Annotated[Ints, Extents((None, 2))]
 
+NO_ROWS, NO_FACTORS = np.zeros((0, 0)), np.zeros(0)
+
 #: Return values of an integration.
 FINISHED, PAUSED, COLLAPSED = range(3)
 #: Rows of `IntegratorState.K` after the seven stages.
@@ -241,5 +243,9 @@ class Recursion(NamedTuple):
     """Rows x_k to which the row before is added, times a number; see `rigidfleet.kernel.recursion`."""
 
     x: Floats  # (K, M)
-    a: Floats  # (K,)
+    a: Floats  # (K,); empty: none is added
     backward: bool  # whether the rows are followed from the last to the first
+    # rows (K, C) of which x is made first, from a column on, times a number (K,) each; without rows, x is as it is
+    y: Floats = NO_ROWS
+    first: int = 0
+    b: Floats = NO_FACTORS

@@ -40,6 +40,7 @@ from rigidfleet.kernel.problem import (
     Workspace,
 )
 from rigidfleet.kernel.records import (
+    NO_FACTORS,
     IntegratorState,
     Monitor,
     Record,
@@ -169,6 +170,11 @@ def least_singular_values(r: Floats, edges: Ints) -> Floats:
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
     _call(_code().follow, pack(Recursion(x, a, backward)))
+
+
+def multiply_rows(y: Floats, first: int, b: Floats, x: Floats) -> None:
+    """x_k = b_k y_k in rows x (K, M), from the M columns of y (K, C) that begin with ``first``; b (K,)."""
+    _call(_code().follow, pack(Recursion(x, NO_FACTORS, False, y, first, b)))
 
 
 class _Code(NamedTuple):
