@@ -62,18 +62,14 @@ class RegulatedTrajectory:
         x = [*start.r.tolist(), *phi.tolist()]
         v = [*start.v.tolist(), *att.rotation_vector_rate(phi, start.omega).tolist()]
         x1, v1 = [*goal.r.tolist(), 0.0, 0.0, 0.0], [*goal.v.tolist(), *goal.omega.tolist()]
-        ends = [
-            (a - c + length * d, b - d, c, d) for a, b, c, d in zip(x, v, x1, v1, strict=True)
-        ]
+        ends = [(a - c + length * d, b - d, c, d) for a, b, c, d in zip(x, v, x1, v1, strict=True)]
         n = len(times) - 1
         pieces = (np.array(ends).reshape(2, 3, 4) @ responses).reshape(6, n, 6).swapaxes(0, 1)
         return as_motion(self.t0 + times, pieces, goal.T.copy())
 
 
 @kept
-def _responses(
-    laws: Lqr, tracking: Tracking, length: float, rest: float
-) -> tuple[Floats, Floats]:
+def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
     """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.
 
     For either regulator, and then the tracking gains, they are those from an error in position of 1 at the start, from

@@ -315,7 +315,8 @@ def plan_phase(
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
         radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost,
-        loses=mission.first_loss < math.inf, blend=reference, through=passed(trajectory), smooth=mission.smooth or mission.on_loss != "continue",
+        loses=mission.first_loss < math.inf, blend=reference, through=passed(trajectory),
+        smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
@@ -379,17 +380,20 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs, wanted, most = _wanted(slots)
-    near = np.maximum.reduce(np.abs(distance_geometry.distances(r, pairs) - wanted)) <= most
+    pairs, most = _wanted(slots)
+    x = r.tolist()
+    near = all(abs(math.dist(x[i], x[j]) - wanted) <= most for i, j, wanted in pairs)
     return name if near else None
 
 
 @kept
-def _wanted(slots: Floats) -> tuple[Ints, Floats, float]:
-    """All pairs of slots (N, 3), their distances [m], and the greatest error [m] at which they count as held."""
+def _wanted(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
+    """All pairs of slots (N, 3) with their distance [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
-    wanted = distance_geometry.distances(slots, pairs)
-    return pairs.copy(), wanted, _NEAR * float(wanted.min())
+    wanted = distance_geometry.distances(slots, pairs).tolist()
+    return [(i, j, d) for (i, j), d in zip(pairs.tolist(), wanted, strict=True)], _NEAR * min(
+        wanted
+    )
 
 
 @kept
