@@ -17,6 +17,7 @@ PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
 Corners = Annotated[Floats, Extents((None, 6))]
 Pairs = Annotated[Ints, Extents((None, 2))]
 
+#: Of a `Recursion` that makes no rows, and of one that adds none.
 NO_ROWS, NO_FACTORS = np.zeros((0, 0)), np.zeros(0)
 
 #: Return values of an integration.

@@ -391,9 +391,8 @@ def _wanted(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
     """All pairs of slots (N, 3) with their distance [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
     wanted = distance_geometry.distances(slots, pairs).tolist()
-    return [(i, j, d) for (i, j), d in zip(pairs.tolist(), wanted, strict=True)], _NEAR * min(
-        wanted
-    )
+    listed = [(i, j, d) for (i, j), d in zip(pairs.tolist(), wanted, strict=True)]
+    return listed, _NEAR * min(wanted)
 
 
 @kept

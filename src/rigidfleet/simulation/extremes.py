@@ -88,11 +88,13 @@ def _idle_integrator(size: _Size) -> records.IntegratorState | None:
         return None
 
 
-@kept
-def _stood(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...]) -> Ints:
+def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...]) -> Ints:
     """Whether agents stand on obstacles at the start (N,)."""
     start, _ = proximity.obstacle_clearances(position, radius, obstacles)
     return (start <= PAD).astype(np.int64)
+
+
+_standing_kept = kept(_standing)
 
 
 class Extremes:
@@ -112,8 +114,8 @@ class Extremes:
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
         # Obstacles that are not boxes may be large, and are not to be kept.
-        stood = _stood if self.solids is None else _stood.__wrapped__
-        self.stood = stood(mission.fleet.position, self.radius, mission.obstacles)
+        standing = _standing_kept if self.solids is None else _standing
+        self.stood = standing(mission.fleet.position, self.radius, mission.obstacles)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
@@ -184,7 +186,7 @@ class Extremes:
 
         ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
         thread.
-        """  # fmt: skip
+        """
         size = len(y), states or len(y), self.n, edges
         known = size == self.size
         if not known:
