@@ -26,7 +26,9 @@ from rigidfleet.math.lqr import (
     knots,
     quintic_pieces,
 )
+from rigidfleet.mission.schema import Lqr, Regulator, Tracking
 from rigidfleet.planning.body_trajectories import RegulatedTrajectory
+from rigidfleet.planning.reference import Pose
 
 CASE = json.loads((Path(__file__).parent / "data/reference_lqr_finite_gains.json").read_text())
 
@@ -585,12 +587,13 @@ def test_planned_motions_are_those_of_the_regulators():
     """
     rng = np.random.default_rng(5)
     t0, arrival, t_end = 3.0, 9.0, 14.0
-    laws = ("finite", (2.0, 1.0), 1.5, (50.0, 9.0)), ("infinite", (0.7, 0.2), 1.0, (0.0, 0.0))
-    tracking = (4.0, 4.0), 1.0
+    turn = Regulator(horizon="infinite", Q=(0.7, 0.2), R=1.0, S=(0.0, 0.0))
+    laws = Lqr(horizon="finite", Q=(2.0, 1.0), R=1.5, S=(50.0, 9.0), attitude=turn)
+    tracking = Tracking(Q=(4.0, 4.0), R=1.0)
     (r, v, omega), (r1, v1, omega1) = rng.normal(0.0, 5.0, (2, 3, 3))
     T, T1 = (dcm_from_rotation_vector(x) for x in rng.normal(0.0, 0.8, (2, 3)))
     phi = rotation_vector_from_dcm(T @ T1.T)
-    ends = (r, v, T, omega), (r1, v1, T1, omega1)
+    ends = Pose(r, v, T, omega), Pose(r1, v1, T1, omega1)
     motion = RegulatedTrajectory(laws, tracking, *ends, t0, arrival, t_end).motion()
     assert motion.knots[[0, -1]] == pytest.approx([t0, t_end])
     np.testing.assert_array_equal(motion.T1, T1)
@@ -603,20 +606,20 @@ def test_planned_motions_are_those_of_the_regulators():
     way, length, rest = t <= arrival, arrival - t0, t_end - arrival
     begins = (r, v), (phi, rotation_vector_rate(phi, omega))
     goals = (r1, v1), (np.zeros(3), omega1)
-    for axes, (horizon, Q, R, S), begin, goal in zip(
-        (slice(3), slice(3, 6)), laws, begins, goals, strict=True
+    for axes, law, begin, goal in zip(
+        (slice(3), slice(3, 6)), (laws, turn), begins, goals, strict=True
     ):
-        given = [*(t[way] - t0), length], begin, goal, length, Q, R
+        given = [*(t[way] - t0), length], begin, goal, length, law.Q, law.R
         x, x_dot, _ = (
-            finite_horizon_trajectory(*given, S)
-            if horizon == "finite"
+            finite_horizon_trajectory(*given, law.S)
+            if law.horizon == "finite"
             else infinite_horizon_trajectory(*given)
         )
         np.testing.assert_allclose(found[way, axes], x[:-1], rtol=0, atol=1e-8)
         np.testing.assert_allclose(slope[way, axes], x_dot[:-1], rtol=0, atol=1e-8)
         onward = goal[0] + rest * goal[1], goal[1]
         x, x_dot, _ = infinite_horizon_trajectory(
-            t[~way] - arrival, (x[-1], x_dot[-1]), onward, rest, *tracking
+            t[~way] - arrival, (x[-1], x_dot[-1]), onward, rest, tracking.Q, tracking.R
         )
         np.testing.assert_allclose(found[~way, axes], x, rtol=0, atol=1e-8)
         np.testing.assert_allclose(slope[~way, axes], x_dot, rtol=0, atol=1e-8)

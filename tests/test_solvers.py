@@ -345,13 +345,15 @@ def test_the_memory_of_a_phase_is_free_when_the_next_one_flies():
         active = flown._ended
         assert active is not None
         assert active.solver is not None
-        kept = [weakref.ref(x) for x in (active.solver, active.workspace.r.base, active.state.K)]
+        kept = [weakref.ref(x) for x in (active.solver, active.workspace.r.base)]
         kept += [
             weakref.ref(x) for x in (active.solver.aside, active.solver.aside.workspace.r.base)
         ]
+        stages = active.state.K
         del active
         assert flown.begin()
-        assert [x() for x in kept] == [None] * 5
+        assert [x() for x in kept] == [None] * 4
+        assert flown.under_way().state.K is stages  # taken over
     finally:
         gc.enable()
 

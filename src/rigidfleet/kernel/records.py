@@ -17,6 +17,9 @@ PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
 Corners = Annotated[Floats, Extents((None, 6))]
 Pairs = Annotated[Ints, Extents((None, 2))]
 
+#: Of a `Recursion` that makes no rows, and of one that adds none.
+NO_ROWS, NO_FACTORS = np.zeros((0, 0)), np.zeros(0)
+
 #: Return values of an integration.
 FINISHED, PAUSED, COLLAPSED = range(3)
 #: Rows of `IntegratorState.K` after the seven stages.
@@ -170,10 +173,22 @@ def integrator(
     in the ``trail``.
     """
     n = len(y)
-    K = zeros(10, padded(n))
-    K[ATOL, :n], K[ATOL, n:] = atol, 1.0
-    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(6, dtype=np.int64)
-    return IntegratorState(y.copy(), K, clock, count, rtol, trail)
+    count = np.empty(6, dtype=np.int64)
+    state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
+    return restarted(state, y, t, rtol=rtol, atol=atol, step=step)
+
+
+def restarted(
+    state: IntegratorState, y: Floats, t: float, *, rtol: float, atol: Floats, step: float = 1e-3
+) -> IntegratorState:
+    """An `integrator` of as many states as another, in its memory and with its trail."""
+    n = len(y)
+    state.y[:] = y
+    state.K.fill(0.0)
+    state.K[ATOL, :n], state.K[ATOL, n:] = atol, 1.0
+    state.clock[:] = t, step, LEAST_ERROR
+    state.count.fill(0)
+    return state if state.rtol == rtol else state._replace(rtol=rtol)
 
 
 class Segment(NamedTuple):
@@ -227,5 +242,9 @@ class Recursion(NamedTuple):
     """Rows x_k to which the row before is added, times a number; see `rigidfleet.kernel.recursion`."""
 
     x: Floats  # (K, M)
-    a: Floats  # (K,)
+    a: Floats  # (K,); empty: none is added
     backward: bool  # whether the rows are followed from the last to the first
+    # rows (K, C) of which x is made first, from a column on, times a number (K,) each; without rows, x is as it is
+    y: Floats = NO_ROWS
+    first: int = 0
+    b: Floats = NO_FACTORS

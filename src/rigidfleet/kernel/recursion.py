@@ -5,10 +5,16 @@ from rigidfleet.kernel.compiler.jit import compiled
 
 @compiled
 def follow(s):
-    """x_k += a_k x_(k-1) from the first row to the last, or x_k += a_k x_(k+1) from the last to the first."""
+    """x_k += a_k x_(k-1) from the first row to the last, or x_k += a_k x_(k+1) from the last to the first.
+
+    Before, x_k = b_k y_k if there are rows y, of which M columns count.
+    """
     x, a = s.x, s.a
     rows, columns = x.shape
-    for n in range(1, rows):
+    for k in range(len(s.y)):
+        for j in range(columns):
+            x[k, j] = s.b[k] * s.y[k, s.first + j]
+    for n in range(1, len(a)):
         k, before = n, n - 1
         if s.backward:
             k, before = rows - 1 - n, rows - n

@@ -76,10 +76,14 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
     if len(r) > some:
         parts = [r[k : k + some] for k in range(0, len(r), some)]
         return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
-    J = jacobian(r, edges)
+    return smallest_of(jacobian(r, edges), masses)
+
+
+def smallest_of(J: Floats, masses: ArrayLike | None = None) -> Floats:
+    """`smallest_singular_value` (K,) of Jacobians J (K, m, 3N), m > 0."""
     if masses is not None:
         m = np.asarray(masses, dtype=float)
-        J *= np.repeat(np.sqrt(m.mean() / m), 3)
+        J = J * np.repeat(np.sqrt(m.mean() / m), 3)
     # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
     gram = J @ J.swapaxes(1, 2) if J.shape[1] <= J.shape[2] else J.swapaxes(1, 2) @ J
     w = np.linalg.eigvalsh(gram)

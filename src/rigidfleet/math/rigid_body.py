@@ -61,8 +61,8 @@ def kabsch(
     p, q = np.asarray(target, dtype=np.float64), np.asarray(source, dtype=np.float64)
     w = np.ones(p.shape[-2]) if weights is None else np.asarray(weights, dtype=np.float64)
     w = w[:, None] / w.sum()
-    p, q = p - (w * p).sum(axis=-2, keepdims=True), q - (w * q).sum(axis=-2, keepdims=True)
-    return best_rotation(*np.linalg.svd(np.swapaxes(w * p, -1, -2) @ q), near, tol)[0]
+    p, q = (x - np.add.reduce(w * x, axis=-2, keepdims=True) for x in (p, q))
+    return best_rotation(*np.linalg.svd((w * p).swapaxes(-1, -2) @ q), near, tol)[0]
 
 
 def best_rotation(
@@ -74,12 +74,14 @@ def best_rotation(
     """
     rotation = u @ vt
     proper = np.linalg.det(rotation) > 0
+    if s.ndim == 1 and proper and s[1] > tol * s[0]:  # the usual case, of one fit
+        return rotation, proper
     turned = u
     if not proper.all():
         turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
         rotation = turned @ vt
-    alike = tol * s[..., 0]
-    free = (s[..., 1] <= alike) | (~proper & (s[..., 1] - s[..., 2] <= alike))
+    first, second, third = s[..., 0], s[..., 1], s[..., 2]
+    free = (second <= tol * first) | (~proper & (second - third <= tol * first))
     if free.any():
         guide = np.eye(3) if near is None else np.asarray(near, dtype=np.float64)
         rotation[free] = _nearest_fit(turned[free], s[free], vt[free], guide, tol)

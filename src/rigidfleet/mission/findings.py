@@ -31,12 +31,18 @@ _STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formatio
 
 
 class Shared:
-    """The tables that several missions have in common, as the same objects, each validated once for all of them."""
+    """The tables that several missions have in common, as the same objects, each validated once for all of them.
+
+    Attributes
+    ----------
+    sound : what the phases of the last mission were checked by, if they had no findings
+    """
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         # Alive, so that no other table gets the number of one of them.
         self._tables = {id(table): table for table in _tables(data)}
         self._models: dict[tuple[Any, ...], Part] = {}
+        self.sound: tuple[Any, ...] | None = None
 
     def key(self, kind: type[Part], data: object, defaults: Mapping[str, Any]) -> Any:
         """What a model of a table is found by; None if the table is none of these."""

@@ -523,7 +523,7 @@ class Mission(Contents):
         lost = pairs[times < t]
         return ~np.isin(edges[:, 0] * n + edges[:, 1], lost[:, 0] * n + lost[:, 1])
 
-    @property
+    @cached_property
     def first_loss(self) -> float:
         """Time [s] at which the first vehicle or link is lost; infinity if none is."""
         return float(min(self.lost_at.min(), self.links_lost[1].min(initial=np.inf)))
@@ -547,5 +547,12 @@ class Mission(Contents):
 @kept
 def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
-    index = constraint_jacobian.smallest_singular_value(slots[None], edges, masses)[0]
-    return float(np.clip(index**2 / 4, *_DAMPING))
+    index = float(constraint_jacobian.smallest_of(_jacobian(slots, edges), masses)[0])
+    least, most = _DAMPING
+    return min(max(index**2 / 4, least), most)
+
+
+@kept
+def _jacobian(slots: Floats, edges: Ints) -> Floats:
+    """J (1, m, 3N) at slots (N, 3) [m], which missions with other masses have in common."""
+    return constraint_jacobian.jacobian(slots[None], edges)

@@ -49,8 +49,39 @@ _MOST_NUMBERS = 5e8
 def check(
     collector: FindingCollector, parts: Mapping[str, Any], n: int | None
 ) -> tuple[AnyPhase, ...]:
-    """Check the phases and return them, including those with findings."""
+    """Check the phases and return them, including those with findings.
+
+    They are not checked again if those of the last mission that shares tables had no findings, and nothing differs on
+    which that depends.
+    """
     found = _phases(collector)
+    given = _depends_on(collector, parts, n)
+    if collector.findings or collector.shared.sound != given:
+        _check(collector, found, parts, n)
+        collector.shared.sound = None if collector.findings else given
+    return tuple(p for p in found if p is not None)
+
+
+def _depends_on(
+    collector: FindingCollector, parts: Mapping[str, Any], n: int | None
+) -> tuple[Any, ...]:
+    """All that the findings of phases depend on."""
+    agents: Agents | None = parts.get("agents")
+    starts = () if agents is None else (
+        agents.position, agents.velocity, agents.thrust_limit, len(set(agents.mass)) > 1,
+    )  # fmt: skip
+    keys = ("phases", "formations", "architecture", "assignment")
+    read = ("lqr", "limits", "smoothness", "output_step")
+    return n, *starts, *map(collector.data.get, keys), *map(parts.get, read)
+
+
+def _check(
+    collector: FindingCollector,
+    found: Sequence[AnyPhase | None],
+    parts: Mapping[str, Any],
+    n: int | None,
+) -> None:
+    """Check phases together."""
     _names(collector, found)
     end, lengths = _times(collector, found)
     _samples(collector, parts, end, n)
@@ -67,7 +98,6 @@ def check(
                 _followers(collector, p, n, ("phases", k))
             if n is not None and isinstance(p, Reshape) and p.control_points is not None:
                 _bent(collector, p, p.control_points, n, ("phases", k))
-    return tuple(p for p in found if p is not None)
 
 
 def latest_end(phases: Sequence[AnyPhase]) -> float:

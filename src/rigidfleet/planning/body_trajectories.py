@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Orbit, Through, seconds
+from rigidfleet.mission.schema import Lqr, Tracking
 from rigidfleet.planning.reference import Pose, changed
 from rigidfleet.typing import Floats
 
@@ -32,14 +33,6 @@ class BodyTrajectory(Protocol):
         ...
 
 
-#: A regulator's horizon, Q, R and S; those of the CM and of the attitude; Q and R of the tracking gains.
-_Law = tuple[str, Any, float, Any]
-
-
-#: Position, velocity, attitude (3, 3) and body rates.
-_End = tuple[Floats, Floats, Floats, Floats]
-
-
 @dataclass
 class RegulatedTrajectory:
     """LQR of the virtual body from one pose to another, and the tracking gains from arrival to the phase's end.
@@ -49,10 +42,10 @@ class RegulatedTrajectory:
     input phi'', which is exact for a rotation about one axis.
     """
 
-    regulators: tuple[_Law, _Law]
-    tracking: tuple[Any, float]  # Q, R
-    start: _End
-    goal: _End
+    lqr: Lqr
+    tracking: Tracking
+    start: Pose
+    goal: Pose
     t0: float  # [s]
     arrival: float  # [s]
     t_end: float  # [s]
@@ -62,39 +55,39 @@ class RegulatedTrajectory:
 
         They are linear in the errors at the start, and in the goal, which goes on with its velocity.
         """
-        (r, v, T, omega), (r1, v1, T1, omega1) = self.start, self.goal
-        phi = att.rotation_vector_from_dcm(T @ T1.T)  # start = goal Exp(phi)
+        start, goal = self.start, self.goal
+        phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
         length, rest = self.arrival - self.t0, self.t_end - self.arrival
-        times, responses = _responses(self.regulators, self.tracking, length, rest)
-        ends = np.concatenate(
-            [r, phi, v, att.rotation_vector_rate(phi, omega), r1, np.zeros(3), v1, omega1]
-        ).reshape(4, 6)
-        ends[:2] -= ends[2:]
-        ends[0] += length * ends[3]
-        pieces = ends.reshape(4, 2, 3).transpose(1, 2, 0) @ responses
+        times, responses = _responses(self.lqr, self.tracking, length, rest)
+        x = [*start.r.tolist(), *phi.tolist()]
+        v = [*start.v.tolist(), *att.rotation_vector_rate(phi, start.omega).tolist()]
+        x1, v1 = [*goal.r.tolist(), 0.0, 0.0, 0.0], [*goal.v.tolist(), *goal.omega.tolist()]
+        ends = [(a - c + length * d, b - d, c, d) for a, b, c, d in zip(x, v, x1, v1, strict=True)]
         n = len(times) - 1
-        return as_motion(self.t0 + times, pieces.reshape(6, n, 6).swapaxes(0, 1), T1.copy())
+        pieces = (np.array(ends).reshape(2, 3, 4) @ responses).reshape(6, n, 6).swapaxes(0, 1)
+        return as_motion(self.t0 + times, pieces, goal.T.copy())
 
 
 @kept
-def _responses(
-    regulators: tuple[_Law, _Law], tracking: tuple[Any, float], length: float, rest: float
-) -> tuple[Floats, Floats]:
+def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
     """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.
 
     For either regulator, and then the tracking gains, they are those from an error in position of 1 at the start, from
     one in velocity, and those of a goal at 1, and of one with a velocity of 1 that is at 0 on arrival.
     """
-    times = np.unique(np.concatenate([_knots(law, length) for law in regulators]))
-    after = lqr.knots(rest, *tracking) if rest > 0.0 else np.zeros(1)
+    regulators = [
+        (law.Q, law.R, law.S if law.horizon == "finite" else None) for law in (laws, laws.attitude)
+    ]
+    hold = tracking.Q, tracking.R
+    times = np.unique(np.concatenate([lqr.knots(length, *law) for law in regulators]))
+    after = lqr.knots(rest, *hold) if rest > 0.0 else np.zeros(1)
     zero, found = np.zeros((2, 2)), []
-    for horizon, Q, R, S in regulators:
-        final = S if horizon == "finite" else None
-        response = lqr.double_integrator_response(times, length, Q, R, final)
+    for law in regulators:
+        response = lqr.double_integrator_response(times, length, *law)
         x = lqr.led(response, times, np.eye(2), zero, length)
         pieces = [lqr.quintic_pieces(times, *x)]
         if rest > 0.0:
-            response = lqr.double_integrator_response(after, rest, *tracking, None)
+            response = lqr.double_integrator_response(after, rest, *hold, None)
             x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
             pieces.append(lqr.quintic_pieces(after, *x))
         found.append(np.concatenate(pieces))
@@ -110,10 +103,7 @@ def regulated(
     mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
 ) -> RegulatedTrajectory:
     """The regulators' trajectory from one pose at ``t0`` [s] to another, and on to the end of the phase."""
-    law, turn = ((x.horizon, x.Q, x.R, x.S) for x in (mission.lqr, mission.lqr.attitude))
-    ends = [(pose.r, pose.v, pose.T, pose.omega) for pose in (start, goal)]
-    tracking = (mission.tracking.Q, mission.tracking.R)
-    return RegulatedTrajectory((law, turn), tracking, *ends, t0, arrival, t_end)
+    return RegulatedTrajectory(mission.lqr, mission.tracking, start, goal, t0, arrival, t_end)
 
 
 @dataclass
@@ -325,8 +315,3 @@ def as_motion(knots: Floats, coefficients: Floats, T1: Floats) -> Motion:
     An array of another memory layout has another type, and would compile the kernel again.
     """
     return Motion(knots, np.ascontiguousarray(coefficients), np.ascontiguousarray(T1))
-
-
-def _knots(law: _Law, T: float) -> Floats:
-    horizon, Q, R, S = law
-    return lqr.knots(T, Q, R, S if horizon == "finite" else None)

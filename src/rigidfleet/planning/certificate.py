@@ -72,8 +72,9 @@ def straight(reference: Reference, radius: Floats, lost: Bools | None = None) ->
     if len(p) < 2:
         return None
     least = _least if p.nbytes < _KEPT else _least.__wrapped__
-    separation, pair, share = least(p.tobytes(), dp.tobytes(), r.tobytes())
-    i, j = (int(k if left is None else left[k]) for k in pair)
+    separation, (i, j), share = least(p.tobytes(), dp.tobytes(), r.tobytes())
+    if left is not None:
+        i, j = int(left[i]), int(left[j])
     time = reference.t0
     if share > 0.0:
         time += reference.T_b * _when(share)

@@ -47,8 +47,8 @@ def disturbance(mission: Mission) -> Disturbance:
         shape = (_knots(mission, step), 2, mission.n_agents, 3)
         white = np.random.default_rng((1, d.noise.seed)).standard_normal(shape)
         r, v = (
-            filters.spline_coefficients(white[:, k], scale)
-            for k, scale in enumerate((d.noise.position, d.noise.velocity))
+            filters.spline_coefficients(white, scale, part)
+            for part, scale in enumerate((d.noise.position, d.noise.velocity))
         )
         out = out._replace(noise_step=step, noise_r=r, noise_v=v)
     return out

@@ -7,6 +7,7 @@ process for any step. The input is white standard-normal samples, so that the ca
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -73,28 +74,38 @@ def _followed(x: Floats, a: float) -> Floats:
     return z
 
 
-def spline_coefficients(samples: Floats, scale: float = 1.0) -> Floats:
+def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = None) -> Floats:
     """Coefficients (K + 2, ...) of the natural cubic B-spline through samples (K, ...), K >= 2, on even knots.
 
-    The samples are multiplied by a ``scale``. Coefficients c solve the tridiagonal system
-    c_{k-1} + 4 c_k + c_{k+1} = 6 y_k; both ends are samples.
+    The samples are multiplied by a ``scale``; if a ``part`` is given, they are samples[:, part]. Coefficients c solve
+    the tridiagonal system c_{k-1} + 4 c_k + c_{k+1} = 6 y_k; both ends are samples.
     """
     from rigidfleet.kernel.engine import native
 
-    n = len(samples)
-    flat = samples.reshape(n, -1)
-    table = np.empty((n + 2, flat.shape[1]))
-    c, ends = table[1:-1], scale * flat[[0, -1]]
+    n, shape = len(samples), samples.shape[1 if part is None else 2 :]
+    flat, width = np.ascontiguousarray(samples).reshape(n, -1), math.prod(shape)
+    first = (part or 0) * width
+    table = np.empty((n + 2, width))
+    c, ends = table[1:-1], scale * flat[[0, -1], first : first + width]
     if n > 2:
-        pivots = np.full(n - 2, _PIVOT)  # of the factors without exchanges
-        pivot = 0.0
-        for k in range(min(_EARLY, n - 2)):
-            pivots[k] = pivot = 1.0 / (4.0 - pivot)
-        np.multiply(flat[1:-1], (6.0 * scale * pivots)[:, None], out=c[1:-1])
+        pivots = _pivots(n - 2)
+        native.multiply_rows(flat[1:-1], first, 6.0 * scale * pivots, c[1:-1])
         c[1] -= pivots[0] * ends[0]
         c[-2] -= pivots[-1] * ends[1]
+        factors = -pivots
         for backward in (False, True):
-            native.follow(c[1:-1], -pivots, backward=backward)
+            native.follow(c[1:-1], factors, backward=backward)
     c[0], c[-1] = ends
     table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
-    return table.reshape(n + 2, *samples.shape[1:])
+    return table.reshape(n + 2, *shape)
+
+
+@lru_cache(8)
+def _pivots(n: int) -> Floats:
+    """Pivots (n,) of the factors without exchanges of a system of n equations; read-only."""
+    pivots = np.full(n, _PIVOT)
+    pivot = 0.0
+    for k in range(min(_EARLY, n)):
+        pivots[k] = pivot = 1.0 / (4.0 - pivot)
+    pivots.flags.writeable = False
+    return pivots

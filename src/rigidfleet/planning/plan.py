@@ -6,6 +6,7 @@ kernel only evaluates. A `PhaseState` holds what the next phase inherits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -60,7 +61,11 @@ from rigidfleet.planning.reference import (
     reference_kind,
     slots_before,
 )
-from rigidfleet.planning.tolerances import absolute_tolerances, tolerance_of_velocity
+from rigidfleet.planning.tolerances import (
+    absolute_tolerances,
+    tolerance_of_velocity,
+    tolerances_of_small,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
@@ -103,6 +108,7 @@ class PhasePlan:
     radius: Floats  # (N,) [m]
     before: PhaseState  # the state that the phase starts from
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
+    loses: bool  # whether vehicles or links are lost at any time of the mission
     blend: Reference  # of all edges, before any is released
     through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
@@ -153,18 +159,15 @@ class PhasePlan:
         return np.concatenate([x.ravel(), y.ravel(), integral, q, *cm])
 
     @cached_property
-    def loses(self) -> bool:
-        """Whether vehicles or links are lost at any time."""
-        return bool(len(self.links_lost[1]) or np.isfinite(self.lost_at).any())
-
-    @cached_property
     def tolerances(self) -> Floats:
         """Absolute tolerances (n,) of the states."""
-        velocity, size = self.velocity_tolerance(), 6 * len(self.masses) + len(self.edges)
+        n, m = len(self.masses), len(self.edges)
+        size = 6 * n + m
         size += 0 if self.frame is None else 10 if self.problem.body_formulation else 4
-        return absolute_tolerances(
-            self.integrator, size, velocity, self.distances, large=self.large
-        )
+        if not self.large:
+            return tolerances_of_small(self.integrator, n, m, size)
+        velocity = self.velocity_tolerance()
+        return absolute_tolerances(self.integrator, size, velocity, self.distances, large=True)
 
     def velocity_tolerance(self) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
@@ -311,8 +314,9 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
-        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost, blend=reference,
-        through=passed(trajectory), smooth=mission.smooth or mission.on_loss != "continue",
+        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost,
+        loses=mission.first_loss < math.inf, blend=reference, through=passed(trajectory),
+        smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
@@ -376,17 +380,19 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs, wanted, most = _wanted(slots)
-    near = np.abs(distance_geometry.distances(r, pairs) - wanted).max() <= most
+    pairs, most = _wanted(slots)
+    x = r.tolist()
+    near = all(abs(math.dist(x[i], x[j]) - wanted) <= most for i, j, wanted in pairs)
     return name if near else None
 
 
 @kept
-def _wanted(slots: Floats) -> tuple[Ints, Floats, float]:
-    """All pairs of slots (N, 3), their distances [m], and the greatest error [m] at which they count as held."""
+def _wanted(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
+    """All pairs of slots (N, 3) with their distance [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
-    wanted = distance_geometry.distances(slots, pairs)
-    return pairs.copy(), wanted, _NEAR * float(wanted.min())
+    wanted = distance_geometry.distances(slots, pairs).tolist()
+    listed = [(i, j, d) for (i, j), d in zip(pairs.tolist(), wanted, strict=True)]
+    return listed, _NEAR * min(wanted)
 
 
 @kept

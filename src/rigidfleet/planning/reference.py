@@ -70,6 +70,9 @@ State = TypeVar("State")
 #: The rates of a pose that has none, which all such poses share.
 _ZERO = np.zeros(3)
 _ZERO.flags.writeable = False
+#: No rotation.
+_SAME = np.eye(3)
+_SAME.flags.writeable = False
 
 
 def changed(state: State, **fields: Any) -> State:
@@ -173,7 +176,7 @@ def attach(
             pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
     slots = now.slots if now.slots is not None else about_cm(now.r, masses) @ pose.T.T
     goal = now.goal or changed(pose, v=np.zeros(3), omega=np.zeros(3))
-    turn = np.eye(3)
+    turn = _SAME
     if establishing is not None and target is not None:
         # The new axes in the old ones: `axes` maps vectors from new to old.
         free = mission.free_attitude(phase)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.typing import Floats
 
@@ -49,6 +50,13 @@ def absolute_tolerances(
     if given.atol_attitude is not None:
         atol[6 * n + m : 6 * n + m + 4] = given.atol_attitude
     return atol
+
+
+@kept
+def tolerances_of_small(given: IntegratorOptions, n: int, m: int, size: int) -> Floats:
+    """`absolute_tolerances` of n agents with m edges that are not solved for as a large formation."""
+    velocity = np.full(n, given.atol_velocity or given.atol)
+    return absolute_tolerances(given, size, velocity, np.zeros(m), large=False)
 
 
 def tolerance_of_velocity(

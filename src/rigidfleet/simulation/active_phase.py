@@ -35,7 +35,6 @@ from rigidfleet.simulation.solver_setup import (
     equip,
     first_step,
     give_back,
-    integrator,
     solved_by,
 )
 from rigidfleet.typing import Bools, Floats
@@ -118,9 +117,10 @@ class ActivePhase:
         plan = self.plan
         #: Whether another thread searches the steps for extremes. It must not ask the user's force.
         self.aside = plan.large and self.external is None
-        trail = self.extremes.begin(len(y), len(plan.edges), aside=self.aside)
+        self.state = self.extremes.begin(
+            y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances, aside=self.aside
+        )
         self.workspace, self.solver = equip(plan)
-        self.state = integrator(self.plan, y, t, trail)
 
     @property
     def t(self) -> float:

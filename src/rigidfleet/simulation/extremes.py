@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, Obstacle
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -73,17 +74,27 @@ _STORED = [(name, k, -1.0 if name in _GREATEST else 1.0) for name, k in _NAMES.i
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
-class _Thing(NamedTuple):
-    """An obstacle, as its arrays alone."""
+#: Size of an integrator: states, states in its trail, agents, edges.
+_Size = tuple[int, int, int, int]
+#: Integrators that no flight uses, by size, because their trails are large; how many of each.
+_idle: dict[_Size, list[records.IntegratorState]] = {}
+_KEPT = 8
 
-    solid: Solids
+
+def _idle_integrator(size: _Size) -> records.IntegratorState | None:
+    try:
+        return _idle[size].pop()
+    except (KeyError, IndexError):
+        return None
 
 
-@kept
-def _stood(position: Floats, radius: Floats, obstacles: tuple[_Thing, ...]) -> Ints:
+def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...]) -> Ints:
     """Whether agents stand on obstacles at the start (N,)."""
     start, _ = proximity.obstacle_clearances(position, radius, obstacles)
     return (start <= PAD).astype(np.int64)
+
+
+_standing_kept = kept(_standing)
 
 
 class Extremes:
@@ -102,12 +113,14 @@ class Extremes:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        things = tuple(_Thing(thing.solid) for thing in mission.obstacles)
-        self.stood = _stood(mission.fleet.position, self.radius, things)
+        # Obstacles that are not boxes may be large, and are not to be kept.
+        standing = _standing_kept if self.solids is None else _standing
+        self.stood = standing(mission.fleet.position, self.radius, mission.obstacles)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
-        self.trail = records.NO_TRAIL
+        self.state: records.IntegratorState | None = None  # of the integrator that is monitored
+        self.size: _Size | None = None  # for which there is a monitor
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
         self._touching: Future[None] | None = None
@@ -127,7 +140,7 @@ class Extremes:
     def among(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
         self._take_obstacles(obstacles)
-        if len(self.trail.points):
+        if self.size is not None:
             found = self.monitor.monitor
             self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
 
@@ -150,35 +163,65 @@ class Extremes:
         self.who.fill(-1)
         self.standing[:] = self.stood
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
-        if len(self.trail.points):
+        if self.size is not None:
             flags = self.monitor.monitor.flags
             flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
 
-    def begin(self, states: int, edges: int, *, aside: bool = False) -> records.Trail:
-        """Begin to monitor an integrator with this many states; it must record its steps in the returned trail.
+    def begin(
+        self,
+        y: Floats,
+        t: float,
+        edges: int,
+        *,
+        rtol: float,
+        atol: Floats,
+        states: int | None = None,
+        aside: bool = False,
+    ) -> records.IntegratorState:
+        """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
 
-        ``aside``: they will be handed over to another thread.
+        ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
+        thread.
         """
-        if self.trail.points.shape[2] == states and len(self.trail.start) == 3 * self.n + 2 * edges:
-            return self.trail
-        self.trail = trail = records.trail(states, self.n, edges)
-        found = records.monitor(
-            self.radius, self.boxes, self.fence, states, len(trail.start),
-            worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
-            standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-            struck=self.struck, listed=np.zeros((2, len(trail.clock)), dtype=np.int64),
-        )  # fmt: skip
-        self.monitor = native.Watch(found)
-        if aside:
-            # Memory costs far more time when it is first touched than ever after. The rows that the integrator reaches
-            # after it has handed over steps are touched while it flies these.
-            self._touching = self._beside().submit(trail.points[self._half :].fill, 0.0)
-        return trail
+        size = len(y), states or len(y), self.n, edges
+        known = size == self.size
+        if not known:
+            self.let_go()
+        state = self.state or _idle_integrator(size)
+        if state is None:
+            trail = records.trail(*size[1:])
+            state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
+        else:
+            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
+        self.state, self.size = state, size
+        if not known:
+            steps, gauge = state.trail.gauge.shape
+            found = records.monitor(
+                self.radius, self.boxes, self.fence, size[1], gauge,
+                worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
+                standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
+                struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
+            )  # fmt: skip
+            self.monitor = native.Watch(found)
+            if aside:
+                # Memory costs far more time when it is first touched than ever after. The rows that the integrator
+                # reaches after it has handed over steps are touched while it flies these.
+                half = self._half(state)
+                self._touching = self._beside().submit(state.trail.points[half:].fill, 0.0)
+        return state
 
-    @property
-    def _half(self) -> int:
+    def let_go(self) -> None:
+        """Let the monitors of other flights use the integrator."""
+        if self.state is not None and self.size is not None and self.n <= _FEW:
+            idle = _idle.setdefault(self.size, [])
+            if len(idle) < _KEPT:
+                idle.append(self.state)
+        self.state = None
+
+    @staticmethod
+    def _half(state: records.IntegratorState) -> int:
         """Steps that fit into the trail beside as many others and one that has stayed."""
-        return (len(self.trail.clock) - 1) // 2
+        return (len(state.trail.clock) - 1) // 2
 
     def _beside(self) -> ThreadPoolExecutor:
         """The other thread."""
@@ -202,7 +245,7 @@ class Extremes:
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
         self._list_all()
-        self.trail = records.NO_TRAIL  # other vehicles are monitored from now on
+        self.state = self.size = None  # other vehicles are monitored from now on
 
     def take(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
@@ -221,7 +264,7 @@ class Extremes:
 
     def room(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
-        half, steps = self._half, int(state.count[4])
+        half, steps = self._half(state), int(state.count[4])
         if self._touching is not None:
             if not steps:
                 return half
@@ -346,10 +389,11 @@ class Extremes:
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
+        new = tuple.__new__  # an extremum by its own name takes twice as long
         found = {
-            name: Extremum(sign * value, when[k], *who[k])
+            name: new(Extremum, (sign * worst[k], when[k], *who[k]))
             for name, k, sign in _STORED
-            if math.isfinite(value := worst[k])
+            if -math.inf < worst[k] < math.inf
         }
         if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
             found["tension"] = tension._replace(value=-tension.value)
@@ -398,10 +442,8 @@ class Extremes:
         """List all pairs of a small fleet; none of a large one yet."""
         self.moved[:] = np.inf
         if self.n <= _FEW:
-            i, j = np.triu_indices(self.n, 1)
-            both = self.left[i] & self.left[j]
-            self.pairs = np.stack([i[both], j[both]], axis=1)
-            self.columns = self.pairs
+            pairs = _all_pairs(self.n)
+            self.pairs = self.columns = pairs[self.left[pairs].all(axis=1)]
 
     def _step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
@@ -481,6 +523,12 @@ class Extremes:
         self.monitor = native.Watch(
             before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
+
+
+@cache
+def _all_pairs(n: int) -> Ints:
+    """All pairs (P, 2) of n agents."""
+    return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 def _row(state: records.IntegratorState, step: int) -> int:

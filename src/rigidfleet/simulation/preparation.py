@@ -45,7 +45,8 @@ class Preparation:
         return found
 
     def give_back(self, extremes: Extremes) -> None:
-        """Let another flight use the monitor of one that is finished."""
+        """Let other flights use the monitor of one that is finished."""
+        extremes.let_go()
         if extremes.reusable and len(self._idle) < _KEPT:
             self._idle.append(extremes)
 
@@ -65,7 +66,7 @@ class Preparation:
         found = self._plans.get(key)
         if found is None or found.phase is not phase:
             found = plan_phase(self.mission, phase, now, disturbance=given, external=external)
-            _ = found.certificate, found.tolerances, found.loses  # once for all flights
+            _ = found.certificate, found.tolerances  # once for all flights
             self._plans = {key: found}
         plan = changed(found)
         plan.before = changed(found.before)

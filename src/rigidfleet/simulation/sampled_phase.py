@@ -32,7 +32,7 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
 from rigidfleet.simulation.recording import LayerSamples, Led, Piece, VehicleSamples
-from rigidfleet.simulation.solver_setup import equip, integrator
+from rigidfleet.simulation.solver_setup import equip
 from rigidfleet.typing import Floats
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
@@ -91,8 +91,8 @@ class SampledPhase(ActivePhase):
         plan, given = self.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
         self.workspace, self.solver = equip(plan)
-        trail = self.extremes.begin(6 * n, m)
-        self.state = integrator(plan, y, t, trail)
+        rtol, atol = plan.integrator.rtol, plan.tolerances
+        self.state = self.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
         lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         if self.parted.any():
@@ -117,6 +117,7 @@ class SampledPhase(ActivePhase):
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
+        trail = self.state.trail
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
         if given.avoidance is not None:
             given.avoidance = avoidance.holding(given.avoidance, m)

@@ -82,13 +82,6 @@ def give_back(problem: Problem, work: Workspace) -> None:
         idle.append(work)
 
 
-def integrator(
-    plan: PhasePlan, y: Floats, t: float, trail: records.Trail
-) -> records.IntegratorState:
-    """An integrator of a plan at time t [s] and state y (n,), which records its steps in a trail."""
-    return records.integrator(y, t, rtol=plan.integrator.rtol, atol=plan.tolerances, trail=trail)
-
-
 def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState) -> float:
     """First step [s] to try in a large formation, from two evaluations.
 

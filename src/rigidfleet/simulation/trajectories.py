@@ -412,9 +412,9 @@ def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces, *, smoo
     )
     problem = plan_phase(mission, mission.phases[0], PhaseState(0.0, r, v)).problem
     work = workspace(n, 0)
-    trail = extremes.begin(6 * n, 0)
     y = np.zeros(6 * n)
-    state = records.integrator(y, record.t_start, rtol=1e-9, atol=np.ones_like(y), trail=trail)
+    state = extremes.begin(y, record.t_start, 0, rtol=1e-9, atol=np.ones_like(y))
+    trail = state.trail
     powers = pieces.position.shape[-1]
     together = max(1, _TOGETHER // (n * 3 * powers))
     row, best = 0, {}

@@ -143,7 +143,8 @@ class Tables:
             fields[name] = made.reshape(count, 3 * agents)
         return fields
 
-    def _room(self, name: str, size: int) -> LaneArray:
+    def _room(self, name: str, size: int) -> Any:
+        """Lanes (size,) of a table."""
         if len(self._lanes[name]) < size:
             self._lanes[name] = simd.empty((size,))
         return self._lanes[name][:size]

@@ -40,6 +40,7 @@ from rigidfleet.kernel.problem import (
     Workspace,
 )
 from rigidfleet.kernel.records import (
+    NO_FACTORS,
     IntegratorState,
     Monitor,
     Record,
@@ -131,8 +132,23 @@ class Watch:
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    segment = Segment(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy)
-    _call(_code().record, packed(problem), packed(workspace), pack(segment), packed(UNRECORDED))
+    found = _own.segment
+    if found is None or len(found.of.dy) != len(y):
+        found = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
+        _own.segment = found
+    segment: Segment = found.of
+    segment.times[0], segment.samples[0] = t, y
+    _call(_code().record, packed(problem), packed(workspace), found, packed(UNRECORDED))
+    dy[:] = segment.dy
+
+
+class _Own(threading.local):
+    """The segment of one state with which a thread has called `closed_loop` last."""
+
+    segment: Packed | None = None
+
+
+_own = _Own()
 
 
 def _call(function: Any, *arguments: Packed) -> int:
@@ -154,6 +170,11 @@ def least_singular_values(r: Floats, edges: Ints) -> Floats:
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
     _call(_code().follow, pack(Recursion(x, a, backward)))
+
+
+def multiply_rows(y: Floats, first: int, b: Floats, x: Floats) -> None:
+    """x_k = b_k y_k in rows x (K, M), from the M columns of y (K, C) that begin with ``first``; b (K,)."""
+    _call(_code().follow, pack(Recursion(x, NO_FACTORS, False, y, first, b)))
 
 
 class _Code(NamedTuple):

@@ -190,7 +190,7 @@ def pack(x: Any) -> Packed:
 
 
 class _Last(threading.local):
-    """The tuples that a thread packed last, by identity: flights call the kernel with the same ones repeatedly."""
+    """The tuples that a thread used last, by identity: flights call the kernel with the same ones repeatedly."""
 
     def __init__(self) -> None:
         self.packed: dict[int, Packed] = {}
@@ -202,19 +202,19 @@ _KEPT = 32
 
 
 def packed(x: Any) -> Packed:
-    """`pack`, unless the named tuple is among the last ones that the thread has packed."""
+    """`pack`, unless the named tuple is among the last ones that the thread has used."""
     kept = _last.packed
-    found = kept.get(id(x))
+    found = kept.pop(id(x), None)
     if found is None or found.of is not x:
         found = pack(x)
         if len(kept) >= _KEPT:
             del kept[next(iter(kept))]
-        kept[id(x)] = found
+    kept[id(x)] = found
     return found
 
 
 def forget() -> None:
-    """Let go of the tuples that this thread has packed last; those of a large formation hold much memory."""
+    """Let go of the tuples that this thread has used last; those of a large formation hold much memory."""
     _last.packed.clear()
 
 
