@@ -30,6 +30,8 @@ _OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
 _OF_EDGES = frozenset(("tension", "constraint"))
 
 
+#: Number of values that fit into the processor's cache.
+_CACHED = 60_000
 #: About so many curves are compared together.
 _TOGETHER = 100_000
 #: The first sample.
@@ -339,7 +341,6 @@ class Measurements:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
-        length = proximity.lengths(r, result.edges)
         reach = float(max(r.max(initial=0.0), -r.min(initial=0.0)))
         if math.isnan(reach):
             reach = float(np.nanmax(np.abs(r), initial=0.0))
@@ -348,7 +349,7 @@ class Measurements:
             stored = {
                 "separation": (result.separation - self.close.separation, "m"),
                 "clearance": (result.clearance - self.close.clearance, "m"),
-                "distance": (np.abs(result.distance - length.T), "m"),
+                "distance": (self.off_lengths, "m"),
                 "thrust": (self.thrust - result.thrust, "N"),
             }
         for name, (off, unit) in stored.items():
@@ -395,6 +396,18 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
+
+    @property
+    def off_lengths(self) -> Floats:
+        """Size (K, m) [m] by which recorded lengths of edges differ from those between positions."""
+        r, edges, given = self.result.position, self.result.edges, self.result.distance
+        off = np.empty(given.shape)
+        some = max(1, _CACHED * len(r) // r.size)  # of some samples at a time
+        for k in range(0, len(r), some):
+            part = slice(k, k + some)
+            np.subtract(given[part], proximity.lengths(r[part], edges).T, out=off[part])
+            np.abs(off[part], out=off[part])
+        return off
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""

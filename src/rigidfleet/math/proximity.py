@@ -315,11 +315,28 @@ def obstacle_clearances(
     Obstacles that move are where they are at ``time`` (...) [s]. Distances beyond ``most`` (..., N) [m] need not be
     known: these are ``most``, without an obstacle.
     """
-    radius = np.asarray(radius, dtype=float)
     nearest = np.full(r.shape[-2::-1], -1)
     least = np.broadcast_to(np.asarray(most, dtype=float).T, nearest.shape).copy()
+    n = r.shape[-2]
+    radius = np.broadcast_to(np.asarray(radius, dtype=float), n)
+    some = max(1, _CACHED * n // max(1, r.size))
+    for first in range(0, n if obstacles else 0, some):
+        part = slice(first, first + some)
+        _approach(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
+    return least.T, nearest.T
+
+
+def _approach(
+    least: Floats,
+    nearest: Ints,
+    r: Floats,
+    radius: Floats,
+    obstacles: Sequence[Obstacle],
+    time: ArrayLike,
+) -> None:
+    """Reduce distances (N, ...) of agents r (..., N, 3) to those of nearer obstacles."""
     # Axis by axis, in rows of samples, which is faster.
-    places = np.ascontiguousarray(r.T) if obstacles else r.T
+    places = np.ascontiguousarray(r.T)
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
         far = least + radius if thing.solid.kind[0] in _SURFACES else np.inf
@@ -327,12 +344,11 @@ def obstacle_clearances(
         clearance -= radius
         closer = clearance < least  # false for NaN
         if closer.all():
-            least = clearance
+            least[...] = clearance
             nearest.fill(k)
         elif closer.any():
             np.copyto(least, clearance, where=closer)
             np.copyto(nearest, k, where=closer)
-    return least.T, nearest.T
 
 
 def distances(
