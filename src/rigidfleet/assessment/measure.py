@@ -345,13 +345,12 @@ class Measurements:
         if math.isnan(reach):
             reach = float(np.nanmax(np.abs(r), initial=0.0))
         rounding = 1e-9 * (1.0 + reach)
+        stored = {}
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
-            stored = {
-                "separation": (result.separation - self.close.separation, "m"),
-                "clearance": (result.clearance - self.close.clearance, "m"),
-                "distance": (self.off_lengths, "m"),
-                "thrust": (self.thrust - result.thrust, "N"),
-            }
+            for name in ("separation", "clearance"):
+                if name in vars(result):  # else it would be made of these very positions
+                    stored[name] = getattr(result, name) - getattr(self.close, name), "m"
+        stored |= {"distance": (self.off_lengths, "m"), "thrust": (self.thrust - result.thrust, "N")}
         for name, (off, unit) in stored.items():
             wrong = off > (rounding if unit == "m" else 1e-6)
             if wrong.any():
@@ -541,26 +540,23 @@ class Measurements:
         if not targets:
             return {}
         at = [self.nearest(target["time"], k) for k, target in targets]
-        flown = {
-            "position": result.cm[at], "velocity": result.cm_velocity[at], "attitude": result.attitude[at],
-            "rates": result.rates[at],
-        }  # fmt: skip
-        #: Where a quantity is asked for, and known.
-        asked = {
-            name: [
-                i for i, ((_, target), row) in enumerate(zip(targets, rows.tolist(), strict=True))
-                if target.get(name) is not None and all(map(math.isfinite, row))
-            ]
-            for name, rows in flown.items()
-        }  # fmt: skip
         miss: dict[str, dict[int, float]] = {}
-        for name, who in asked.items():
-            wanted = [targets[i][1][name] for i in who]
-            if name == "attitude" and who:
-                off = np.degrees(att.angle_between(flown[name][who], wanted)).tolist()
+        for name, values in (
+            ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
+            ("rates", result.rates),
+        ):  # fmt: skip
+            rows = values[at].tolist()
+            # Where the quantity is asked for, and known.
+            asked = {
+                i: wanted for i, ((_, target), row) in enumerate(zip(targets, rows, strict=True))
+                if (wanted := target.get(name)) is not None and all(map(math.isfinite, row))
+            }  # fmt: skip
+            rows = [rows[i] for i in asked]
+            if name == "attitude" and rows:
+                off = np.degrees(att.angle_between(rows, [*asked.values()])).tolist()
             else:
-                off = list(map(math.dist, flown[name][who].tolist(), wanted))
-            miss[name] = dict(zip(who, off, strict=True))
+                off = map(math.dist, rows, asked.values())
+            miss[name] = dict(zip(asked, off, strict=True))
         return {
             k: Waypoint(
                 time=t,

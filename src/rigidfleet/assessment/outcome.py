@@ -1,5 +1,7 @@
 """The outcome of checks, phases and waypoints."""
 
+# The classes are not frozen: a flight of many phases makes hundreds, each in a fifth of the time.
+
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -37,7 +39,7 @@ SENSE: dict[str, Callable[..., Any]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Extreme:
     """Worst value of a quantity: how much, when [s], who, and in which phase."""
 
@@ -47,7 +49,7 @@ class Extreme:
     phase: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class CheckResult:
     """One check.
 
@@ -82,7 +84,7 @@ class CheckResult:
         return words.format(worst=worst, limit=limit, who=self.who)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Waypoint:
     """Miss of a waypoint at its time [s]: [m], [m/s], [deg], [deg/s]; None for what it does not specify."""
 
@@ -93,7 +95,7 @@ class Waypoint:
     rates: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class PhaseVerdict:
     """Numbers of one phase; None where they do not apply.
 
