@@ -350,7 +350,10 @@ class Measurements:
             for name in ("separation", "clearance"):
                 if name in vars(result):  # else it would be made of these very positions
                     stored[name] = getattr(result, name) - getattr(self.close, name), "m"
-        stored |= {"distance": (self.off_lengths, "m"), "thrust": (self.thrust - result.thrust, "N")}
+        stored |= {
+            "distance": (self.off_lengths, "m"),
+            "thrust": (self.thrust - result.thrust, "N"),
+        }
         for name, (off, unit) in stored.items():
             wrong = off > (rounding if unit == "m" else 1e-6)
             if wrong.any():

@@ -191,17 +191,23 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
             least[k], pair[k] = _lowest(points, radius)
         return least, pair
     x = np.ascontiguousarray(r.T)
-    for i in range(n - 1):
-        d, radii = x[:2, i + 1 :] - x[:2, i : i + 1], radius[i] + radius[i + 1 :]
+    i, j = all_pairs(n)
+    some = max(1, _CACHED // max(1, 3 * len(r)))
+    for first in range(0, len(i), some):
+        part = slice(first, first + some)
+        radii = (radius[i] + radius[j])[part]
+        d = x[:2].take(j[part], axis=1)
+        d -= x[:2].take(i[part], axis=1)
         d *= d
         d[0] += d[1]
         overlap = d[0] <= (radii**2)[:, None]  # false for agents without a position
-        for j in np.flatnonzero(overlap.any(axis=1)).tolist():
-            height = abs(x[2, i + 1 + j] - x[2, i]) - radii[j]
-            lower = overlap[j] & (height < least)
+        for k in np.flatnonzero(overlap.any(axis=1)).tolist():
+            a, b = i.item(first + k), j.item(first + k)
+            height = abs(x[2, b] - x[2, a]) - radii[k]
+            lower = overlap[k] & (height < least)
             np.copyto(least, height, where=lower)
-            np.copyto(pair[:, 0], i, where=lower)
-            np.copyto(pair[:, 1], i + 1 + j, where=lower)
+            np.copyto(pair[:, 0], a, where=lower)
+            np.copyto(pair[:, 1], b, where=lower)
     return least, pair
 
 
