@@ -144,14 +144,17 @@ class Fit:
         return SHAPE_TOLERANCE * self.shortest
 
 
-def length(x: Floats) -> Floats:
-    """Lengths (...) of vectors (..., 3)."""
+def length(x: Floats, more: Floats | None = None) -> Floats:
+    """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
     if x.size > _CACHED and len(x) > 1:  # in parts, of which what is between stays in the cache
         found = np.empty(x.shape[:-1])
         some = max(1, _CACHED * len(x) // x.size)
         for k in range(0, len(x), some):
-            found[k : k + some] = length(x[k : k + some])
+            part = slice(k, k + some)
+            found[part] = length(x[part], None if more is None else more[part])
         return found
+    if more is not None:
+        x = x + more
     squares = x * x
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 

@@ -87,7 +87,7 @@ class Measurements:
             result.time,
             self.left,
         )
-        thrust = length(result.input_force + result.constraint_force)
+        thrust = length(result.input_force, result.constraint_force)
         if self.mission.agents.saturate:
             thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
         if result.rotor_force is not None:  # what was given, not what was asked
@@ -401,15 +401,16 @@ class Measurements:
 
     @property
     def off_lengths(self) -> Floats:
-        """Size (K, m) [m] by which recorded lengths of edges differ from those between positions."""
+        """Greatest size (K,) [m] by which a recorded length of an edge differs from that between positions."""
         r, edges, given = self.result.position, self.result.edges, self.result.distance
-        off = np.empty(given.shape)
+        greatest = np.zeros(len(r))
         some = max(1, _CACHED * len(r) // r.size)  # of some samples at a time
         for k in range(0, len(r), some):
             part = slice(k, k + some)
-            np.subtract(given[part], proximity.lengths(r[part], edges).T, out=off[part])
-            np.abs(off[part], out=off[part])
-        return off
+            off = proximity.lengths(r[part], edges)
+            off -= given[part].T
+            np.fmax.reduce(np.abs(off, out=off), axis=0, initial=0.0, out=greatest[part])
+        return greatest
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
