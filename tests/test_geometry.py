@@ -322,6 +322,24 @@ def test_mean_axis_rates_are_those_of_the_rigid_motion(seed, n):
     np.testing.assert_allclose(rates, omega, rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-7, 1e-3, 0.1, 1.0, 4.0])
+def test_rates_of_a_line_leave_out_the_spin_about_it(off):
+    """As the pseudo-inverse of the inertia does, whose small eigenvalues are zero: also of agents beside their line."""
+    rng = np.random.default_rng(1)
+    x, y = LINE + off * rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3, 3))
+    x, y = (
+        z - z.mean(axis=1, keepdims=True) for z in (x @ Rotation.random(rng=rng).as_matrix(), y)
+    )
+    found = measure(
+        x, y, np.broadcast_to(LINE, x.shape), np.ones(3), np.broadcast_to(EYE, (5, 3, 3))
+    )
+    assert found.line.all()
+    inertia = np.einsum("kia,kia,bc->kbc", x, x, EYE) - np.einsum("kib,kic->kbc", x, x)
+    rates = (np.linalg.pinv(inertia, rcond=0.01) @ np.cross(x, y).sum(axis=1)[..., None])[..., 0]
+    T = attitude.dcm_from_quaternion(found.attitude)
+    np.testing.assert_allclose(found.rates, (T @ rates[..., None])[..., 0], rtol=0, atol=1e-12)
+
+
 # -- ranks -----------------------------------------------------------------------------------------
 
 
@@ -367,6 +385,22 @@ def test_recorded_singular_values_are_numpys(seed, n):
         values = np.linalg.svd(jacobian(r[k], edges), compute_uv=False)
         least = values[values > 1e-6 * values[0]].min()
         assert found[k] == pytest.approx(least, rel=1e-7)
+
+
+def test_singular_values_of_triangles_are_numpys_however_flat():
+    """The least eigenvalue is exact to rounding; at each sample alone it is the same, and two agents in one place spoil
+    no other sample."""
+    rng = np.random.default_rng(3)
+    r = rng.normal(size=(21, 3, 3))
+    r[:, :, 1:] *= np.logspace(-6, 0, 21)[:, None, None]
+    r[5, 1] = r[5, 0]
+    edges = graphs.complete_graph(3)
+    found = native.least_singular_values(r, edges)
+    assert np.isnan(found).tolist() == [k == 5 for k in range(21)]
+    for k in set(range(21)) - {5}:
+        values = np.linalg.svd(jacobian(r[k], edges), compute_uv=False)
+        assert found[k] ** 2 == pytest.approx(values[values > 1e-7].min() ** 2, rel=0, abs=5e-15)
+        assert native.least_singular_values(r[[k]], edges)[0] == found[k]
 
 
 def test_weighted_singular_values_are_those_of_the_law():

@@ -20,8 +20,12 @@ from rigidfleet.typing import Floats, Ints
 THIN = 1e-3
 
 
-#: Greatest size of slots, in bytes, whose shape is cached for the next phase or flight.
+#: Size of slots, in bytes, from which on only the last shape is cached for the next phase or flight, not some tens.
 _KEPT = 100_000
+
+
+#: Number of values that fit into the processor's cache.
+_CACHED = 60_000
 
 
 #: Number of agents up to which all distances of a shape are computed at once.
@@ -103,7 +107,7 @@ class Fit:
     ) -> None:
         """Compare agents p (N, 3) with slots (N, 3), which are the k-th of ``laid``; ``who`` (N,) are their numbers."""
         self._laid, self._k = Laid(p[None], slots[None]) if laid is None else laid, k
-        shape = _shape if slots.nbytes < _KEPT else _shape.__wrapped__
+        shape = _shape if slots.nbytes < _KEPT else _shape_of_many
         self.dimension, self.axis, self._plane, self._order, self.shortest = shape(slots.tobytes())
         self.error, pair, self.flown, self.intended = _all_pairs(p, slots, self._laid, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
@@ -140,8 +144,17 @@ class Fit:
         return SHAPE_TOLERANCE * self.shortest
 
 
-def length(x: Floats) -> Floats:
-    """Lengths (...) of vectors (..., 3)."""
+def length(x: Floats, more: Floats | None = None) -> Floats:
+    """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
+    if x.size > _CACHED and len(x) > 1:  # in parts, of which what is between stays in the cache
+        found = np.empty(x.shape[:-1])
+        some = max(1, _CACHED * len(x) // x.size)
+        for k in range(0, len(x), some):
+            part = slice(k, k + some)
+            found[part] = length(x[part], None if more is None else more[part])
+        return found
+    if more is not None:
+        x = x + more
     squares = x * x
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
@@ -157,6 +170,9 @@ def _shape(slots: bytes) -> tuple[int, Floats, Floats, list[int], float]:
     order = (centred @ axis).argsort().tolist() if dimension == 1 else []
     plane = np.array([axes[0], np.cross(axis, axes[0])])
     return dimension, axis, plane, order, float(proximity.nearest(points).min())
+
+
+_shape_of_many = lru_cache(1)(_shape.__wrapped__)
 
 
 def _worst_of_few(p: Floats, slots: Floats) -> Floats:
@@ -181,20 +197,21 @@ def _all_pairs(
     if laid.worst is not None:
         error, i, j, flown, intended = laid.worst[k]
         return error, (int(i), int(j)), flown, intended
-    off, both = laid.off[k].tolist(), np.array([p, slots])
-    order = sorted(range(len(off)), key=lambda i: -off[i])
-    ranked, rounding = [-off[i] for i in order], _ROUNDING * float(laid.size[k])
+    off, both = laid.off[k], np.array([p, slots])
+    order = np.argsort(-off, kind="stable")
+    ranked, rounding = -off[order], _ROUNDING * float(laid.size[k])
     worst = (-1.0, (0, 0), 0.0, 0.0)
-    for first, i in enumerate(order[:-1], start=1):
+    for first, i in enumerate(order[:-1].tolist(), start=1):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)
         if last <= first:
             break
-        others = sorted(order[first:last])
-        flown, intended = length(both[:, others] - both[:, i, None]).tolist()
-        error = [abs(a - b) for a, b in zip(flown, intended, strict=True)]
-        if (most := max(error)) > worst[0]:
-            j = error.index(most)
-            worst = (most, (min(i, others[j]), max(i, others[j])), flown[j], intended[j])
+        others = np.sort(order[first:last])
+        flown, intended = length(both.take(others, axis=1) - both[:, i, None])
+        error = np.abs(flown - intended)
+        at = int(error.argmax())
+        if (most := float(error[at])) > worst[0]:
+            j = int(others[at])
+            worst = (most, (min(i, j), max(i, j)), float(flown[at]), float(intended[at]))
     return worst
 
 

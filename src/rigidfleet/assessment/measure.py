@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from rigidfleet.math.bernstein import greatest as extreme_of
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
+if TYPE_CHECKING:
+    from rigidfleet.mission.obstacles import Obstacle
+
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
@@ -30,6 +33,8 @@ _OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
 _OF_EDGES = frozenset(("tension", "constraint"))
 
 
+#: Number of values that fit into the processor's cache.
+_CACHED = 60_000
 #: About so many curves are compared together.
 _TOGETHER = 100_000
 #: The first sample.
@@ -64,6 +69,31 @@ class Quantity:
             self.most = np.maximum.reduceat(self.rank.reshape(-1), places * starts).tolist()
 
 
+def agent(_k: int, i: int) -> str:
+    """Name of agent i (from 0), the same at every sample."""
+    return f"agent {i + 1}"
+
+
+def _edge(edges: Ints, _k: int, e: int) -> str:
+    """Name of edge e (from 0), the same at every sample."""
+    i, j = edges[e].tolist()
+    return f"edge {i + 1}-{j + 1}"
+
+
+def _pair(close: proximity.Closeness, k: int) -> str:
+    """The two agents that are nearest to each other at sample k."""
+    return agent_names(sorted(close.pair[k].tolist()))
+
+
+def _obstacle(close: proximity.Closeness, obstacles: Sequence[Obstacle], k: int) -> str:
+    """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
+    return _beside(obstacles, close.agent.item(k), close.obstacle.item(k))
+
+
+def _beside(obstacles: Sequence[Obstacle], agent: int, obstacle: int) -> str:
+    return f"agent {agent + 1}, {obstacles[obstacle].name}"
+
+
 class Measurements:
     """Measures a result phase by phase, at samples (recomputed from positions and forces) and between them."""
 
@@ -85,7 +115,7 @@ class Measurements:
             result.time,
             self.left,
         )
-        thrust = length(result.input_force + result.constraint_force)
+        thrust = length(result.input_force, result.constraint_force)
         if self.mission.agents.saturate:
             thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
         if result.rotor_force is not None:  # what was given, not what was asked
@@ -98,17 +128,20 @@ class Measurements:
             for x in (result.velocity, result.acceleration, result.constraint_force)
         )
         close, single = self.close, result.singular_value
+        # Owners know what they need of this object, not the object: no cycle keeps a record that is judged.
+        edge, pair = partial(_edge, result.edges), partial(_pair, close)
+        obstacle = partial(_obstacle, close, self.mission.obstacles)
         self.measured: dict[str, Quantity] = {
             name: Quantity(values, who, rank, starts)
             for name, values, who, rank in (
-                ("constraint", constraint, self.edge, constraint),
-                ("separation", close.separation, self.pair, -close.separation),
-                ("clearance", close.clearance, self.obstacle, -close.clearance),
-                ("thrust", self.thrust, self.agent, self.thrust),
-                ("speed", speed, self.agent, speed),
-                ("acceleration", acceleration, self.agent, acceleration),
-                ("constraint_force", force, self.agent, force),
-                ("tension", tension, self.edge, np.abs(tension)),
+                ("constraint", constraint, edge, constraint),
+                ("separation", close.separation, pair, -close.separation),
+                ("clearance", close.clearance, obstacle, -close.clearance),
+                ("thrust", self.thrust, agent, self.thrust),
+                ("speed", speed, agent, speed),
+                ("acceleration", acceleration, agent, acceleration),
+                ("constraint_force", force, agent, force),
+                ("tension", tension, edge, np.abs(tension)),
                 ("singular_value", single, lambda k: "", -single),
             )
         }
@@ -125,26 +158,9 @@ class Measurements:
         """Values (K, N), NaN for lost agents."""
         return values if self.whole else np.where(self.left, values, np.nan)
 
-    def agent(self, _k: int, i: int) -> str:
-        """Name of agent i (from 0), the same at every sample."""
-        return f"agent {i + 1}"
-
-    def edge(self, _k: int, e: int) -> str:
-        """Name of edge e (from 0), the same at every sample."""
-        i, j = self.result.edges[e].tolist()
-        return f"edge {i + 1}-{j + 1}"
-
-    def pair(self, k: int) -> str:
-        """The two agents that are nearest to each other at sample k."""
-        return agent_names(sorted(self.close.pair[k].tolist()))
-
-    def obstacle(self, k: int) -> str:
-        """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
-        return self.beside(self.close.agent.item(k), self.close.obstacle.item(k))
-
     def beside(self, agent: int, obstacle: int) -> str:
         """Names of an agent and an obstacle, both counted from 0."""
-        return f"agent {agent + 1}, {self.mission.obstacles[obstacle].name}"
+        return _beside(self.mission.obstacles, agent, obstacle)
 
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -252,7 +268,7 @@ class Measurements:
         if worst is None:
             return None
         index = int(result.phase[np.searchsorted(time, at[0], side="right") - 1])
-        return Extreme(worst, at[0], self.agent(0, at[1]), result.phases[index].name)
+        return Extreme(worst, at[0], agent(0, at[1]), result.phases[index].name)
 
     def below(self) -> Extreme | None:
         """Least height [m] between two agents, one below the other."""
@@ -266,7 +282,7 @@ class Measurements:
         """Greatest distance [m] of an agent's centre outside a box with these corners; negative inside."""
         r = self.result.position
         beyond = self.of_left(np.maximum(low - r, r - high).max(axis=2))
-        return self.worst("geofence", self.extreme(beyond, self.agent))
+        return self.worst("geofence", self.extreme(beyond, agent))
 
     def height(self, *, lowest: bool) -> Extreme | None:
         """Least or greatest altitude [m] of an agent's centre."""
@@ -275,12 +291,12 @@ class Measurements:
             np.negative if lowest else np.positive,
         )
         name = "lowest" if lowest else "highest"
-        return self.worst(name, self.extreme(z, self.agent, sense), sense)
+        return self.worst(name, self.extreme(z, agent, sense), sense)
 
     def nearest_to_limit(self) -> Extreme | None:
         """Thrust minus limit [N] of the agent nearest to its own limit, or furthest beyond it."""
         most = self.mission.fleet.thrust_limit
-        return self.worst("thrust_margin", self.extreme(self.thrust - most, self.agent))
+        return self.worst("thrust_margin", self.extreme(self.thrust - most, agent))
 
     def clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
@@ -339,18 +355,19 @@ class Measurements:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
-        length = proximity.lengths(r, result.edges)
         reach = float(max(r.max(initial=0.0), -r.min(initial=0.0)))
         if math.isnan(reach):
             reach = float(np.nanmax(np.abs(r), initial=0.0))
         rounding = 1e-9 * (1.0 + reach)
+        stored = {}
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
-            stored = {
-                "separation": (result.separation - self.close.separation, "m"),
-                "clearance": (result.clearance - self.close.clearance, "m"),
-                "distance": (np.abs(result.distance - length.T), "m"),
-                "thrust": (self.thrust - result.thrust, "N"),
-            }
+            for name in ("separation", "clearance"):
+                if name in vars(result):  # else it would be made of these very positions
+                    stored[name] = getattr(result, name) - getattr(self.close, name), "m"
+        stored |= {
+            "distance": (self.off_lengths, "m"),
+            "thrust": (self.thrust - result.thrust, "N"),
+        }
         for name, (off, unit) in stored.items():
             wrong = off > (rounding if unit == "m" else 1e-6)
             if wrong.any():
@@ -395,6 +412,19 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
+
+    @property
+    def off_lengths(self) -> Floats:
+        """Greatest size (K,) [m] by which a recorded length of an edge differs from that between positions."""
+        r, edges, given = self.result.position, self.result.edges, self.result.distance
+        greatest = np.zeros(len(r))
+        some = max(1, _CACHED * len(r) // r.size)  # of some samples at a time
+        for k in range(0, len(r), some):
+            part = slice(k, k + some)
+            off = proximity.lengths(r[part], edges)
+            off -= given[part].T
+            np.fmax.reduce(np.abs(off, out=off), axis=0, initial=0.0, out=greatest[part])
+        return greatest
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -528,26 +558,23 @@ class Measurements:
         if not targets:
             return {}
         at = [self.nearest(target["time"], k) for k, target in targets]
-        flown = {
-            "position": result.cm[at], "velocity": result.cm_velocity[at], "attitude": result.attitude[at],
-            "rates": result.rates[at],
-        }  # fmt: skip
-        #: Where a quantity is asked for, and known.
-        asked = {
-            name: [
-                i for i, ((_, target), row) in enumerate(zip(targets, rows.tolist(), strict=True))
-                if target.get(name) is not None and all(map(math.isfinite, row))
-            ]
-            for name, rows in flown.items()
-        }  # fmt: skip
         miss: dict[str, dict[int, float]] = {}
-        for name, who in asked.items():
-            wanted = [targets[i][1][name] for i in who]
-            if name == "attitude" and who:
-                off = np.degrees(att.angle_between(flown[name][who], wanted)).tolist()
+        for name, values in (
+            ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
+            ("rates", result.rates),
+        ):  # fmt: skip
+            rows = values[at].tolist()
+            # Where the quantity is asked for, and known.
+            asked = {
+                i: wanted for i, ((_, target), row) in enumerate(zip(targets, rows, strict=True))
+                if (wanted := target.get(name)) is not None and all(map(math.isfinite, row))
+            }  # fmt: skip
+            rows = [rows[i] for i in asked]
+            if name == "attitude" and rows:
+                off = np.degrees(att.angle_between(rows, [*asked.values()])).tolist()
             else:
-                off = list(map(math.dist, flown[name][who].tolist(), wanted))
-            miss[name] = dict(zip(who, off, strict=True))
+                off = map(math.dist, rows, asked.values())
+            miss[name] = dict(zip(asked, off, strict=True))
         return {
             k: Waypoint(
                 time=t,

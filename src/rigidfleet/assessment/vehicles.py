@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rigidfleet._common.text import percent
-from rigidfleet.assessment.measure import Measurements
+from rigidfleet.assessment.measure import Measurements, agent
 from rigidfleet.assessment.outcome import CheckResult, Extreme, value
 from rigidfleet.math import attitude as att
 from rigidfleet.result import LABELS, Extremum
@@ -37,7 +37,7 @@ def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
     error = _worst(measured, "tracking_error", lambda x: x.value)
     sampled = measured.extreme(
         measured.of_left(np.linalg.norm(result.position - result.slot_position, axis=2)),
-        measured.agent,
+        agent,
     )
     error = max((e for e in (error, sampled) if e is not None), key=lambda e: e.value, default=None)
     if error is not None:
@@ -110,7 +110,7 @@ def _tilt(measured: Measurements) -> Extreme | None:
     assert result.vehicle_attitude is not None
     up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
     sampled = measured.extreme(
-        measured.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))), measured.agent
+        measured.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))), agent
     )
     between = _worst(measured, "tilt", lambda x: x.value)
     if between is not None:

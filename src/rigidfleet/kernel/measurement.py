@@ -18,6 +18,7 @@ from rigidfleet.kernel.rigid_body import (
     multiply,
     multiply_transposed,
 )
+from rigidfleet.kernel.vectors import filled, in_vectors, inverse_root_of, where_positive
 
 #: Slots thinner than this, relative to their length, count as a line in an attitude fit.
 _THIN = 1e-3
@@ -30,6 +31,10 @@ _HALF_TURN = 5e-17
 _MULTIPLE = 0.03
 #: Eigenvalues of J J^T below this share of the largest count as zero.
 _ZERO = 1e-14
+#: Samples of which singular values are found at once.
+_AT_ONCE = 8
+#: Sweeps of rotations that leave 1e-20 of a matrix of three rows off its diagonal; a square that adds nothing.
+_SWEEPS, _TINY = 4, 1e-300
 
 
 @compiled
@@ -163,8 +168,8 @@ def continued(q, last):
 
 
 @compiled
-def extent(p, root, C, V, w, axis):
-    """Width and length of slots p (N, 3), weighted by ``root`` (N,); the direction of the length into ``axis`` (3,).
+def extent(p, mass, C, V, w, axis):
+    """Width and length of slots p (N, 3) of a ``mass`` (N,); the direction of the length into ``axis`` (3,).
 
     For slots too wide to be a line, two numbers with a ratio that shows this, and no axis.
     """
@@ -173,7 +178,7 @@ def extent(p, root, C, V, w, axis):
         for b in range(a + 1):
             s = 0.0
             for i in range(p.shape[0]):
-                s += root[i] * root[i] * p[i, a] * p[i, b]
+                s += mass[i] * p[i, a] * p[i, b]
             C[a, b] = C[b, a] = s
     # Eigenvalues a >= b >= c of C: with s = a + b + c, b >= (ab + ac + bc) / 3s.
     s, square = C[0, 0] + C[1, 1] + C[2, 2], 0.0
@@ -244,18 +249,62 @@ def lay_line(x, p, mass, axis, near, T, now, there, across):
 
 
 @compiled
-def line_inverse(I, C, V, w, out):
-    """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself."""
+def line_inverse(I, lifted, axis, out):
+    """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself.
+
+    ``lifted`` (3, 3) and ``axis`` (3,) are scratch.
+    """
+    first = I[0, 0] + I[1, 1] + I[2, 2]
+    second = I[0, 0] * I[1, 1] + I[0, 0] * I[2, 2] + I[1, 1] * I[2, 2]
+    second -= I[0, 1] * I[0, 1] + I[0, 2] * I[0, 2] + I[1, 2] * I[1, 2]
+    third = axis_of(I, 0.0, axis)
+    if not second > 0.0:
+        for a in range(3):
+            for b in range(3):
+                out[a, b] = 0.0
+        return
+    # det (I - x) = -x^3 + first x^2 - second x + third: Newton's method, from below all roots.
+    x = 0.0
+    for _ in range(60):
+        slope = second - (2.0 * first - 3.0 * x) * x
+        step = (third - (second - (first - x) * x) * x) / slope if slope > 0.0 else 0.0
+        x += step
+        if not abs(step) > 1e-15 * first:
+            break
+    half = 0.5 * (first - x)
+    largest = half + math.sqrt(max(half * half - (second - 2.0 * x * half), 0.0))
+    if x > _NARROW * _NARROW * largest:
+        inertia_inverse(I, out)
+        return
+    # I + largest n n^T, n the axis of the least inertia, has no small eigenvalue.
+    axis_of(I, x, axis)
     for a in range(3):
         for b in range(3):
-            C[a, b] = I[a, b]
-            out[a, b] = 0.0
-    largest = jacobi_eigen(C, V, w)
+            lifted[a, b] = I[a, b] + largest * axis[a] * axis[b]
+    inertia_inverse(lifted, out)
+    for a in range(3):
+        for b in range(3):
+            out[a, b] -= axis[a] * axis[b] / (x + largest)
+
+
+@compiled
+def axis_of(I, x, axis):
+    """Unit eigenvector of symmetric I (3, 3) for its simple eigenvalue x, into axis (3,); returns det (I - x)."""
+    a, d, f = I[0, 0] - x, I[1, 1] - x, I[2, 2] - x
+    b, c, e = I[0, 1], I[0, 2], I[1, 2]
+    # It is any column of the adjugate; the longest is accurate.
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    if A >= D and A >= F:
+        axis[0], axis[1], axis[2] = A, B, C
+    elif D >= F:
+        axis[0], axis[1], axis[2] = B, D, E
+    else:
+        axis[0], axis[1], axis[2] = C, E, F
+    size = length(axis[0], axis[1], axis[2])
     for k in range(3):
-        if w[k] > _NARROW * _NARROW * largest:
-            for a in range(3):
-                for b in range(3):
-                    out[a, b] += V[a, k] * V[b, k] / w[k]
+        axis[k] /= size
+    return a * A + b * B + c * C
 
 
 @compiled
@@ -265,11 +314,11 @@ def attitude_of(m, k, known, line_known, near, work, T):
     ``near`` (3, 3) is the attitude expected, commanded (``known``) or that of the sample before. ``line_known`` tells
     that the slots are those of the sample before, whose extent is in ``work[7]``.
     """
-    x, p, mass, root = m.x[0], m.x[1], m.who[0], m.who[1]
+    x, p, mass = m.x[0], m.x[1], m.left
     B, K, V, w, axis, size = work[0], work[1], work[2], work[3, 0], work[7, 0], work[7, 1]
     n = x.shape[0]
     if not line_known:
-        size[0], size[1] = extent(p, root, K, V, w, axis)
+        size[0], size[1] = extent(p, mass, K, V, w, axis)
     width, length = size[0], size[1]
     line = width <= _THIN * length
     if line or (known and width <= _NARROW * length):
@@ -309,7 +358,7 @@ def measure(m):
         for b in range(4):
             last[a, b] = 0.0
     last[0, 0] = last[1, 0] = 1.0
-    mass, root = m.who[0], m.who[1]
+    mass = m.left
     for piece in range(m.attached.shape[0]):
         first = m.start[piece]
         commanded = first < m.start[piece + 1] and not math.isnan(m.T_ref[first, 0, 0])
@@ -317,7 +366,6 @@ def measure(m):
             M, left = 0.0, 0
             for i in range(n):
                 mass[i] = m.mass[i] if m.time[k] <= m.lost_at[i] else 0.0
-                root[i] = math.sqrt(mass[i])
                 M += mass[i]
                 left += 1 if mass[i] > 0.0 else 0
             same = k > first
@@ -358,7 +406,7 @@ def measure(m):
             angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
             if line:
-                line_inverse(I, work[8], work[2], work[3, 2], inverse)
+                line_inverse(I, work[8], work[3, 2], inverse)
             else:
                 inertia_inverse(I, inverse)
             multiply(inverse, h, omega)
@@ -429,9 +477,13 @@ def angular_momentum(m, k, mass, h):
 
 @compiled
 def spectrum(s):
-    """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J."""
-    edges, u, A, share = s.edges, s.u, s.A, s.share
-    m, n = edges.shape[0], s.r.shape[1]
+    """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J.
+
+    Of eight samples at once.
+    """
+    edges, share = s.edges, s.share
+    K, n, m, size = s.positions.shape[0], s.positions.shape[1], edges.shape[0], s.A.shape[0]
+    r, u, A, least = in_vectors(s.r), in_vectors(s.u), in_vectors(s.A), in_vectors(s.least)
     for e in range(share.shape[0]):
         i, j = edges[e, 0], edges[e, 1]
         for o in range(e + 1):
@@ -442,24 +494,26 @@ def spectrum(s):
             sign -= 1.0 if i == b else 0.0
             sign -= 1.0 if j == a else 0.0
             share[e, o] = sign
-    for k in range(s.r.shape[0]):
-        r = s.r[k]
+    for first in range(0, K, _AT_ONCE):
+        for l in range(_AT_ONCE):  # the last sample takes the places of those missing
+            k = min(first + l, K - 1)
+            for i in range(n):
+                for a in range(3):
+                    s.r[i, a * _AT_ONCE + l] = s.positions[k, i, a]
         for e in range(m):
             i, j = edges[e, 0], edges[e, 1]
             x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
-            inverse = 1.0 / math.sqrt(x * x + y * y + z * z)
+            inverse = inverse_root_of(x * x + y * y + z * z)
             u[e, 0], u[e, 1], u[e, 2] = x * inverse, y * inverse, z * inverse
         if m <= 3 * n:
             for e in range(m):
                 for o in range(e + 1):
-                    sign = share[e, o]
-                    if sign != 0.0:
-                        sign *= u[e, 0] * u[o, 0] + u[e, 1] * u[o, 1] + u[e, 2] * u[o, 2]
-                    A[e, o] = sign
+                    uv = u[e, 0] * u[o, 0] + u[e, 1] * u[o, 1] + u[e, 2] * u[o, 2]
+                    A[e, o] = share[e, o] * uv
         else:
             for a in range(3 * n):
                 for b in range(3 * n):
-                    A[a, b] = 0.0
+                    A[a, b] = filled(0.0)
             for e in range(m):
                 i, j = 3 * edges[e, 0], 3 * edges[e, 1]
                 for a in range(3):
@@ -469,4 +523,49 @@ def spectrum(s):
                         A[j + a, j + b] += uv
                         A[i + a, j + b] -= uv
                         A[j + a, i + b] -= uv
-        s.least[k] = math.sqrt(least_eigenvalue(A, s.work[0], s.work[1], s.work[2], _ZERO))
+        if size == 3:
+            least[0, 0] = least_eigenvalue_of_three(A)
+        else:
+            for l in range(_AT_ONCE):
+                for a in range(size):
+                    for b in range(a + 1):
+                        s.one[a, b] = s.A[a, b * _AT_ONCE + l]
+                s.least[0, l] = least_eigenvalue(s.one, s.work[0], s.work[1], s.work[2], _ZERO)
+        for l in range(min(_AT_ONCE, K - first)):
+            s.found[first + l] = math.sqrt(s.least[0, l])
+
+
+@compiled
+def least_eigenvalue_of_three(A):
+    """As `linalg.least_eigenvalue`, of eight symmetric matrices at once: A (3, 3) of vectors.
+
+    Jacobi's rotations, equally many for all matrices, so that none depends on those beside it.
+    """
+    a, b, c, d, e, f = A[0, 0], A[1, 1], A[2, 2], A[1, 0], A[2, 0], A[2, 1]
+    none = filled(0.0)
+    for _ in range(_SWEEPS):
+        a, b, e, f = rotated(d, a, b, e, f)
+        a, c, d, f = rotated(e, a, c, none, f)
+        b, c, d, e = rotated(f, b, c, d, none)
+        f = none
+    largest = max(a, b)
+    largest = max(largest, c)
+    zero, least = _ZERO * largest, largest
+    least = min(least, where_positive(a - zero, a, largest))
+    least = min(least, where_positive(b - zero, b, largest))
+    return min(least, where_positive(c - zero, c, largest))
+
+
+@compiled
+def rotated(off, p, q, x, y):
+    """Rotate so that an element ``off`` the diagonal of a matrix becomes zero.
+
+    p and q are the elements of the diagonal in its row and column, x and y what else is in these.
+    """
+    # The tangent of the angle is sign(d) off / (|d| + sqrt(d^2 + off^2)); it is 0 where there is nothing to do.
+    d = 0.5 * (q - p)
+    square = d * d + off * off + _TINY
+    t = where_positive(d, off, -1.0 * off) / (abs(d) + square * inverse_root_of(square))
+    c = inverse_root_of(t * t + 1.0)
+    s = t * c
+    return p - t * off, q + t * off, c * x - s * y, s * x + c * y

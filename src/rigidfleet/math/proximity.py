@@ -191,17 +191,23 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
             least[k], pair[k] = _lowest(points, radius)
         return least, pair
     x = np.ascontiguousarray(r.T)
-    for i in range(n - 1):
-        d, radii = x[:2, i + 1 :] - x[:2, i : i + 1], radius[i] + radius[i + 1 :]
+    i, j = all_pairs(n)
+    some = max(1, _CACHED // max(1, 3 * len(r)))
+    for first in range(0, len(i), some):
+        part = slice(first, first + some)
+        radii = (radius[i] + radius[j])[part]
+        d = x[:2].take(j[part], axis=1)
+        d -= x[:2].take(i[part], axis=1)
         d *= d
         d[0] += d[1]
         overlap = d[0] <= (radii**2)[:, None]  # false for agents without a position
-        for j in np.flatnonzero(overlap.any(axis=1)).tolist():
-            height = abs(x[2, i + 1 + j] - x[2, i]) - radii[j]
-            lower = overlap[j] & (height < least)
+        for k in np.flatnonzero(overlap.any(axis=1)).tolist():
+            a, b = i.item(first + k), j.item(first + k)
+            height = abs(x[2, b] - x[2, a]) - radii[k]
+            lower = overlap[k] & (height < least)
             np.copyto(least, height, where=lower)
-            np.copyto(pair[:, 0], i, where=lower)
-            np.copyto(pair[:, 1], i + 1 + j, where=lower)
+            np.copyto(pair[:, 0], a, where=lower)
+            np.copyto(pair[:, 1], b, where=lower)
     return least, pair
 
 
@@ -315,11 +321,28 @@ def obstacle_clearances(
     Obstacles that move are where they are at ``time`` (...) [s]. Distances beyond ``most`` (..., N) [m] need not be
     known: these are ``most``, without an obstacle.
     """
-    radius = np.asarray(radius, dtype=float)
     nearest = np.full(r.shape[-2::-1], -1)
     least = np.broadcast_to(np.asarray(most, dtype=float).T, nearest.shape).copy()
+    n = r.shape[-2]
+    radius = np.broadcast_to(np.asarray(radius, dtype=float), n)
+    some = max(1, _CACHED * n // max(1, r.size))
+    for first in range(0, n if obstacles else 0, some):
+        part = slice(first, first + some)
+        _approach(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
+    return least.T, nearest.T
+
+
+def _approach(
+    least: Floats,
+    nearest: Ints,
+    r: Floats,
+    radius: Floats,
+    obstacles: Sequence[Obstacle],
+    time: ArrayLike,
+) -> None:
+    """Reduce distances (N, ...) of agents r (..., N, 3) to those of nearer obstacles."""
     # Axis by axis, in rows of samples, which is faster.
-    places = np.ascontiguousarray(r.T) if obstacles else r.T
+    places = np.ascontiguousarray(r.T)
     radius = radius.reshape(-1, *[1] * (r.ndim - 2))
     for k, thing in enumerate(obstacles):
         far = least + radius if thing.solid.kind[0] in _SURFACES else np.inf
@@ -327,12 +350,11 @@ def obstacle_clearances(
         clearance -= radius
         closer = clearance < least  # false for NaN
         if closer.all():
-            least = clearance
+            least[...] = clearance
             nearest.fill(k)
         elif closer.any():
             np.copyto(least, clearance, where=closer)
             np.copyto(nearest, k, where=closer)
-    return least.T, nearest.T
 
 
 def distances(

@@ -89,12 +89,12 @@ class Unevaluated(NamedTuple):
 
     @property
     def motion(self) -> tuple[Floats, Floats]:
-        """Positions and velocities (K, N, 3) of agents, world axes, as copies."""
+        """Positions and velocities (K, N, 3) of agents, world axes; they may be views of the states."""
         n, m = len(self.problem.vehicles.m), len(self.problem.graph.edges)
         both = self.y[:, : 6 * n].reshape(-1, 2, n, 3)
         r, v = both[:, 0], both[:, 1]
         if not self.problem.body_formulation:
-            return r.copy(), v.copy()
+            return r, v
         q, *cm = np.split(self.y[:, 6 * n + m :], [4, 7], axis=1)
         T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
         return _in_world(r, T, cm[0]), _in_world(v, T, cm[1])
@@ -236,7 +236,10 @@ def assemble(
     ]
     now: dict[str, Any] = {}
     if all(isinstance(p.given, Unevaluated) for p in pieces):
-        now["position"], now["velocity"] = (_joined(parts) for parts in zip(*motion, strict=True))
+        now["position"], now["velocity"] = (
+            _joined(parts) if len(parts) > 1 else np.ascontiguousarray(parts[0])
+            for parts in zip(*motion, strict=True)
+        )
     else:
         for names, make in later[:2]:
             made = make()

@@ -10,11 +10,13 @@ Points are in the solid's own axes, unless a docstring says otherwise.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.solids.records import CYLINDER, HEIGHTS, ROUNDED
+from rigidfleet.typing import Floats
 
 #: A number [m], or an array of them.
 Numbers = Any
@@ -37,7 +39,15 @@ def whole(x: Numbers) -> Any:
 
 def zero(x: Numbers) -> Any:
     """Zero: as zeros of the same shape if there are few, with which NumPy compares in half the time."""
-    return np.zeros(np.shape(x)) if np.size(x) <= _FEW else 0.0
+    return _zeros(np.shape(x)) if np.size(x) <= _FEW else 0.0
+
+
+@lru_cache(4)
+def _zeros(shape: tuple[int, ...]) -> Floats:
+    """Zeros that nobody writes to."""
+    found = np.zeros(shape)
+    found.flags.writeable = False
+    return found
 
 
 #: Greatest number of zeros: more would not stay in the processor's cache.

@@ -164,7 +164,7 @@ def least_singular_values(r: Floats, edges: Ints) -> Floats:
     """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
     found = spectrum_of(r, edges)
     _call(_code().spectrum, pack(found))
-    return found.least
+    return found.found
 
 
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
