@@ -205,10 +205,10 @@ class Vector:
             state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
         ):
             self._allocate()
-        limits = [np.minimum(p.vehicles.thrust_limit, _NO_LIMIT) for p in problems]
+        limits = np.stack([p.vehicles.thrust_limit for p in problems], axis=-1)
         tables = self._tables.between(float(states[0].clock[0]), t_end)
-        ready = unrolled_together(_alike(problems), tables)
-        found = self._search._replace(limit=packed(limits))
+        ready = unrolled_together(problems, tables)
+        found = self._search._replace(limit=pack(np.minimum(limits, _NO_LIMIT)))
         lane_bounds.begin(found, monitors)
         places = np.array([x.ctypes.data for x in samples])
         self._problem = ready._replace(samples=places, search=found)
@@ -256,19 +256,6 @@ class Vector:
 #: Thrust that stands for no limit [N].
 _NO_LIMIT = 1e150
 _UNSAMPLED = pack(np.zeros((0, 1, WIDTH)))
-#: What turns slots that do not turn, where others do: too little to count, yet a direction [rad].
-_BARELY = np.array([0.0, 0.0, 1e-150])
-
-
-def _alike(problems: Sequence[Problem]) -> Sequence[Problem]:
-    """The problems, of which either all turn their slots, or none."""
-    turns = [bool(p.reference.turn.any()) for p in problems]
-    if all(turns) or not any(turns):
-        return problems
-    return [
-        p if turn else p._replace(reference=p.reference._replace(turn=_BARELY))
-        for p, turn in zip(problems, turns, strict=True)
-    ]
 
 
 def fly_all(

@@ -28,6 +28,7 @@ from rigidfleet.kernel.engine.lane_bounds import Search
 from rigidfleet.kernel.engine.tracer import (
     MOMENT,
     SOURCES,
+    TURN,
     Code,
     FlightTrace,
     Symbol,
@@ -94,6 +95,9 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
         The problems have branches that depend on the state, or take different ones.
     """
     first, values = problems[0], numbers(problems)
+    turns = values[TURN].any(axis=0)
+    if turns.any():  # slots that do not turn, where others do
+        values[TURN, ~turns] = _BARELY
     motion = interleaved(
         [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
     )
@@ -107,6 +111,8 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     )  # fmt: skip
 
 
+#: A turn of slots that do not turn: too little to count, yet with a direction [rad].
+_BARELY = np.array([[0.0], [0.0], [1e-150]])
 #: Coefficients of a component of the reference motion that does not move, in metres or radians and seconds: rounding of
 #: a turn about another axis. In 1000 s they would make 1e-15 of it.
 _STILL = 1e-30
@@ -190,7 +196,7 @@ def _prepared(
     )
     before(given.ctypes.data, uniform.ctypes.data)
     reference, none = problem.reference, simd.empty((0, 1))
-    lanes = lambda count: simd.pack(np.zeros((count, WIDTH)))  # noqa: E731
+    lanes = lambda count: simd.empty((count,))  # noqa: E731
     return UnrolledProblem(
         address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
         lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,

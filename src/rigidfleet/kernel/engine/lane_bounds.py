@@ -259,33 +259,24 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
     unpack(s.nearest)[:] = _FAR
     # Where an agent stands, lands or takes off, what is stored depends on every step.
     landed = np.array(
-        [
-            near <= x.pad + _MARGIN
-            or len(x.fence) > 0
-            or x.standing.any()
-            or x.low[:, 0].min() < np.inf
-            for near, x in zip(nearest, monitors, strict=True)
-        ]
+        [near <= x.pad + _MARGIN or _landing(x) for near, x in zip(nearest, monitors, strict=True)]
     )
     _list(
-        s,
-        first,
-        steps.start,
-        steps.stop,
-        landed,
-        limits,
-        margins,
-        unpack(margins),
-        found,
-        count,
-        unpack(s.points),
-        unpack(s.gauge),
-    )
+        s, first, steps.start, steps.stop, landed, limits, margins, unpack(margins), found, count,
+        unpack(s.points), unpack(s.gauge),
+    )  # fmt: skip
     for lane, monitor in enumerate(monitors):
         distances, forces = count[lane].tolist()
         monitor.listed[0, :distances] = found[lane, 0, :distances]
         monitor.listed[1, :forces] = found[lane, 1, :forces]
         monitor.flags[LISTED:] = distances, forces
+
+
+def _landing(monitor: Monitor) -> bool:
+    """Whether an agent stands on an obstacle or may be landing, or there is a fence."""
+    # Of few numbers, Python's own take less time than NumPy's.
+    low = min(monitor.low[:, 0].tolist())
+    return low < math.inf or any(monitor.standing.tolist()) or len(monitor.fence) > 0
 
 
 @compiled

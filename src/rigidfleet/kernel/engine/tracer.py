@@ -302,14 +302,19 @@ _ARRAYS = (
     "disturbance.drag", "disturbance.wind",
     "reference.dp", "reference.turn",
 )  # fmt: skip
+#: Places of the slots' turn among the `numbers`.
+TURN = slice(-3, None)
 _MAY_BE_ZERO = {*_NUMBERS[-4:], *_ARRAYS[-2:]}
 _numbers_of, _arrays_of = attrgetter(*_NUMBERS), attrgetter(*_ARRAYS)
 
 
 def numbers(problems: Iterable[Problem]) -> Floats:
     """The numbers (U, B) in which B problems of one graph may differ, in the order of `FlightTrace`."""
-    rows = [np.concatenate([_numbers_of(p), *[x.ravel() for x in _arrays_of(p)]]) for p in problems]
-    return np.stack(rows, axis=-1)
+    rows = [
+        np.concatenate([_numbers_of(p), *[x if x.ndim == 1 else x.ravel() for x in _arrays_of(p)]])
+        for p in problems
+    ]
+    return np.array(rows).T
 
 
 class FlightTrace(Trace):
