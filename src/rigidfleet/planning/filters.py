@@ -39,14 +39,10 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     """
     s = step / tau
     a = math.exp(-s)
-    # P - A P A^T, of the stationary covariances P = [[1, 1/2], [1/2, 1/2]], by incomplete gamma functions: for a short
-    # step, differences would cancel.
-    q11, q12, q22 = (w * _incomplete_gamma(n, 2.0 * s) for n, w in ((1, 1.0), (2, 0.5), (3, 0.5)))
-    root = math.sqrt(q11)
-    low = q12 / root
+    root, low, rest = _shares(s)
     first, second = white[:, 0], white[:, 1]
     z1, z2 = root * first, low * first
-    z2 += math.sqrt(q22 - low**2) * second
+    z2 += rest * second
     z1[0], z2[0] = first[0], 0.5 * (first[0] + second[0])
     z1 = _followed(z1, a)
     z2[1:] += a * s * z1[:-1]
@@ -56,6 +52,19 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     z1 += z2
     z1 /= math.sqrt(2.0)
     return z1
+
+
+@lru_cache(8)
+def _shares(s: float) -> tuple[float, float, float]:
+    """Shares of the first white sample in z1 and z2, and of the second one in z2: the lower root of P - A P A^T.
+
+    The stationary covariances are P = [[1, 1/2], [1/2, 1/2]]. The entries are incomplete gamma functions: for a short
+    step, differences would cancel.
+    """
+    q11, q12, q22 = (w * _incomplete_gamma(n, 2.0 * s) for n, w in ((1, 1.0), (2, 0.5), (3, 0.5)))
+    root = math.sqrt(q11)
+    low = q12 / root
+    return root, low, math.sqrt(q22 - low**2)
 
 
 def _incomplete_gamma(n: int, x: float) -> float:
