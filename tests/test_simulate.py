@@ -538,6 +538,22 @@ def test_damping_follows_a_slender_shape_once_it_is_taken():
     assert left["auto"][1] == pytest.approx(left[0.03][1], rel=1e-2)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_automatic_damping_is_that_of_the_masses(seed):
+    """Of slots and masses at random it is w/4 within its limits, w from the singular values of J M^-1/2."""
+    rng = np.random.default_rng(seed)
+    slots, masses = 6.0 * rng.random((5, 3)) * [1.0, 1.0, 0.3], rng.uniform(0.2, 4.0, 5)
+    edges = graphs.complete_graph(5)
+    mission = a_mission(
+        establish(formation="five", until=8.0),
+        agents={"mass": masses, "position": slots + [0, 0, 20]},
+        formations={"five": {"slots": slots, "edges": edges + 1}},
+    )
+    J = jacobian(slots, edges) * np.repeat(np.sqrt(masses.mean() / masses), 3)
+    w = np.linalg.svd(J, compute_uv=False)[8] ** 2  # five points have nine independent distances
+    assert mission.damping("five") == pytest.approx(min(w / 4, 0.03), rel=1e-8)
+
+
 def test_a_law_without_feedback_is_told_of_it():
     """Lengths that drift into a line end a flight whose diagnosis names the feedback that is missing."""
     triangle = shapes.slots("triangle", 4.0, 3)

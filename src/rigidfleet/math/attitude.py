@@ -236,11 +236,16 @@ def rotation_vector_from_dcm(T: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) [rad], at most pi long, of direction cosines (..., 3, 3)."""
     T = _vectors("T", T, 3, 3)
     if T.ndim == 2:
-        w, x, y, z = _quaternion(*T.ravel().tolist())
-        n = math.sqrt(x * x + y * y + z * z)
-        ratio = 2.0 if n == 0.0 else 2.0 * math.atan2(n, w) / n
-        return np.array([ratio * x, ratio * y, ratio * z])
+        return np.array(vector_of(T))
     return rotation_vector_from_quaternion(quaternion_from_dcm(T))
+
+
+def vector_of(T: Floats) -> tuple[float, float, float]:
+    """`rotation_vector_from_dcm` of one T (3, 3)."""
+    w, x, y, z = _quaternion(*T.ravel().tolist())
+    n = math.sqrt(x * x + y * y + z * z)
+    ratio = 2.0 if n == 0.0 else 2.0 * math.atan2(n, w) / n
+    return ratio * x, ratio * y, ratio * z
 
 
 def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
@@ -251,7 +256,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     """
     phi, omega = _vectors("phi", phi, 3), _vectors("omega", omega, 3)
     if phi.ndim == omega.ndim == 1:
-        return np.array(_vector_rate(*phi.tolist(), *omega.tolist()))
+        return np.array(vector_rate(*phi.tolist(), *omega.tolist()))
     x = np.linalg.norm(phi, axis=-1, keepdims=True)
     small = x < 0.05
     safe = np.where(small, 1.0, x)
@@ -261,7 +266,7 @@ def rotation_vector_rate(phi: ArrayLike, omega: ArrayLike) -> Floats:
     return omega + 0.5 * turn + k * _cross(phi, turn)
 
 
-def _vector_rate(
+def vector_rate(
     x: float, y: float, z: float, p: float, q: float, r: float
 ) -> tuple[float, float, float]:
     """`rotation_vector_rate` of one phi = (x, y, z) at omega = (p, q, r)."""

@@ -7,6 +7,9 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.typing import Bools, Floats
 
+#: Factors of the columns of U that turn a reflection into a rotation.
+_MIRROR = np.array([1.0, 1.0, -1.0])
+
 
 def centred(points: ArrayLike) -> Floats:
     """Points (N, 3) with their geometric centre moved to 0."""
@@ -78,30 +81,31 @@ def best_rotation(
         return rotation, proper
     turned = u
     if not proper.all():
-        turned = u * np.where(proper[..., None], 1.0, [1.0, 1.0, -1.0])[..., None, :]
+        turned = u * np.where(proper[..., None], 1.0, _MIRROR)[..., None, :]
         rotation = turned @ vt
     first, second, third = s[..., 0], s[..., 1], s[..., 2]
     free = (second <= tol * first) | (~proper & (second - third <= tol * first))
     if free.any():
         guide = np.eye(3) if near is None else np.asarray(near, dtype=np.float64)
-        rotation[free] = _nearest_fit(turned[free], s[free], vt[free], guide, tol)
+        equal = np.add.reduce(s <= s[..., 2:] + tol * s[..., :1], axis=-1, dtype=np.int64)
+        for some in set(equal[free].tolist()):
+            these = ... if s.ndim == 1 else free & (equal == some)
+            rotation[these] = _nearest_fit(turned[these], vt[these], guide, some)
+        rotation[first == 0.0] = guide
     return rotation, proper
 
 
-def _nearest_fit(u: Floats, s: Floats, vt: Floats, near: Floats, tol: float) -> Floats:
-    """Of the rotations that fit as well as U V^T, the ones nearest to `near` (3, 3); u, s, vt of F fits.
+def _nearest_fit(u: Floats, vt: Floats, near: Floats, equal: int) -> Floats:
+    """Of the rotations that fit as well as U V^T, the ones nearest to `near` (3, 3); u, vt (..., 3, 3).
 
     With the last column of U reversed, they are U (1 - 2 n n^T) V^T, where n is any unit vector in the span of
-    the equal smallest singular directions.
+    the smallest singular directions, of which so many are ``equal``.
     """
-    u = u * [1.0, 1.0, -1.0]
-    overlap, n = vt @ near.T @ u, np.zeros(s.shape)
-    overlap = overlap + overlap.swapaxes(1, 2)
-    equal = np.count_nonzero(s <= s[:, 2:] + tol * s[:, :1], axis=1)
-    for some in set(equal.tolist()):
-        n[equal == some, -some:] = np.linalg.eigh(overlap[equal == some, -some:, -some:])[1][..., 0]
-    fit = (u - 2.0 * (u @ n[..., None]) * n[:, None, :]) @ vt
-    return np.where(s[:, :1, None] == 0.0, near, fit)
+    u = u * _MIRROR
+    overlap = (vt @ near.T @ u)[..., -equal:, -equal:]
+    n = np.linalg.eigh(overlap + overlap.swapaxes(-1, -2))[1][..., :1]
+    u[..., -equal:] -= 2.0 * (u[..., -equal:] @ n) * n.swapaxes(-1, -2)
+    return u @ vt
 
 
 def mean_axis_rates(x: Floats, y: Floats, masses: Floats) -> Floats:

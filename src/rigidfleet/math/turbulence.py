@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.kept import kept
 from rigidfleet.typing import Floats
 
 _FOOT = 0.3048  # [m]
@@ -38,12 +39,15 @@ def correlate_evenly(white: Floats, correlation: float) -> Floats:
 
 def correlate_by_distance(white: Floats, points: ArrayLike, length: float) -> Floats:
     """Samples (..., N, 3) with the correlation exp(-distance / length) between agents at points (N, 3) [m]."""
-    p = np.asarray(points, dtype=np.float64)
-    apart = np.linalg.norm(p[:, None] - p[None], axis=2)
+    mixing = _mixing(np.asarray(points, dtype=np.float64), length)
+    by_axis = np.moveaxis(white, -1, 0)
+    mixed = by_axis.reshape(-1, len(mixing)) @ mixing.T  # one product, not many small ones
+    return np.moveaxis(mixed.reshape(by_axis.shape), 0, -1)
+
+
+@kept
+def _mixing(points: Floats, length: float) -> Floats:
+    """The lower root (N, N) of the correlations."""
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     # Nearly coincident places would make the matrix singular to rounding.
-    C = np.exp(-apart / length) + 1e-12 * np.eye(len(p))
-    by_axis = np.swapaxes(white, -1, -2)
-    mixed = (
-        by_axis.reshape(-1, len(p)) @ np.linalg.cholesky(C).T
-    )  # one product, not many small ones
-    return np.swapaxes(mixed.reshape(by_axis.shape), -1, -2)
+    return np.linalg.cholesky(np.exp(-apart / length) + 1e-12 * np.eye(len(points)))

@@ -544,12 +544,21 @@ class Mission(Contents):
         return "continue" if self.disturbances is None else self.disturbances.on_loss
 
 
-@kept
 def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
-    index = float(constraint_jacobian.smallest_of(_jacobian(slots, edges), masses)[0])
     least, most = _DAMPING
-    return min(max(index**2 / 4, least), most)
+    m = masses.tolist()
+    # J M^-1 J^T is at least J J^T / max m: with enough of this, no mass of a sweep needs its own decomposition.
+    w = sum(m) / len(m) / max(m) * _smallest(slots, edges, None)
+    if not w > 4 * most:
+        w = _smallest(slots, edges, masses)
+    return min(max(w / 4, least), most)
+
+
+@kept
+def _smallest(slots: Floats, edges: Ints, masses: Floats | None) -> float:
+    """The smallest non-zero eigenvalue w of mbar J M^-1 J^T, or of J J^T without masses."""
+    return float(constraint_jacobian.smallest_of(_jacobian(slots, edges), masses)[0]) ** 2
 
 
 @kept

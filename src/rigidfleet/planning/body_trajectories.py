@@ -56,16 +56,17 @@ class RegulatedTrajectory:
         They are linear in the errors at the start, and in the goal, which goes on with its velocity.
         """
         start, goal = self.start, self.goal
-        phi = att.rotation_vector_from_dcm(start.T @ goal.T.T)  # start = goal Exp(phi)
+        phi = att.vector_of(start.T @ goal.T.T)  # start = goal Exp(phi)
         length, rest = self.arrival - self.t0, self.t_end - self.arrival
         times, responses = _responses(self.lqr, self.tracking, length, rest)
-        x = [*start.r.tolist(), *phi.tolist()]
-        v = [*start.v.tolist(), *att.rotation_vector_rate(phi, start.omega).tolist()]
-        x1, v1 = [*goal.r.tolist(), 0.0, 0.0, 0.0], [*goal.v.tolist(), *goal.omega.tolist()]
-        ends = [(a - c + length * d, b - d, c, d) for a, b, c, d in zip(x, v, x1, v1, strict=True)]
-        n = len(times) - 1
-        pieces = (np.array(ends).reshape(2, 3, 4) @ responses).reshape(6, n, 6).swapaxes(0, 1)
-        return as_motion(self.t0 + times, pieces, goal.T.copy())
+        x = *start.r.tolist(), *phi
+        v = *start.v.tolist(), *att.vector_rate(*phi, *start.omega.tolist())
+        x1, v1 = (*goal.r.tolist(), 0.0, 0.0, 0.0), (*goal.v.tolist(), *goal.omega.tolist())
+        each = zip(x, v, x1, v1, strict=True)
+        ends = [part for a, b, c, d in each for part in (a - c + length * d, b - d, c, d)]
+        pieces = np.array(ends).reshape(2, 3, 4) @ responses
+        pieces = pieces.reshape(6, len(times) - 1, 6).swapaxes(0, 1)
+        return as_motion(self.t0 + times, pieces, goal.T)
 
 
 @kept

@@ -62,27 +62,29 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
     """Velocity of the air (K, N, 3) [m/s] at each agent, world axes, without the steady wind."""
     n, speed = mission.n_agents, float(np.linalg.norm(wind))
     rng = np.random.default_rng((0, gusts.seed))
-    white = rng.standard_normal((_knots(mission, step), 2, n + 1, 3))
+    # The two numbers of a sample first, so that those of each filter lie together after the products.
+    white = rng.standard_normal((_knots(mission, step), 2, n + 1, 3)).swapaxes(0, 1)
     if gusts.correlation_length is not None:
         white = turbulence.correlate_by_distance(
             white[..., :n, :], _places(mission), gusts.correlation_length
         )
     else:
         white = turbulence.correlate_evenly(white, gusts.correlation or 0.0)
+    u, sigma = np.empty(white[0].shape), intensity(gusts, speed)
     if gusts.model == "first-order":
         assert gusts.time_scale is not None  # checked on entry
-        u = filters.first_order(white[:, 0], step, gusts.time_scale)
+        np.multiply(filters.first_order(white[0], step, gusts.time_scale), sigma, out=u)
     else:
         if gusts.altitude is not None:
             _, length = turbulence.low_altitude(gusts.altitude, speed)
         else:
             length = np.broadcast_to(np.array(gusts.length, dtype=np.float64), 3)
         tau = length / (gusts.airspeed or speed)
-        u = np.empty(white[:, 0].shape)
-        u[..., 0] = filters.first_order(white[:, 0, :, 0], step, tau[0])
+        u[..., 0] = sigma[0] * filters.first_order(white[0, ..., 0], step, tau[0])
+        by_sample = white.swapaxes(0, 1)
         for axis in (1, 2):
-            u[..., axis] = filters.second_order(white[..., axis], step, tau[axis])
-    return ((intensity(gusts, speed) * u).reshape(-1, 3) @ _wind_axes(wind)).reshape(u.shape)
+            u[..., axis] = sigma[axis] * filters.second_order(by_sample[..., axis], step, tau[axis])
+    return (u.reshape(-1, 3) @ _wind_axes(wind)).reshape(u.shape)
 
 
 def _wind_axes(wind: Floats) -> Floats:

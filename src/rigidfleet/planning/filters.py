@@ -39,17 +39,32 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     """
     s = step / tau
     a = math.exp(-s)
-    # P - A P A^T, of the stationary covariances P = [[1, 1/2], [1/2, 1/2]], by incomplete gamma functions: for a short
-    # step, differences would cancel.
-    q11, q12, q22 = (w * _incomplete_gamma(n, 2.0 * s) for n, w in ((1, 1.0), (2, 0.5), (3, 0.5)))
-    root = math.sqrt(q11)
-    low = q12 / root
-    z1, z2 = root * white[:, 0], low * white[:, 0] + math.sqrt(q22 - low**2) * white[:, 1]
-    z1[0], z2[0] = white[0, 0], 0.5 * (white[0, 0] + white[0, 1])
+    root, low, rest = _shares(s)
+    first, second = white[:, 0], white[:, 1]
+    z1, z2 = root * first, low * first
+    z2 += rest * second
+    z1[0], z2[0] = first[0], 0.5 * (first[0] + second[0])
     z1 = _followed(z1, a)
     z2[1:] += a * s * z1[:-1]
     z2 = _followed(z2, a)
-    return (math.sqrt(3.0) * z1 + (1.0 - math.sqrt(3.0)) * z2) / math.sqrt(2.0)
+    z1 *= math.sqrt(3.0)
+    z2 *= 1.0 - math.sqrt(3.0)
+    z1 += z2
+    z1 /= math.sqrt(2.0)
+    return z1
+
+
+@lru_cache(8)
+def _shares(s: float) -> tuple[float, float, float]:
+    """Shares of the first white sample in z1 and z2, and of the second one in z2: the lower root of P - A P A^T.
+
+    The stationary covariances are P = [[1, 1/2], [1/2, 1/2]]. The entries are incomplete gamma functions: for a short
+    step, differences would cancel.
+    """
+    q11, q12, q22 = (w * _incomplete_gamma(n, 2.0 * s) for n, w in ((1, 1.0), (2, 0.5), (3, 0.5)))
+    root = math.sqrt(q11)
+    low = q12 / root
+    return root, low, math.sqrt(q22 - low**2)
 
 
 def _incomplete_gamma(n: int, x: float) -> float:

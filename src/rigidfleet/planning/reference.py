@@ -25,9 +25,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 @dataclass(frozen=True)
 class ByEdge:
-    """A number for each edge that has been active: keys of the edges (m,), and values (m,)."""
+    """A number for each edge that has been active: edges (m, 2), i < j, and values (m,)."""
 
-    keys: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    edges: Ints = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
     def of(self, edges: Ints, other: Floats | float | Callable[[], Floats]) -> Floats:
@@ -35,32 +35,31 @@ class ByEdge:
 
         A function of ``other`` values is called only where edges may be new.
         """
-        keys = _keys(edges)
-        if self._has(keys) and not (isinstance(other, np.ndarray) and other.ndim > 1):
+        if self._has(edges) and not (isinstance(other, np.ndarray) and other.ndim > 1):
             return self.values.copy()
         new = other if isinstance(other, np.ndarray | float | int) else other()
-        if not len(self.keys):
+        if not len(self.edges):
             return np.zeros(len(edges)) + new
-        order = np.argsort(self.keys)
-        at = np.searchsorted(self.keys, keys, sorter=order)
+        keys, own = _keys(edges), _keys(self.edges)
+        order = np.argsort(own)
+        at = np.searchsorted(own, keys, sorter=order)
         at = np.append(order, len(order))[at]
-        known = np.append(self.keys, -1)[at] == keys
+        known = np.append(own, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], new)
 
     def updated(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
-        keys = _keys(edges)
-        if not len(self.keys) or self._has(keys):
-            return ByEdge(keys, values.copy())
-        keys, first = np.unique(np.concatenate([keys, self.keys]), return_index=True)
-        return ByEdge(keys, np.concatenate([values, self.values])[first])
+        if not len(self.edges) or self._has(edges):
+            return ByEdge(edges, values.copy())
+        edges = np.concatenate([edges, self.edges])
+        first = np.unique(_keys(edges), return_index=True)[1]
+        return ByEdge(edges[first], np.concatenate([values, self.values])[first])
 
-    def _has(self, keys: Ints) -> bool:
+    def _has(self, edges: Ints) -> bool:
         """Whether these are its edges, in the same order: most phases have those of the phase before."""
-        return keys is self.keys or np.array_equal(keys, self.keys)
+        return edges is self.edges or np.array_equal(edges, self.edges)
 
 
-@kept
 def _keys(edges: Ints) -> Ints:
     return (edges[:, 0] << 32) + edges[:, 1]
 
