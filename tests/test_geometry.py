@@ -149,12 +149,17 @@ def test_the_compiled_nearest_box_is_that_of_arrays(seed, n, K):
 def test_boxes_that_move_or_are_turned_are_not_compiled_ones(monkeypatch):
     """The compiled pass gets boxes at rest that are always there, and gives the same bits; other solids do not."""
     native._code()
-    keys = BOX.model_dump()
-    others = {"yaw_deg": 30.0}, {"velocity": (1.0, 0.0, 0.0)}, {"vanishes": 2.0}
+    keys: dict[str, Any] = BOX.model_dump()
+    others: tuple[dict[str, Any], ...] = (
+        {"yaw_deg": 30.0},
+        {"velocity": (1.0, 0.0, 0.0)},
+        {"vanishes": 2.0},
+    )
     ball = Sphere(kind="sphere", name="ball", centre=(1.0, 2.0, 3.0), radius=1.0)
     r, t = np.random.default_rng(1).normal(size=(7, 2, 3)) * 5, np.arange(7.0)
-    compiled, asked = distance.nearest_boxes(), []
-    monkeypatch.setattr(distance, "_compiled", [lambda *x: asked.append(x) or compiled(*x)])
+    asked: list[Any] = []
+    compiled = [lambda *x: asked.append(x) or native.nearest_boxes(*x)]
+    monkeypatch.setattr(distance, "_compiled", compiled)
     found = proximity.obstacle_clearances(r, 0.2, [BOX], t)
     assert len(asked) == 1
     for other in (*(Box(**keys | x) for x in others), ball):

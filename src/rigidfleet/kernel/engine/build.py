@@ -75,7 +75,7 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
 
 def apart() -> list[bytes]:
-    """Object codes of the monitor, measurement, clearances, recursions and packing, which share little with the rest."""
+    """Object codes of monitor, measurement, clearances, recursions and packing, which share little with the rest."""
     problem, workspace, integrator, _, _, watching, *_, measured, spectrum, boxes, recursing = (
         _pointers()
     )
