@@ -5,10 +5,14 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.problem import Extents, PerAgent, PlacesInTime
+from rigidfleet.kernel.records import Corners
 from rigidfleet.typing import Bools, Floats, Ints
 
 Vectors = Annotated[Floats, Extents((None, 3))]
 Quaternions = Annotated[Floats, Extents((None, 4))]
+
+#: Samples of one agent whose places and distances stay in the processor's first cache.
+BLOCK = 512
 
 
 class Measured(NamedTuple):
@@ -60,6 +64,17 @@ class Spectrum(NamedTuple):
     found: Floats  # (K,) the smallest non-zero singular value
 
 
+class Nearest(NamedTuple):
+    """The nearest of some boxes to each of N agents at K samples; infinity and -1 without boxes."""
+
+    r: PlacesInTime
+    radius: PerAgent
+    boxes: Corners
+    least: Annotated[Floats, Extents(("N", None))]  # distance of the agent's surface
+    nearest: Annotated[Ints, Extents(("N", None))]
+    places: Annotated[Floats, Extents((3, BLOCK))]  # of one agent
+
+
 def measured(n: int, m: int, K: int, **given: Any) -> Measured:
     """Arrays for the measurement of K samples of ``n`` agents and ``m`` edges."""
     work = np.zeros((9, 4, 4))
@@ -81,3 +96,11 @@ def spectrum_of(r: Floats, edges: Ints) -> Spectrum:
         r, edges, share, np.empty((r.shape[1], 24)), np.empty((m, 24)), np.empty((size, 8 * size)), np.empty((1, 8)),
         np.empty((size, size)), np.empty((3, size)), np.empty(len(r)),
     )  # fmt: skip
+
+
+def nearest_of(r: Floats, radius: Floats, boxes: Floats) -> Nearest:
+    """Arrays for the nearest of boxes (B, 6) to agents r (K, N, 3) with ``radius`` (N,)."""
+    K, n, _ = r.shape
+    return Nearest(
+        r, radius, boxes, np.full((n, K), np.inf), np.full((n, K), -1), np.empty((3, BLOCK))
+    )

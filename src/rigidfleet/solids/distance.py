@@ -10,13 +10,14 @@ Points are in the solid's own axes, unless a docstring says otherwise.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.solids.records import CYLINDER, HEIGHTS, ROUNDED
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: A number [m], or an array of them.
 Numbers = Any
@@ -308,6 +309,23 @@ def own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         T[1, 0] * x + T[1, 1] * y + T[1, 2] * z,
         T[2, 0] * x + T[2, 1] * y + T[2, 2] * z,
     )
+
+
+# -- many boxes ----------------------------------------------------------------------------------------
+
+#: Least distances to boxes, and these boxes (N, K), of agents (K, N, 3) with radii (N,), to boxes (B, 6).
+Nearest = Callable[[Floats, Floats, Floats], tuple[Floats, Ints]]
+_compiled: list[Nearest] = []
+
+
+def use(nearest: Nearest) -> None:
+    """Find the nearest boxes by a compiled pass from now on: that of the kernel, once it is loaded."""
+    _compiled[:] = [nearest]
+
+
+def nearest_boxes() -> Nearest | None:
+    """The compiled pass, which finds the same bits as `from_box`; None if there is none yet."""
+    return _compiled[0] if _compiled else None
 
 
 #: The functions that the kernel compiles, each after those that it calls.

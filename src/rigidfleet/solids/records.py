@@ -203,6 +203,16 @@ def joined(parts: Sequence[Solids]) -> Solids:
     )
 
 
+def boxes_of(parts: Sequence[Solids]) -> Floats | None:
+    """Corners (B, 6) [m] of B records of one solid each; None unless all are boxes, at rest and not turned."""
+    for s in parts:
+        if s.kind.item(0) != ROUNDED or s.rounding.item(0) or s.turned.item(0) or s.moves:
+            return None
+        if s.there.tolist() != [[*ALWAYS]]:
+            return None
+    return np.concatenate([s.size for s in parts]) if parts else None
+
+
 def extent(solid: Solids) -> Floats:
     """Lowest and highest corner (2, 3) [m] of the space that a solid, alone in its record, ever takes."""
     size, turn = solid.size[0], solid.turn[0]

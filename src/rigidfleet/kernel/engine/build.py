@@ -16,7 +16,7 @@ from typing import Any
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 
-from rigidfleet.kernel import dopri5, measurement, monitor, recorder, recursion
+from rigidfleet.kernel import dopri5, measurement, monitor, nearest, recorder, recursion
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, sized
@@ -75,8 +75,10 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
 
 def apart() -> list[bytes]:
-    """Object codes of the monitor, of measurement, recursions and packing, which share little with the rest."""
-    problem, workspace, integrator, _, _, watching, *_, measured, spectrum, recursing = _pointers()
+    """Object codes of monitor, measurement, clearances, recursions and packing, which share little with the rest."""
+    problem, workspace, integrator, _, _, watching, *_, measured, spectrum, boxes, recursing = (
+        _pointers()
+    )
 
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
@@ -87,6 +89,10 @@ def apart() -> list[bytes]:
 
     def singular_values(s):
         measurement.spectrum(spectrum(s))
+        return 0
+
+    def find_nearest(s):
+        nearest.nearest_boxes(boxes(s))
         return 0
 
     def follow(s):
@@ -100,18 +106,22 @@ def apart() -> list[bytes]:
         (watch_trail, 4),
         (measure_flight, 1),
         (singular_values, 1),
+        (find_nearest, 1),
         (follow, 1),
         (gather, 4),
     )
     entries = zip(functions, objects.ENTRIES[2:-1], strict=True)
-    return [_object(*_module(function, name, words)) for (function, words), name in entries]
+    return [
+        _object(*_module(function, name, words), loops=function is find_nearest)
+        for (function, words), name in entries
+    ]
 
 
 def sampled_code() -> list[bytes]:
     """Object code of the two C functions of sampled flights, `objects.SAMPLED_ENTRIES`."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
-    problem, workspace, *_, flight, state, segment, evaluation, _, _, _, _ = _pointers()
+    problem, workspace, *_, flight, state, segment, evaluation, _, _, _, _, _ = _pointers()
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -130,7 +140,7 @@ def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight, `objects.AVOIDANCE_ENTRY`."""
     from rigidfleet.kernel import guard
 
-    problem, workspace, *_, flight, state, _, _, avoidance, _, _, _ = _pointers()
+    problem, workspace, *_, flight, state, _, _, avoidance, _, _, _, _ = _pointers()
 
     def avoid(f, s, given, _):
         a = avoidance(given)
@@ -159,10 +169,15 @@ def _object(
     name: str,
     hot: tuple[str, ...] = _HOT,
     sizes: Mapping[str, int] = ANY,
+    *,
+    loops: bool = False,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside; see `sized`."""
+    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside; see `sized`.
+
+    ``loops``: make vectors of its loops.
+    """
     module = _simplified(sized(text, sizes), symbol, name, hot)
-    builder = _passes(3)
+    builder = _passes(3, loops=loops)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
@@ -192,10 +207,10 @@ def _simplified(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) 
     return module
 
 
-def _passes(level: int) -> Any:
+def _passes(level: int, *, loops: bool = False) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
-    # Loops are short, and the integrator's sums use vectors already
-    options.loop_vectorization = False
+    # Most loops are short, and the integrator's sums use vectors already
+    options.loop_vectorization = loops
     return llvm.create_pass_builder(objects.target_machine(), options)
 
 

@@ -34,7 +34,7 @@ from rigidfleet.kernel.engine.objects import (
     target_machine,
 )
 from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed, use
-from rigidfleet.kernel.measured import Measured, spectrum_of
+from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
 from rigidfleet.kernel.problem import (
     Problem,
     Workspace,
@@ -48,6 +48,7 @@ from rigidfleet.kernel.records import (
     Segment,
     recorder,
 )
+from rigidfleet.solids import distance
 from rigidfleet.typing import Floats, Ints
 
 
@@ -167,6 +168,13 @@ def least_singular_values(r: Floats, edges: Ints) -> Floats:
     return found.found
 
 
+def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
+    """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
+    found = nearest_of(r, radius, boxes)
+    _call(_code().nearest, pack(found))
+    return found.least, found.nearest
+
+
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
     _call(_code().follow, pack(Recursion(x, a, backward)))
@@ -183,6 +191,7 @@ class _Code(NamedTuple):
     watch: Any
     measure: Any
     spectrum: Any
+    nearest: Any
     follow: Any
     integrate_three: Any  # integrate, for three agents with three edges
     recorder: int  # address of record
@@ -281,10 +290,11 @@ def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
     addresses = [engine.get_function_address(name) for name in ENTRIES]
     functions = (
         ctypes.CFUNCTYPE(word, *(word,) * words)(address)
-        for words, address in zip((4, 4, 4, 1, 1, 1, 4, 4), addresses, strict=True)
+        for words, address in zip((4, 4, 4, 1, 1, 1, 1, 4, 4), addresses, strict=True)
     )
     *calls, gather, three = functions
     use(gather, engine)
+    distance.use(nearest_boxes)
     return _Code(*calls, three, addresses[1], engine, unkept)
 
 

@@ -13,11 +13,11 @@ import llvmlite.binding as llvm
 
 #: Names of the machine code's functions. Their arguments are addresses: int64(problem, workspace, integrator, segment),
 #: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor); int64(measured),
-#: int64(spectrum), int64(recursion) and int64(objects, count, asked, words). Each function is in its own object. The
-#: last one is the first for three agents with three edges.
+#: int64(spectrum), int64(nearest), int64(recursion) and int64(objects, count, asked, words). Each function is in its
+#: own object. The last one is the first for three agents with three edges.
 ENTRIES = (
     "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch", "rigidfleet_measure", "rigidfleet_spectrum",
-    "rigidfleet_follow", "rigidfleet_gather", "rigidfleet_integrate_three",
+    "rigidfleet_nearest", "rigidfleet_follow", "rigidfleet_gather", "rigidfleet_integrate_three",
 )  # fmt: skip
 #: Those of the second library: int64(problem, workspace, flight, state, segment) and int64(flight, evaluation).
 SAMPLED_ENTRIES = "rigidfleet_fly_ticks", "rigidfleet_evaluate"
