@@ -488,7 +488,7 @@ def test_one_warning_for_a_sweep(tmp_path):
     base = tmp_path / "base"
     base.mkdir()
     base.chmod(0o777)
-    vary = ["--vary", "agents.position.*.* += normal(0, 0.1)", "--runs", "2000", "--workers", "2"]
+    vary = ["--vary", "agents.position.*.* += normal(0, 0.1)", "--runs", "6000", "--workers", "2"]
     asked = [COMMAND, "sweep", "narrow-passage", *vary, "--no-figures", "--out", tmp_path / "out"]
     done = run(*asked, cwd=tmp_path, NUMBA_CACHE_DIR=str(base))
     assert done.returncode == 0, done.stderr
