@@ -307,8 +307,10 @@ def fly_all(
         K[lane_steps.ATOL] = atol[:, None]
         y, clock, counts = pack(np.zeros((n, WIDTH))), np.zeros(3), np.zeros(6, dtype=np.int64)
         state = IntegratorState(y, pack(K), clock, counts, rtol, NO_TRAIL)
-        names = "before", "time", "known", "stage"
-        own = ready._replace(**{name: getattr(ready, name).copy() for name in names})
+        own = ready._replace(
+            before=empty(ready.before.shape), known=empty(ready.known.shape), time=ready.time.copy(),
+            stage=ready.stage.copy(),
+        )  # fmt: skip
 
         def work(*part: Any) -> None:
             fly(own, state, *times, _FIRST_STEP_IN_VECTORS, *part, max_steps, True)
