@@ -204,14 +204,12 @@ class Vector:
         if len(self._trails) != len(states) or any(
             state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
         ):
-            self._allocate()
-        limits = np.stack([p.vehicles.thrust_limit for p in problems], axis=-1)
+            self._allocate(problems)
         tables = self._tables.between(float(states[0].clock[0]), t_end)
         ready = unrolled_together(problems, tables)
-        found = self._search._replace(limit=pack(np.minimum(limits, _NO_LIMIT)))
-        lane_bounds.begin(found, monitors)
+        lane_bounds.begin(self._search, monitors)
         places = np.array([x.ctypes.data for x in samples])
-        self._problem = ready._replace(samples=places, search=found)
+        self._problem = ready._replace(samples=places, search=self._search)
         first = states[0]
         K, n = self._K, len(first.y)
         unpack(K)[: lane_steps.STAGES] = 0.0
@@ -221,14 +219,15 @@ class Vector:
         self._state = IntegratorState(y, K, clock, count, first.rtol, self._length)
         self._fresh = True
 
-    def _allocate(self) -> None:
-        """Arrays for these trails and monitors, which are those of the phases to come, too."""
+    def _allocate(self, problems: Sequence[Problem]) -> None:
+        """Arrays for these trails, monitors and vehicles, which are those of the phases to come, too."""
         states, monitors = self._states, self._monitors
         self._trails = trails = [state.trail for state in states]
         n, rows = len(states[0].y), len(trails[0].clock)
         self._K = empty((lane_steps.ROWS, n))
         self._length = NO_TRAIL._replace(clock=np.empty((rows, 2)))
-        self._search = lane_bounds.search(monitors, trails, self._length.clock)
+        limits = np.minimum([p.vehicles.thrust_limit for p in problems], _NO_LIMIT)
+        self._search = lane_bounds.search(monitors, trails, self._length.clock, pack(limits.T))
 
     def __call__(self, max_steps: int) -> int:
         """Go on to the end of the phase; return what `dopri5.integrate` returns.

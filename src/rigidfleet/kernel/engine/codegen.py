@@ -125,8 +125,7 @@ class Tables:
     """
 
     def __init__(self, given: Sequence[Disturbance]) -> None:
-        self._given, first = given, given[0]
-        self._steps = {"gust": first.gust_step, "noise": first.noise_step}
+        self._steps = {"gust": given[0].gust_step, "noise": given[0].noise_step}
         self._whole = {
             name: [np.ascontiguousarray(getattr(x, name)) for x in given] for name in _TABLES
         }

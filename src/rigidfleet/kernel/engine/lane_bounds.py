@@ -91,14 +91,19 @@ NO_SEARCH = Search(
 )  # fmt: skip
 
 
-def search(monitors: Sequence[Monitor], trails: Sequence[Trail], clock: Floats) -> Search:
-    """A search of eight flights: of monitors for the same pairs and trails of the same size, with a clock (rows, 2)."""
+def search(
+    monitors: Sequence[Monitor], trails: Sequence[Trail], clock: Floats, limit: LaneArray
+) -> Search:
+    """A search of eight flights: of monitors for the same pairs and trails of the same size, with a clock (rows, 2).
+
+    ``limit`` (N,) is that of thrust [N].
+    """
     (rows, _, n), (_, forces) = trails[0].points.shape, trails[0].gauge.shape
     lanes = lambda name: pack(np.stack([getattr(x, name) for x in monitors], axis=-1))  # noqa: E731
     names = "points", "gauge", "start", "clock"
     return Search(
         clock, empty((rows, 5, n)), empty((rows, forces)), empty((rows, COLUMNS)), empty((DISTANCES,)),
-        empty((FORCES,)), empty((1,)), lanes("radius"), monitors[0].pairs, lanes("boxes"), empty((0,)),
+        empty((FORCES,)), empty((1,)), lanes("radius"), monitors[0].pairs, lanes("boxes"), limit,
         empty((2, forces)), np.zeros(2),
         np.array([[getattr(trail, name).ctypes.data for trail in trails] for name in names]),
     )  # fmt: skip
