@@ -24,10 +24,6 @@ THIN = 1e-3
 _KEPT = 100_000
 
 
-#: Number of values that fit into the processor's cache.
-_CACHED = 60_000
-
-
 #: Number of agents up to which all distances of a shape are computed at once.
 _FEW = 16
 
@@ -146,9 +142,10 @@ class Fit:
 
 def length(x: Floats, more: Floats | None = None) -> Floats:
     """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
-    if x.size > _CACHED and len(x) > 1:  # in parts, of which what is between stays in the cache
+    if x.size > proximity.CACHED and len(x) > 1:
+        # In parts, of which what is between stays in the cache.
         found = np.empty(x.shape[:-1])
-        some = max(1, _CACHED * len(x) // x.size)
+        some = max(1, proximity.CACHED * len(x) // x.size)
         for k in range(0, len(x), some):
             part = slice(k, k + some)
             found[part] = length(x[part], None if more is None else more[part])

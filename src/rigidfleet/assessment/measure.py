@@ -33,8 +33,6 @@ _OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
 _OF_EDGES = frozenset(("tension", "constraint"))
 
 
-#: Number of values that fit into the processor's cache.
-_CACHED = 60_000
 #: About so many curves are compared together.
 _TOGETHER = 100_000
 #: The first sample.
@@ -418,7 +416,7 @@ class Measurements:
         """Greatest size (K,) [m] by which a recorded length of an edge differs from that between positions."""
         r, edges, given = self.result.position, self.result.edges, self.result.distance
         greatest = np.zeros(len(r))
-        some = max(1, _CACHED * len(r) // r.size)  # of some samples at a time
+        some = max(1, proximity.CACHED * len(r) // r.size)  # of some samples at a time
         for k in range(0, len(r), some):
             part = slice(k, k + some)
             off = proximity.lengths(r[part], edges)

@@ -25,7 +25,7 @@ _ASKED = 256
 # Distance of the pairs listed, as a multiple of the least distance.
 _SPARE = 1.2
 # Number of values that fit into the processor's cache.
-_CACHED = 60_000
+CACHED = 60_000
 
 
 #: Number of points for which a surface of triangles is searched at once: near ones need the same triangles.
@@ -66,7 +66,7 @@ def separation(r: Floats, radius: ArrayLike) -> tuple[Floats, Ints]:
         return least, pair
     x, samples = np.ascontiguousarray(r.T), np.arange(len(r))  # rows of samples are faster
     i, j = pairs = all_pairs(n)
-    some = max(1, _CACHED // max(1, 3 * len(r)))
+    some = max(1, CACHED // max(1, 3 * len(r)))
     for first in range(0, len(i), some):
         part = slice(first, first + some)
         d = x.take(j[part], axis=1)
@@ -94,7 +94,7 @@ def all_pairs(n: int) -> Ints:
 def lengths(r: Floats, pairs: Ints) -> Floats:
     """Distances (m, K) [m] of pairs (m, 2) of agents r (K, N, 3): a row for each pair, which is faster."""
     x, found = np.ascontiguousarray(r.T), np.empty((len(pairs), len(r)))
-    some = max(1, _CACHED // (3 * len(r)))
+    some = max(1, CACHED // (3 * len(r)))
     for first in range(0, len(pairs), some):
         i, j = pairs[first : first + some].T
         d = x.take(i, axis=1)
@@ -192,7 +192,7 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
         return least, pair
     x = np.ascontiguousarray(r.T)
     i, j = all_pairs(n)
-    some = max(1, _CACHED // max(1, 3 * len(r)))
+    some = max(1, CACHED // max(1, 3 * len(r)))
     for first in range(0, len(i), some):
         part = slice(first, first + some)
         radii = (radius[i] + radius[j])[part]
@@ -332,7 +332,7 @@ def obstacle_clearances(
     least = np.broadcast_to(np.asarray(most, dtype=float).T, nearest.shape).copy()
     n = r.shape[-2]
     radius = np.broadcast_to(np.asarray(radius, dtype=float), n)
-    some = max(1, _CACHED * n // max(1, r.size))
+    some = max(1, CACHED * n // max(1, r.size))
     for first in range(0, n if obstacles else 0, some):
         part = slice(first, first + some)
         _approach(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
