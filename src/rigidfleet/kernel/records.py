@@ -242,9 +242,9 @@ class Recursion(NamedTuple):
     """Rows x_k to which the row before is added, times a number; see `rigidfleet.kernel.recursion`."""
 
     x: Floats  # (K, M)
-    a: Floats  # (K,); empty: none is added
+    a: Floats  # (K,)
     backward: bool  # whether the rows are followed from the last to the first
-    # rows (K, C) of which x is made first, from a column on, times a number (K,) each; without rows, x is as it is
+    # rows (K, C) of which x is made, from a column on, times a number (K,) each; without rows, x is as it is
     y: Floats = NO_ROWS
     first: int = 0
     b: Floats = NO_FACTORS

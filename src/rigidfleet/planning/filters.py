@@ -99,28 +99,26 @@ def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = 
 
     n, shape = len(samples), samples.shape[1 if part is None else 2 :]
     flat, width = np.ascontiguousarray(samples).reshape(n, -1), math.prod(shape)
-    first = (part or 0) * width
     table = np.empty((n + 2, width))
-    c, ends = table[1:-1], scale * flat[[0, -1], first : first + width]
-    if n > 2:
-        pivots = _pivots(n - 2)
-        native.multiply_rows(flat[1:-1], first, 6.0 * scale * pivots, c[1:-1])
-        c[1] -= pivots[0] * ends[0]
-        c[-2] -= pivots[-1] * ends[1]
-        factors = -pivots
-        for backward in (False, True):
-            native.follow(c[1:-1], factors, backward=backward)
-    c[0], c[-1] = ends
+    c, (factors, shares) = table[1:-1], _elimination(n)
+    native.follow_multiples(flat, (part or 0) * width, scale * shares, c, factors)
+    native.follow(c, factors, backward=True)
     table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
     return table.reshape(n + 2, *shape)
 
 
 @lru_cache(8)
-def _pivots(n: int) -> Floats:
-    """Pivots (n,) of the factors without exchanges of a system of n equations; read-only."""
-    pivots = np.full(n, _PIVOT)
+def _elimination(n: int) -> tuple[Floats, Floats]:
+    """Factors (n,) of the row before in either sweep of the elimination, and shares (n,) of the samples; read-only.
+
+    Both ends are known: their factors are zero, and their shares one.
+    """
+    factors, shares = np.zeros(n), np.ones(n)
+    factors[1:-1] = -_PIVOT
     pivot = 0.0
-    for k in range(min(_EARLY, n)):
-        pivots[k] = pivot = 1.0 / (4.0 - pivot)
-    pivots.flags.writeable = False
-    return pivots
+    for k in range(1, min(1 + _EARLY, n - 1)):
+        pivot = 1.0 / (4.0 - pivot)
+        factors[k] = -pivot
+    shares[1:-1] = -6.0 * factors[1:-1]
+    factors.flags.writeable = shares.flags.writeable = False
+    return factors, shares

@@ -40,7 +40,6 @@ from rigidfleet.kernel.problem import (
     Workspace,
 )
 from rigidfleet.kernel.records import (
-    NO_FACTORS,
     IntegratorState,
     Monitor,
     Record,
@@ -180,9 +179,9 @@ def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     _call(_code().follow, pack(Recursion(x, a, backward)))
 
 
-def multiply_rows(y: Floats, first: int, b: Floats, x: Floats) -> None:
-    """x_k = b_k y_k in rows x (K, M), from the M columns of y (K, C) that begin with ``first``; b (K,)."""
-    _call(_code().follow, pack(Recursion(x, NO_FACTORS, False, y, first, b)))
+def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
+    """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
+    _call(_code().follow, pack(Recursion(x, a, False, y, first, b)))
 
 
 class _Code(NamedTuple):
