@@ -49,6 +49,11 @@ def kept(function: Callable[..., R]) -> Callable[..., R]:
     return wrapper
 
 
+def same(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> bool:
+    """Whether two small arrays of one kind have the same numbers."""
+    return a is b or (a.shape == b.shape and a.tobytes() == b.tobytes())
+
+
 def _of_float(x: float) -> Any:
     return x or ("zero", str(x))  # 0.0 == -0.0
 

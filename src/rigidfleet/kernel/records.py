@@ -34,7 +34,7 @@ LEAST_ERROR = math.log(1e-4)
 #: Place among a monitor's flags of the numbers of steps to search, and the number that stands for all of them.
 LISTED, ANY_STEP = 4, -1
 #: Approximate size of a trail in bytes; the integrator pauses when it is full.
-_TRAIL = 1 << 19
+_TRAIL = 1 << 20
 #: Greatest number of points in a search for a greatest force.
 _NODES = 27
 
@@ -65,7 +65,7 @@ class Trail(NamedTuple):
 
 
 def trail(states: int, agents: int, edges: int) -> Trail:
-    """Allocate a trail of half a megabyte, or of three steps."""
+    """Allocate a trail of a megabyte, or of three steps."""
     row = 5 * states + 3 * agents + 2 * edges
     rows = max(3, _TRAIL // (8 * row))
     gauge = 3 * agents + 2 * edges

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.kept import kept
+from rigidfleet._common.kept import kept, same
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -57,7 +57,7 @@ class ByEdge:
 
     def _has(self, edges: Ints) -> bool:
         """Whether these are its edges, in the same order: most phases have those of the phase before."""
-        return edges is self.edges or np.array_equal(edges, self.edges)
+        return same(edges, self.edges)
 
 
 def _keys(edges: Ints) -> Ints:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from rigidfleet._common.kept import same
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measured
 from rigidfleet.kernel.records import Record, recorder
@@ -247,7 +248,7 @@ def assemble(
         del later[:2]
     return Result(
         time=time,
-        phase=_joined([np.full(len(p.time), p.phase) for p in pieces]),
+        phase=np.array([p.phase for p in pieces]).repeat([len(p.time) for p in pieces]),
         edges=mission.edges,
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
@@ -487,7 +488,7 @@ def _integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
     """Indices of some edges among all edges, (m, 2) both."""
-    if some.shape == edges.shape and some.tobytes() == edges.tobytes():
+    if same(some, edges):
         return slice(None)
     key = edges.max(initial=0) + 1
     keys = edges[:, 0] * key + edges[:, 1]
@@ -518,7 +519,7 @@ def _singular_values(places: _Places, edges: Sequence[Ints]) -> dict[str, Floats
     ends = np.cumsum([len(x) for x in places.parts]).tolist()
     spans: list[tuple[list[int], Ints]] = []  # pieces with the same edges, one after the other
     for end, some in zip(ends, edges, strict=True):
-        if spans and np.array_equal(spans[-1][1], some):
+        if spans and same(spans[-1][1], some):
             spans[-1][0].append(end)
         else:
             spans.append(([end], some))

@@ -79,7 +79,6 @@ def _plain(phase: ActivePhase) -> bool:
         and phase.solver is None
         and phase.external is None
         and not plan.loses
-        and not phase.lost.any()
     )
 
 

@@ -248,22 +248,25 @@ class Sweep:
                 found.append(column.grid[places[_axis(column, k)]])
         return found[::-1]
 
-    def varied(self, run: int) -> dict[str, Any]:
-        """The mission of a run as plain data, not yet checked; what does not vary is shared with `document`."""
+    def varied(self, run: int, values: Sequence[Any] | None = None) -> dict[str, Any]:
+        """The mission of a run as plain data, not yet checked; what does not vary is shared with `document`.
+
+        ``values`` are those of the run, if they are known.
+        """
         document = _copied(self.document, [column.keys for column in self.columns])
-        for column, value in zip(self.columns, self.values(run), strict=True):
+        for column, value in zip(self.columns, values or self.values(run), strict=True):
             apply(document, self.whole, column, value)
         return document
 
-    def mission_of(self, run: int) -> Mission:
-        """The mission of a run.
+    def mission_of(self, run: int, values: Sequence[Any] | None = None) -> Mission:
+        """The mission of a run, with its ``values``, if they are known.
 
         Raises
         ------
         MissionError
             It has errors.
         """
-        return Mission.from_plain(self.varied(run), f"run {run}", self._shared)
+        return Mission.from_plain(self.varied(run, values), f"run {run}", self._shared)
 
     @cached_property
     def _shared(self) -> Shared:

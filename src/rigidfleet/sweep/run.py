@@ -41,7 +41,10 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     from rigidfleet.simulation.together import simulate_together
 
     begun = perf_counter()
-    flown: dict[int, Any] = {run: _tried(lambda run=run: sweep.mission_of(run)) for run in runs}
+    values = {run: sweep.values(run) for run in runs}
+    flown: dict[int, Any] = {
+        run: _tried(lambda run=run: sweep.mission_of(run, values[run])) for run in runs
+    }
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
     together = _tried(lambda: simulate_together([flown[run] for run in valid]))
     if isinstance(together, Exception):
@@ -50,7 +53,7 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     del together
     shared = (perf_counter() - begun) / len(runs)
     # Each flight is let go of when it is judged: the next one's record takes its memory over.
-    return [_row(sweep, run, flown.pop(run), shared) for run in runs]
+    return [_row(sweep, run, values[run], flown.pop(run), shared) for run in runs]
 
 
 def _tried(job: Callable[[], Any]) -> Any:
@@ -63,10 +66,11 @@ def _tried(job: Callable[[], Any]) -> Any:
         return error
 
 
-def _row(sweep: Sweep, run: int, flown: Result | Exception, shared: float) -> RunRecord:
+def _row(
+    sweep: Sweep, run: int, values: Sequence[Any], flown: Result | Exception, shared: float
+) -> RunRecord:
     """Judge a flight and measure it; ``shared`` is its share of the time that its group has taken so far [s]."""
     begun = perf_counter()
-    values = sweep.values(run)
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
     found = flown if isinstance(flown, Exception) else _tried(lambda: _judged(flown))

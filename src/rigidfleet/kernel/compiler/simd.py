@@ -65,6 +65,10 @@ class _Model(models.PrimitiveModel):
         super().__init__(manager, kind, VECTOR)
 
 
+#: A number of each lane, for NumPy.
+_KIND = np.dtype((np.void, WIDTH * 8))
+
+
 class LaneArray(np.ndarray):
     """An array of `lanes`, made by `pack` and read by `unpack`."""
 
@@ -81,9 +85,8 @@ def empty(shape: tuple[int, ...]) -> LaneArray:
     """An array of lanes with any numbers, aligned for vectors."""
     size = WIDTH * math.prod(shape)
     memory = np.empty(size + WIDTH)
-    skip = -memory.ctypes.data // memory.itemsize % WIDTH
-    kind = np.dtype((np.void, WIDTH * memory.itemsize))
-    return memory[skip : skip + size].view(kind).reshape(shape).view(LaneArray)
+    skip = -memory.__array_interface__["data"][0] // memory.itemsize % WIDTH
+    return memory[skip : skip + size].view(_KIND).reshape(shape).view(LaneArray)
 
 
 def unpack(array: NDArray[Any]) -> Floats:

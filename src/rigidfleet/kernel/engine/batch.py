@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rigidfleet._common.kept import same
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
@@ -136,7 +136,7 @@ def fit_together(problems: Sequence[Problem]) -> bool:
     ):
         return False
     return all(
-        not (x.has_frame or x.body_formulation or x.external or x.disturbance.lost.any())
+        not (x.has_frame or x.body_formulation or x.external or any(x.disturbance.lost.tolist()))
         and len(x.reference.knots) == 0
         and x.vehicles.saturate == first.vehicles.saturate
         and x.law.solver == first.law.solver
@@ -144,15 +144,10 @@ def fit_together(problems: Sequence[Problem]) -> bool:
         and x.control.kind == first.control.kind
         and _blend(x.reference) == _blend(first.reference)
         and _tables(x.disturbance) == _tables(first.disturbance)
-        and _same(x.graph.edges, first.graph.edges)
-        and _same(x.motion.knots, first.motion.knots)
+        and same(x.graph.edges, first.graph.edges)
+        and same(x.motion.knots, first.motion.knots)
         for x in problems
     )
-
-
-def _same(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    """Whether two small arrays have the same numbers, of one kind."""
-    return a is b or (a.shape == b.shape and a.tobytes() == b.tobytes())
 
 
 def _blend(reference: Reference) -> tuple[int, float, float]:
