@@ -407,9 +407,9 @@ def straight_line(mission: Mission) -> int:
     r = np.array(mission.agents.position)
     now = PhaseState(0.0, r, np.zeros_like(r))
     code = Code(Trace(plan_phase(mission, mission.phases[0], now).problem))
-    # The last two of seven stages are at the same moment.
+    # The last two of eight stages are at the same moment.
     return (
-        len(code.moment) * 6 // 7 + len(code.lines) + share_of_a_step(mission, stages=7, weights=34)
+        len(code.moment) * 7 // 8 + len(code.lines) + share_of_a_step(mission, stages=8, weights=36)
     )
 
 

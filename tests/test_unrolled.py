@@ -150,26 +150,37 @@ def test_what_branches_on_the_state_is_refused(solver: str):
         Trace(p)
 
 
+def rooted_trees(A: np.ndarray, c: np.ndarray, most: int) -> list[tuple[int, np.ndarray, int]]:
+    """Order, elementary weights of the stages, and density of each rooted tree of at most so many nodes."""
+    found = [(1, np.ones_like(c), 1)]
+
+    def grow(first: int, left: int, weights: np.ndarray, density: int, order: int) -> None:
+        """Add trees of some order, with branches from ``first`` on among the smaller ones."""
+        if not left:
+            made.append((order, weights, density * order))
+        for k, (size, branch, dense) in enumerate(smaller[first:], start=first):
+            if size <= left:
+                grow(k, left - size, weights * (A @ branch), density * dense, order)
+
+    for order in range(2, most + 1):
+        smaller, made = found[:], []
+        grow(0, order - 1, np.ones_like(c), 1, order)
+        found += made
+    return found
+
+
 def test_the_pair_for_lanes_has_its_orders():
-    """Its weights meet Butcher's conditions of fifth order, and those of the error vanish up to the fourth."""
-    A, c, one = lane_steps.A, lane_steps.C, np.ones(lane_steps.STAGES)
-    np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-15)
-    # Each rooted tree: its elementary weight of every stage, and its density.
-    trees = {
-        1: [(one, 1)],
-        2: [(c, 2)],
-        3: [(c**2, 3), (A @ c, 6)],
-        4: [(c**3, 4), (c * (A @ c), 8), (A @ c**2, 12), (A @ A @ c, 24)],
-        5: [
-            (c**4, 5), (c**2 * (A @ c), 10), (c * (A @ c**2), 15), (c * (A @ A @ c), 30), ((A @ c) ** 2, 20),
-            (A @ c**3, 20), (A @ (c * (A @ c)), 40), (A @ A @ c**2, 60), (A @ A @ A @ c, 120),
-        ],
-    }  # fmt: skip
-    for order, weights in trees.items():
-        for weight, density in weights:
-            assert A[-1] @ weight == pytest.approx(1.0 / density, abs=1e-14)
-            if order <= 4:
-                assert lane_steps.E @ weight == pytest.approx(0.0, abs=1e-15)
-            # Halfway through the step, the continuous extension has the fifth order, too.
-            assert lane_steps.HALF @ weight == pytest.approx(0.5**order / density, abs=1e-15)
-    assert max(abs(lane_steps.E @ weight) for weight, _ in trees[5]) > 1e-5
+    """Its weights meet Butcher's conditions of sixth order, those of the error vanish up to the fifth.
+
+    Halfway through the step, the weights have the fifth order, too.
+    """
+    A, c = lane_steps.A, lane_steps.C
+    np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-14)
+    trees = rooted_trees(A, c, 6)
+    assert np.bincount([order for order, *_ in trees]).tolist() == [0, 1, 1, 2, 4, 9, 20]
+    for order, weights, density in trees:
+        assert A[-1] @ weights == pytest.approx(1.0 / density, abs=2e-14)
+        if order <= 5:
+            assert lane_steps.E @ weights == pytest.approx(0.0, abs=1e-15)
+            assert lane_steps.HALF @ weights == pytest.approx(0.5**order / density, abs=1e-14)
+    assert max(abs(lane_steps.E @ weights) for order, weights, _ in trees if order == 6) > 1e-5

@@ -261,7 +261,11 @@ def _closed_loop(t, y, dy, p, w):
 
 #: As `dopri5.integrate`, by the steps of `lane_steps`; p is an `UnrolledProblem`, w is not used, arrays hold lanes.
 integrate = compiled_copy(
-    dopri5.integrate, "integrate_straight", closed_loop=_closed_loop, **lane_steps.INSTEAD
+    dopri5.integrate,
+    "integrate_straight",
+    closed_loop=_closed_loop,
+    keep_step=compiled_copy(lane_steps.keep_step, "keep_step_straight", closed_loop=_closed_loop),
+    **lane_steps.INSTEAD,
 )
 
 
