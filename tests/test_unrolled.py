@@ -175,12 +175,12 @@ def test_the_pair_for_lanes_has_its_orders():
     Halfway through the step, the weights have the fifth order, too.
     """
     A, c = lane_steps.A, lane_steps.C
-    np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-14)
+    np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-15)
     trees = rooted_trees(A, c, 6)
     assert np.bincount([order for order, *_ in trees]).tolist() == [0, 1, 1, 2, 4, 9, 20]
     for order, weights, density in trees:
-        assert A[-1] @ weights == pytest.approx(1.0 / density, abs=2e-14)
+        assert A[-1] @ weights == pytest.approx(1.0 / density, abs=1e-14)
         if order <= 5:
             assert lane_steps.E @ weights == pytest.approx(0.0, abs=1e-15)
-            assert lane_steps.HALF @ weights == pytest.approx(0.5**order / density, abs=1e-14)
+            assert lane_steps.HALF @ weights == pytest.approx(0.5**order / density, abs=1e-15)
     assert max(abs(lane_steps.E @ weights) for order, weights, _ in trees if order == 6) > 1e-5

@@ -21,7 +21,7 @@ from rigidfleet.kernel.vectors import filled, in_vectors, rough_inverse, total_o
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
 _STAGES = 7
 #: Rows of the trail that a step takes.
-_ROWS = 1
+_TRAIL_ROWS = 1
 _A = np.zeros((7, 6))
 _A[1, :1] = 1 / 5
 _A[2, :2] = 3 / 40, 9 / 40
@@ -230,7 +230,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         if t >= t_end:
             status = FINISHED
             break
-        if capacity > 0 and count[4] + _ROWS > capacity:
+        if capacity > 0 and count[4] + _TRAIL_ROWS > capacity:
             break
     for q in range(n):
         state.y[q] = y[q]

@@ -251,7 +251,7 @@ def _closed_loop(t, y, dy, p, w):
                 t, p.noise_step, p.noise_rows
             )
             noise -= p.noise_first
-    if stage == 0 or stage == lane_steps.STAGES - 1:  # the start and the end of a step
+    if stage == 0 or stage == lane_steps.STAGES - 1:  # the start, the middle and the end of a step
         wanted += OF_GAUGE
     _call_code(
         p.address, wanted, y, dy, p.gauge, p.uniform, p.before, time, p.known, p.motion[piece:], p.gust[gust:],

@@ -112,11 +112,13 @@ def _weights(w, h):
 
 
 @inlined
-def _to_stage(k, coordinates, s, h):
-    """Write the state of stage s, a literal, so that no term of weight zero is left."""
-    w, x, hc = _weights(A[s], h), _weights(_AA[s], h * h), h * C[s]
+def _to_state(k, row, coordinates, w, x, hc, s):
+    """Write into a row the state that the first s stages, a literal, lead to, so that no term of weight zero is left.
+
+    ``w`` and ``x`` are the `_weights` of accelerations in velocities and in positions, ``hc`` the time to it [s].
+    """
     of_rates, of_positions = 1 if s < 3 else 2, 1
-    if s == STAGES - 1:
+    if s >= STAGES - 1:  # the end and the middle
         of_rates = of_positions = 3
     for q in range(coordinates):
         i = coordinates + q
@@ -124,10 +126,16 @@ def _to_stage(k, coordinates, s, h):
         r = k[STATE, q] + hc * v
         if s > 1:
             r += _sum(k, i, x, of_positions, s - 1)
-        k[TRIAL, i] = v + _sum(k, i, w, of_rates, s)
-        k[TRIAL, q] = r
+        k[row, i] = v + _sum(k, i, w, of_rates, s)
+        k[row, q] = r
     for q in range(2 * coordinates, k.shape[1]):
-        k[TRIAL, q] = k[STATE, q] + _sum(k, q, w, of_rates, s)
+        k[row, q] = k[STATE, q] + _sum(k, q, w, of_rates, s)
+
+
+@inlined
+def _to_stage(k, coordinates, s, h):
+    """Write the state of stage s, a literal."""
+    _to_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
 
 @inlined
@@ -192,18 +200,6 @@ def step_size(t, h, t_end, p):
 
 
 @inlined
-def _to_middle(k, coordinates, h):
-    """Write the state halfway."""
-    w, x = _weights(HALF, h), _weights(_HALF_A, h * h)
-    for q in range(coordinates):
-        i = coordinates + q
-        k[MIDDLE, q] = k[STATE, q] + (0.5 * h) * k[STATE, i] + _sum(k, i, x, 3, STAGES - 1)
-        k[MIDDLE, i] = k[STATE, i] + _sum(k, i, w, 3, STAGES)
-    for q in range(2 * coordinates, k.shape[1]):
-        k[MIDDLE, q] = k[STATE, q] + _sum(k, q, w, 3, STAGES)
-
-
-@inlined
 def _put_points(points, q, y, quarter, y_new, slope, slope_new):
     """Write Bernstein coefficients of a state q over half a step, from its value after a quarter of the step.
 
@@ -243,8 +239,9 @@ def keep_step(t, h, p, w, state):
     before, after = (row + rows - 1) % rows, (row + 1) % rows
     for g in range(p.gauge.shape[0]):
         found.gauge[after, g] = p.gauge[g]
-    _to_middle(k, coordinates, h)
-    p.stage[0] = 0  # whose forces are asked for
+    w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
+    _to_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
+    p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
     state.count[0] += 1
     for g in range(p.gauge.shape[0]):
@@ -292,12 +289,12 @@ def keep_samples(t, h, t_new, times, samples, p, state):
         count[3] += 1
 
 
-#: What differs from `dopri5.integrate`.
+#: What differs from `dopri5.integrate`, beside the right-hand side and `keep_step`, which calls it.
 INSTEAD = {
     "_A": A,
     "_C": C,
-    "_ROWS": 2,
     "_STAGES": STAGES,
+    "_TRAIL_ROWS": 2,
     "STATE": STATE,
     "TRIAL": TRIAL,
     "advance": advance,
