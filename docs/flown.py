@@ -1,10 +1,11 @@
-"""Write the tables of vehicles.md that are flown: where errors come from, and what the paper asks of rotors.
+"""Write the tables that are flown: errors and rotor forces, gusts, what damping changes, how near vectors are.
 
-`python docs/flown.py` flies (one or two minutes) and rewrites them in place, each between `<!-- flown: NAME -->` and
+`python docs/flown.py` flies (two or three minutes) and rewrites them in place, each between `<!-- flown: NAME -->` and
 `<!-- end -->`. tests/test_docs.py flies them again and compares the numbers.
 """
 
 import re
+import runpy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 
 import rigidfleet as rf
+from rigidfleet.simulation.together import simulate_together
 
-PAGE = Path(__file__).with_name("vehicles.md")
+HERE = Path(__file__).parent
+PAGES = [HERE / name for name in ("vehicles.md", "theory.md", "paper.md", "performance.md")]
 Table = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 NO_DRAG = {"rotor_drag": 0.0, "rotor_inflow": 0.0, "body_drag": [0.0, 0.0, 0.0]}
@@ -88,7 +91,72 @@ def rotors() -> Table:
     return ("mission", "as the paper flies it", "", "smooth", ""), rows
 
 
-TABLES: dict[str, Callable[[], Table]] = {"errors": errors, "rotors": rotors}
+def damping() -> Table:
+    """Table 1 with the deformation damping of rigidfleet, with half of it, and without, as the paper's law is."""
+    tables, rows, usual = rf.load_mission("establish-triangle").to_dict(), [], None
+    for rate in (1.0, 0.5, 0.0):
+        changed = tables | {"constraint": {"deformation_damping": rate}}
+        result = rf.simulate(rf.Mission.from_dict(changed))
+        usual = result.position[-1] if usual is None else usual
+        peak = np.linalg.norm(result.constraint_force, axis=2).max()
+        apart = np.linalg.norm(result.position[-1] - usual, axis=1)
+        rows.append((f"{rate:g}", f"{peak:.2f}", ", ".join(f"{d:.1f}" for d in apart)))
+    head = (
+        "damping [1/s]",
+        "peak of a constraint force [N]",
+        "ends of agents 1 to 3 [m] from those at 1",
+    )
+    return head, rows
+
+
+def gusts() -> Table:
+    """The flights of examples/gusts.py."""
+    flights = runpy.run_path(str(HERE.parent / "examples" / "gusts.py"))["main"]()
+    words = {
+        "calm": "calm air",
+        "gusts": "the law is told the force of the gusts (`force=`)",
+        "gusts, f_C on board": "$f_C$ on board at 100 Hz, not told",
+        "gusts, tracking alone": "tracking alone (no edges)",
+    }
+    rows = [
+        (text, f"{worst['f_C']:.2f}", f"{1e3 * worst['pair']:.2f}", f"{1e3 * worst['slot']:.0f}")
+        for worst, text in ((flights[name], text) for name, text in words.items())
+    ]
+    return ("", "peak $f_C$ [N]", "worst error of a pair [mm]", "of a slot [mm]"), rows
+
+
+def vectors() -> Table:
+    """Eight flights of the windy passage side by side, and alone, beside flights at the tightest tolerances."""
+
+    def varied(**integrator: float) -> list[rf.Mission]:
+        missions = []
+        for k in range(8):
+            tables: dict[str, Any] = rf.load_mission("windy-passage").to_dict()
+            tables["agents"]["mass"] = [1.0 + 0.02 * k, 1.0 - 0.01 * k, 1.0 + 0.003 * k]
+            for name in ("gusts", "noise"):
+                tables["disturbances"][name]["seed"] = 5 * k
+            if integrator:
+                tables["integrator"] = integrator
+            missions.append(rf.Mission.from_dict(tables))
+        return missions
+
+    true = [rf.simulate(mission) for mission in varied(rtol=1e-12, atol=1e-12)]
+    alone, rows = [rf.simulate(mission) for mission in varied()], []
+    for words, flown in (("alone", alone), ("side by side", simulate_together(varied()))):
+        worst = (
+            max(
+                float(np.linalg.norm(getattr(r, name) - getattr(t, name), axis=2).max())
+                for r, t in zip(flown, true, strict=True)
+            )
+            for name in ("position", "velocity", "acceleration")
+        )
+        rows.append((words, *(f"{x:.0e}" for x in worst)))
+    return ("", "position [m]", "velocity [m/s]", "acceleration [m/s²]"), rows
+
+
+TABLES: dict[str, Callable[[], Table]] = {
+    "errors": errors, "rotors": rotors, "damping": damping, "gusts": gusts, "vectors": vectors,
+}  # fmt: skip
 
 
 def render(page: str) -> str:
@@ -104,4 +172,5 @@ def render(page: str) -> str:
 
 
 if __name__ == "__main__":
-    PAGE.write_text(render(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for path in PAGES:
+        path.write_text(render(path.read_text(encoding="utf-8")), encoding="utf-8")

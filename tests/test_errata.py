@@ -145,6 +145,22 @@ def test_moving_references_do_work():
     assert abs(powers[1]) > 0.01
 
 
+def test_errors_that_close_do_work():
+    """E4: while Table 1's first step closes, desired distances rest, and the power is -19 to +53 W."""
+    result = simulate("line-singular")
+    first = result.time < 6.0
+    power = (result.constraint_force * result.velocity).sum(axis=(1, 2))[first]
+    assert power.min() == pytest.approx(-19.06, abs=0.1)
+    assert power.max() == pytest.approx(53.1, abs=0.1)
+    energy = 0.5 * (result.velocity[first] ** 2).sum(
+        axis=(1, 2)
+    )  # of 1 kg each; 0.1 N along x and y besides
+    pushed = 0.1 * result.velocity[first][..., :2].sum(axis=(1, 2))
+    steps = np.diff(result.time[first])
+    done = ((power + pushed)[1:] + (power + pushed)[:-1]) / 2 @ steps
+    assert energy[-1] - energy[0] == pytest.approx(done, abs=0.05)
+
+
 @pytest.mark.parametrize(
     ("shape", "n", "edges", "rank"),
     [

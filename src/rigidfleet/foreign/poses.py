@@ -33,7 +33,7 @@ def read_poses(
     """
     if find_spec("mcap") is None:
         raise TrajectoryError(
-            f"{name}: needs the package 'mcap', which is not installed. Run: pip install 'rigidfleet[mcap]'"
+            f"{name}: needs the package 'mcap', which is not installed. Run: pip install mcap"
         )
     found = _messages(data, name)
     if not found:

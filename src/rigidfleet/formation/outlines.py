@@ -37,7 +37,7 @@ def svg_outlines(path: str | Path) -> list[Floats]:
         import svgpathtools
     except ImportError:
         raise RigidfleetError(
-            'Drawings need svgpathtools. Install it: pip install "rigidfleet[show]".'
+            "Drawings need svgpathtools. Install it: pip install svgpathtools."
         ) from None
     text = read_bytes(path)
     try:

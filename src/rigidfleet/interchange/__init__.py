@@ -46,7 +46,7 @@ class Format(NamedTuple):
     tolerance : default tolerance of fitted curves [m]; None: it has samples at a rate instead
     kept, lost : what such a file has of each vehicle, and what it lacks
     own_time : whether its time begins at 0, not at the mission time of the first state
-    package, extra : what has to be installed, and the extra of rigidfleet that does so
+    package, distribution : module that has to be installed, and the name under which pip installs it
     """
 
     write: Callable[[Motion, Any], Iterator[bytes]]
@@ -58,7 +58,7 @@ class Format(NamedTuple):
     lost: str
     own_time: bool = True
     package: str = ""
-    extra: str = ""
+    distribution: str = ""
 
 
 FORMATS: dict[str, Format] = {
@@ -96,7 +96,7 @@ FORMATS: dict[str, Format] = {
     ),
     "rrd": Format(
         recordings.write_rrd, recordings.read_rrd, "rrd", False, None,
-        "position and yaw", "velocity, acceleration, jerk, tilt and rotors", False, "rerun", "rerun",
+        "position and yaw", "velocity, acceleration, jerk, tilt and rotors", False, "rerun", "rerun-sdk",
     ),
     "gltf": Format(
         gltf.write_gltf, gltf.read_gltf, "glb", False, 1e-2,
@@ -188,7 +188,7 @@ def export(
     if chosen.package and find_spec(chosen.package) is None:
         raise ResultError(
             f"{format}: needs the package {chosen.package!r}, which is not installed. Run: "
-            f"pip install 'rigidfleet[{chosen.extra}]'"
+            f"pip install {chosen.distribution}"
         )
     try:
         motion, cut = tracked(result, flown=flown)

@@ -171,7 +171,7 @@ def cluster(address: str) -> Generator[Pool]:
         from distributed import Client
     except ImportError:
         raise RigidfleetError(
-            '--cluster needs the package distributed. Install it: pip install "rigidfleet[cluster]"'
+            "--cluster needs the package distributed. Install it: pip install distributed"
         ) from None
     try:
         client: Any = Client(address, timeout=_CONNECT, set_as_default=False)
