@@ -67,7 +67,7 @@ def test_tables_are_up_to_date():
 
 @pytest.mark.long
 def test_flown_tables_are_up_to_date():
-    """Tables that are flown have the numbers of today's flights: to the last digit or 3 %, errors 1e-N to a factor 3."""
+    """Tables that are flown have the numbers of today's flights: to a digit or 3 %, errors 1e-N to a factor 3."""
     flown = script("flown")
     number = re.compile(r"\d+\.\d+|\d+e-\d+|\b\d+\b")
     for path in flown.PAGES:

@@ -628,7 +628,8 @@ def test_commands():
     for wrong in (
         {}, {"move": [1, 0], "turn": [0, 0, 0]}, {"move": [1, 0, "x"], "turn": [0, 0, 0]},
         {"move": [1, 0, math.nan], "turn": [0, 0, 0]}, {"move": [True, 0, 0], "turn": [0, 0, 0]},
-        {"formation": "star"}, {"gust": [0, 0, 0], "strength": 1}, {"pause": 1}, {"speed": 3}, {"stop": 1},
+        {"formation": "star"}, {"gust": [0, 0, 0], "strength": 1},
+        {"gust": [1e-320, 0, 0], "strength": 1}, {"pause": 1}, {"speed": 3}, {"stop": 1},
     ):  # fmt: skip
         with pytest.raises(ValueError, match=r"\w"):
             session.command(wrong)
@@ -811,6 +812,45 @@ def test_only_this_machine(server):
 def test_wrong_commands(server, body):
     """What is no command is refused, and nothing happens."""
     assert ask(server, "POST", "command", body)[0] == 400
+
+
+def odd(rng: np.random.Generator, depth: int) -> str:
+    """JSON of any kind, with numbers beyond every float, and nested as deep as fits into a command."""
+    kinds = (
+        "null", "true", "0", "-1", "1" * 400, "-" + "9" * 400, "1e400", "NaN", "-Infinity", "1e-320", '"x"', "[]",
+        "{}", "[0, 0, 0]", "[1e-320, 0, 0]", f"[{'7' * 400}, 0, 0]", "[" * depth + "]" * depth,
+        '{"a":' * 900 + "1" + "}" * 900,
+    )  # fmt: skip
+    return kinds[rng.integers(len(kinds))]
+
+
+def test_every_command_has_an_answer(server):
+    """Whatever stands where a command has its values, the answer says that it is done or why not; none is cut off."""
+    rng, answers = np.random.default_rng(3), set()
+    forms = (
+        ("move", "turn"), ("formation",), ("gust", "strength"), ("ball", "radius", "velocity"), ("pull", "to"),
+        ("remove",), ("pause",), ("speed",), ("again",), ("stop",), ("other",),
+    )  # fmt: skip
+    for k in range(300):
+        keys = forms[k % len(forms)]
+        if k % len(forms) in {6, 8, 9}:  # what would end or hold the flight of the other tests
+            body = f'{{"{keys[0]}": {odd(rng, 4000).replace("true", "1")}}}'
+        else:
+            body = f"{{{', '.join(f'{json.dumps(key)}: {odd(rng, 4000)}' for key in keys)}}}"
+        answers.add(ask(server, "POST", "command", body)[0])
+    assert answers == {204, 400}
+
+
+def test_idle_connections_end(server, monkeypatch):
+    """Who connects and sends nothing, or half a request, is hung up on: threads do not pile up."""
+    assert 0 < server.http.RequestHandlerClass.timeout <= 30  # [s]
+    monkeypatch.setattr(server.http.RequestHandlerClass, "timeout", 0.2)
+    where = urlsplit(server.url)
+    head = f"POST {where.path}command HTTP/1.1\r\nHost: {where.netloc}\r\nOrigin: http://{where.netloc}\r\n"
+    for begun in ("", "POST /", head + "Content-Length: 20\r\n\r\n{"):
+        with socket.create_connection((where.hostname, where.port), timeout=5) as idle:
+            idle.sendall(begun.encode())
+            assert idle.recv(1) == b""  # closed by the server, before our own time is up
 
 
 def test_command(server):

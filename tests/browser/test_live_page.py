@@ -16,6 +16,9 @@ from rigidfleet.web.live.session import Session
 
 pytestmark = pytest.mark.long
 
+#: Colour of errors (`--alert` of the page).
+ALERT = "rgb(176, 0, 32)"
+
 
 #: Whether a vehicle was ever seen more than 0.1 m from its slot. The gust that a slow page asks about is gone.
 MOVED = """
@@ -181,11 +184,18 @@ def test_a_refused_ball_says_why(page, session):
     page.run("document.getElementById('radius').value = '5'")
     page.press("b")
     page.wait("return document.getElementById('word').textContent.startsWith('Click')")
+    assert colour(page, "word") != ALERT  # what to do next is no error
     page.click("#view")
     page.wait("return document.getElementById('word').textContent.includes('at least 1 m away')")
+    assert colour(page, "word") == ALERT
     assert session.pilot.balls == []
     page.click("#play")
     page.wait("return document.getElementById('word').hidden")
+
+
+def colour(page, name):
+    """Colour of an element's letters."""
+    return page.run(f"return getComputedStyle(document.getElementById('{name}')).color")
 
 
 def test_contact_ends_the_flight_in_words(page, session):
@@ -193,6 +203,7 @@ def test_contact_ends_the_flight_in_words(page, session):
     session.pilot.flight.ending = "agent 3 met 'left' at 4.20 s"
     page.wait("return !document.getElementById('ending').hidden")
     assert page.text("#ending") == "Incomplete: agent 3 met 'left' at 4.20 s"
+    assert colour(page, "ending") == ALERT
 
 
 def test_held_off(page, session):
@@ -289,6 +300,7 @@ def test_end(page, session):
         "return document.getElementById('ending').textContent.startsWith('The flight has ended')"
     )
     assert session.stopped.is_set()
+    assert colour(page, "ending") != ALERT  # a flight that was ended and saved is a success
     assert page.run("return document.getElementById('fly').hidden")
     page.run(
         "const s = document.getElementById('scrub'); s.value = s.min; s.dispatchEvent(new Event('input'))"

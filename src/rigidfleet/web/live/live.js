@@ -216,6 +216,7 @@ class LivePlayer extends Player {
     const text = words && words[0].toUpperCase() + words.slice(1);
     if (part("word").textContent === text) return;
     part("word").textContent = text;
+    part("word").classList.toggle("refused", Boolean(refusal));
     part("word").hidden = !text;
     this.resize(); // the card begins below
   }
@@ -293,6 +294,7 @@ class LivePlayer extends Player {
   end(words) {
     this.over = true;
     part("ending").textContent = [FAREWELL, words].filter(Boolean).join(" ");
+    part("ending").classList.toggle("well", !this.recording.info.ending);
     part("ending").hidden = false;
     for (const id of ["fly", "play", "speed", "now", "again", "end"]) part(id).hidden = true;
     this.resize();

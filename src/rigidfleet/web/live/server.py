@@ -21,6 +21,7 @@ from rigidfleet.web.live.session import Session
 
 _HOST = "127.0.0.1"
 _LARGEST = 10_000  # greatest size of a command [bytes]
+_IDLE = 10.0  # time that a connection may take to send its request, or to take a message [s]
 _SILENCE = 1.0  # silence after which a message tests whether the page still listens [s]
 #: Headers of every answer. The page has its own policy, but only a header can forbid frames around it.
 _HEADERS = {
@@ -79,6 +80,7 @@ class _Handler(BaseHTTPRequestHandler):
     base: str
     port: int
     server_version, sys_version = "rigidfleet", ""
+    timeout = _IDLE  # [s] of the socket: who connects and sends nothing does not keep a thread
 
     def parse_request(self) -> bool:
         """Read a request; whatever its method, refuse it unless it comes from our page."""
@@ -111,6 +113,8 @@ class _Handler(BaseHTTPRequestHandler):
             if not isinstance(asked, dict):
                 raise ValueError("a command must be an object")
             self.session.command(asked)
+        except RecursionError:
+            self._answer(HTTPStatus.BAD_REQUEST, "the command is nested too deeply")
         except (ValueError, RigidfleetError) as error:
             self._answer(HTTPStatus.BAD_REQUEST, str(error))
         else:

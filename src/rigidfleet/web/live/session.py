@@ -191,7 +191,7 @@ class Session:
                 case {"gust": direction, "strength": strength}:
                     strength = _number(strength, _STRONGEST)
                     direction = _vector(direction, 1.0)
-                    if not direction.any():
+                    if not np.linalg.norm(direction) > 0.0:  # the square of a tiny one is 0
                         raise ValueError("a gust needs a direction")
                     self.pilot.gust(direction, strength)
                 case {"ball": place, "radius": radius, "velocity": velocity}:
@@ -276,9 +276,10 @@ def _event(name: str, data: str) -> bytes:
 
 
 def _number(value: Any, most: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    whole = isinstance(value, int) and not isinstance(value, bool)  # of any size: it may exceed every float
+    if not (whole or (isinstance(value, float) and math.isfinite(value))):
         raise ValueError("the value must be a finite number")
-    return min(max(float(value), -most), most)
+    return float(min(max(value, -most), most))
 
 
 def _vector(value: Any, most: float) -> np.ndarray:
