@@ -21,7 +21,7 @@ help:  ## Show this list
 setup: .venv/.core .venv/.dev  ## Make .venv with all that development needs
 
 demo: .venv/.core  ## Fly the paper's narrow passage
-	@$(BIN)/rigidfleet run narrow-passage --force
+	@$(BIN)/rigidfleet run narrow-passage --force --replay
 
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"

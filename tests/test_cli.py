@@ -879,7 +879,7 @@ def test_replay(capsys, plot):
     """A replay is a page beside the result, which is kept, replaced with --force, and gone with its flight."""
     assert cli.main(["run", "short.toml", "--no-figures", "--replay"]) == codes.PASSED
     page = Path("flights/short/replay.html")
-    assert f"Replay   {page}" in capsys.readouterr().out
+    assert f"Replay   {page} (open it in a browser)\n" in capsys.readouterr().out
     write(page, "earlier")
     assert cli.main(["replay", "flights/short/short.nc"]) == codes.BAD_INPUT
     assert "already exists; use --force to overwrite" in capsys.readouterr().err

@@ -252,7 +252,8 @@ def list_files(files: Files) -> None:
         ("Replay", files.replay),
     ):
         if path.exists():
-            console.out().print(f"{what:8} {path}", soft_wrap=True)
+            how = " (open it in a browser)" if path.suffix == ".html" else ""
+            console.out().print(f"{what:8} {path}{how}", soft_wrap=True)
     drawn = [path for path in files.figures if path.exists()]
     if drawn:
         text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
