@@ -719,7 +719,8 @@ def test_interrupt_inside_the_compiler(capsys, simulate):
 def plot(monkeypatch):
     """Draw figures in no time."""
 
-    def draw(result, name, formats, *, titles=True):
+    def draw(result, name, formats, *, titles=True, width=None):
+        assert width in {None, 88.0}
         return dict.fromkeys(formats, b"drawn" if titles else b"bare")
 
     monkeypatch.setattr("rigidfleet.plotting.rendered", draw)
@@ -734,6 +735,15 @@ def test_run_draws(capsys, plot):
     assert found == {f"{name}.png" for name in known}
     where = os.path.join("flights", "short", "figures") + os.sep
     assert f"Figures  {where} ({len(found)} files)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", [["run", "short.toml"], ["report", "flights/short/short.nc"]])
+@pytest.mark.parametrize("width", ["59", "1000", "nan", "-88"])
+def test_width_of_figures(capsys, plot, command, width):
+    """--width is checked before anything is flown or drawn."""
+    assert cli.main(["run", "short.toml", "--width", "88"]) == codes.PASSED
+    assert cli.main([*command, "--width", width, "--force"]) == codes.BAD_INPUT
+    assert "--width must be 60 to 400 [mm]" in capsys.readouterr().err
 
 
 def test_formats_and_titles_of_figures(capsys, plot):

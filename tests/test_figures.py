@@ -1,4 +1,5 @@
 import math
+import re
 import subprocess
 import sys
 import warnings
@@ -886,11 +887,69 @@ def test_an_incomplete_flight_says_so_without_titles(tmp_path):
     )
     assert "incomplete, stopped at 20.00 s" in words
     assert "Thrust of each agent" not in words
-    with style.titles(shown=False):
+    with style.shape(titles=False):
         figure = drawn("inputs", stopped)
     assert figure._suptitle is not None
     warning = figure._suptitle.get_window_extent().corners()
     assert not any(overlap(warning, corners(label)) for label in by_gid(figure, "phase"))
+
+
+def test_fonts_of_a_pdf_are_those_that_publishers_take(triangle, tmp_path):
+    """A PDF embeds TrueType fonts; Type 3, which many journals refuse, is not in it."""
+    (path,) = plotting.plot(triangle, tmp_path, names=["summary"], formats=["pdf"])
+    kinds = set(re.findall(rb"/Subtype /(Type\w+|CIDFontType\w+|TrueType)", path.read_bytes()))
+    assert b"Type3" not in kinds
+    assert kinds & {b"CIDFontType2", b"TrueType"}
+
+
+@pytest.mark.parametrize("width", [60.0, 88.0, 130.0, 250.0])
+def test_a_figure_fits_its_column(triangle, tmp_path, width):
+    """Files have the width that is wanted; legends, titles and names of axes are on the page, and letters keep size."""
+    names = ["attitude", "cm", "distances", "constraint_force", "inputs", "clearance", "trajectory"]
+    for titles in (True, False):
+        for name, figure in zip(
+            names, plotting.plot(triangle, names=names, titles=titles, width=width), strict=True
+        ):
+            assert figure.get_figwidth() == pytest.approx(width / 25.4)
+            figure.canvas.draw()  # which moves the names of axes
+            page, flat = figure.bbox.padded(1.0), [ax for ax in figure.axes if ax.name != "3d"]
+            shown: list[Any] = [*figure.texts, *figure.legends, *(ax.get_legend() for ax in flat)]
+            shown += [ax.xaxis.label for ax in flat] + [ax.yaxis.label for ax in flat]
+            for part in shown:
+                if part is not None and (not isinstance(part, Text) or part.get_text()):
+                    box = part.get_window_extent()
+                    assert page.containsx(box.x0), (name, part)
+                    assert page.containsx(box.x1), (name, part)
+            assert {text.get_fontsize() for ax in figure.axes for text in ax.get_xticklabels()} <= {
+                8.0,
+                7.0,
+                6.5,
+            }
+    (path,) = plotting.plot(triangle, tmp_path, names=["cm"], formats=["png"], width=width)
+    with Image.open(path) as image:
+        assert image.width / image.info["dpi"][0] * 25.4 == pytest.approx(width, abs=0.5)
+
+
+@pytest.mark.parametrize("width", [0.0, -88.0, 59.0, 401.0, math.nan])
+def test_a_width_has_bounds(triangle, width):
+    """A width that no page has is refused with the bounds."""
+    with pytest.raises(ValueError, match="60 to 400 mm"):
+        plotting.plot(triangle, names=["cm"], width=width)
+
+
+@pytest.mark.parametrize("n", [1, 7, 12, 13, 60, 200, 201])
+def test_the_legend_of_the_summary_is_on_the_page(n):
+    """Whatever the number of agents, the legend is on the page, clear of the axes above and the phases below."""
+    figure = plotting.plot(a_flight(n=n, formation=None, samples=20), names=["summary"])[0]
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    box, page = legend.get_window_extent(), figure.bbox
+    assert page.x0 <= box.x0 < box.x1 <= page.x1
+    (phases,) = [text for text in figure.texts if text.get_text().startswith("Phases")]
+    assert box.y0 >= phases.get_window_extent().y1
+    below = [ax.xaxis.label for ax in figure.axes if ax.get_xlabel() == "time [s]"]
+    assert len(below) >= 3
+    assert all(box.y1 <= label.get_window_extent().y0 for label in below)
 
 
 def test_pdf_is_written(triangle, tmp_path):

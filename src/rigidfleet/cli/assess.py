@@ -94,7 +94,7 @@ def assess(
         from rigidfleet.cli.run import drawings, list_files, write_figures, write_replay
 
         made.make_folder()
-        with drawings(result, made.figures, None, titles=True) as pictures:
+        with drawings(result, made.figures, None) as pictures:
             result.save(made.result)
             write_file(made.verdict, (verdict.json() + "\n").encode())
             write_report([result], [verdict], made.report, quiet=json)

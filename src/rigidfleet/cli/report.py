@@ -13,7 +13,15 @@ if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.run import Format, drawings, list_files, of_formats, write_figures, write_replay
+from rigidfleet.cli.run import (
+    Format,
+    check_width,
+    drawings,
+    list_files,
+    of_formats,
+    write_figures,
+    write_replay,
+)
 
 
 def report(
@@ -25,6 +33,7 @@ def report(
     no_figures: bool = False,
     format: list[Format] | None = None,
     no_titles: bool = False,
+    width: float | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -49,6 +58,8 @@ def report(
         Format of the figure files; may be repeated: --format pdf --format png. Default: png.
     no_titles : bool
         Draw the figure files without titles, for papers with captions.
+    width : float
+        Width of the figure files [mm], such as 88 for one column of a paper.
     json : bool
         Print the verdict as JSON; for several flights, a list of verdicts.
     quiet : bool
@@ -58,6 +69,7 @@ def report(
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 
+    check_width(width)
     if not (no_figures or others):
         drawing.prepare()
     paths = [result, *others]
@@ -90,7 +102,7 @@ def report(
         if files.verdict not in kept:
             write_file(files.verdict, (verdicts[0].json() + "\n").encode())
         left = [path for path in drawn if path not in kept]
-        with drawings(records[0], left, format, titles=not no_titles) as pictures:
+        with drawings(records[0], left, format, titles=not no_titles, width=width) as pictures:
             if files.report not in kept:
                 write_report(records, verdicts, files.report, quiet=quiet)
             write_figures(pictures, quiet=quiet)

@@ -38,6 +38,7 @@ def run(
     no_figures: bool = False,
     format: list[Format] | None = None,
     no_titles: bool = False,
+    width: float | None = None,
     replay: bool = False,
     csv: bool = False,
     csv_rate: float | None = None,
@@ -61,6 +62,8 @@ def run(
         Format of the figures; may be repeated: --format pdf --format png. Default: png.
     no_titles : bool
         Draw figures without titles, for papers with captions.
+    width : float
+        Width of the figures [mm], such as 88 for one column of a paper.
     replay : bool
         Also write replay.html, which replays the flight in a browser.
     csv : bool
@@ -78,6 +81,7 @@ def run(
         raise RigidfleetError("--csv-rate and --flown say what --csv writes. Add --csv.")
     if csv_rate is not None and not csv_rate > 0.0:
         raise RigidfleetError(f"--csv-rate must be positive [Hz], not {csv_rate:g}.")
+    check_width(width)
     if not no_figures:
         drawing.prepare()
     from rigidfleet.mission import load_mission
@@ -94,7 +98,7 @@ def run(
 
     files.make_folder()
     drawn = [] if interrupted or no_figures else files.figures
-    with drawings(result, drawn, format, titles=not no_titles) as pictures:
+    with drawings(result, drawn, format, titles=not no_titles, width=width) as pictures:
         result.save(files.result)
         files.forget()
         if csv:
@@ -204,8 +208,23 @@ def of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> lis
     return [path for path in figures if path.suffix in kinds]
 
 
+def check_width(width: float | None) -> None:
+    """Raise an error if figures cannot have this width [mm]."""
+    from rigidfleet.plotting import WIDTHS
+
+    if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise RigidfleetError(
+            f"--width must be {WIDTHS[0]:g} to {WIDTHS[1]:g} [mm], not {width:g}."
+        )
+
+
 def drawings(
-    result: Result, figures: Iterable[Path], kinds: Iterable[Format] | None, *, titles: bool
+    result: Result,
+    figures: Iterable[Path],
+    kinds: Iterable[Format] | None,
+    *,
+    titles: bool = True,
+    width: float | None = None,
 ) -> drawing.Drawings:
     """Begin to draw the figures that apply to the flight, each for the file of its name."""
     from rigidfleet.plotting import figure_names, rendered
@@ -217,7 +236,7 @@ def drawings(
         for path in paths:
             if path.stem in names:
                 formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
-    draw = partial(rendered, result, titles=titles)
+    draw = partial(rendered, result, titles=titles, width=width)
     return drawing.Drawings(formats, draw, alone=result.position.nbytes > _LARGEST)
 
 

@@ -34,8 +34,7 @@ from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
 from rigidfleet.plotting.sketches import formations
 from rigidfleet.plotting.space import trajectory
-from rigidfleet.plotting.style import agent_colours, settings
-from rigidfleet.plotting.style import titles as shown_titles
+from rigidfleet.plotting.style import agent_colours, settings, shape
 from rigidfleet.result import Result, as_result
 
 if TYPE_CHECKING:
@@ -73,6 +72,8 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
 }  # fmt: skip
 #: File formats of figures.
 FORMATS = ("png", "svg", "pdf")
+#: Least and greatest width of a figure [mm].
+WIDTHS = (60.0, 400.0)
 _MARGIN = 0.05  # [in] around a figure cropped to its content
 
 
@@ -118,6 +119,7 @@ def plot(
     *,
     names: Iterable[str] | None = None,
     titles: bool = True,
+    width: float | None = None,
 ) -> Figures: ...
 
 
@@ -129,6 +131,7 @@ def plot(
     formats: Iterable[str] = ("png", "svg"),
     names: Iterable[str] | None = None,
     titles: bool = True,
+    width: float | None = None,
 ) -> list[Path]: ...
 
 
@@ -139,6 +142,7 @@ def plot(
     formats: Iterable[str] = ("png", "svg"),
     names: Iterable[str] | None = None,
     titles: bool = True,
+    width: float | None = None,
 ) -> Figures | list[Path]:
     """Draw a flight, for a notebook or as files ``folder/NAME.FORMAT``; each file is written completely or not at all.
 
@@ -150,6 +154,8 @@ def plot(
     names : figures to draw, from `figure_names`; by default all in which there is something to draw
     titles : whether a title and the mission's name stand above each figure. Without them, the figure is cropped
         to its content, for a paper with its own captions; a note that the flight is incomplete is always shown
+    width : width of the figures [mm], 60 to 400, such as 88 for one column of a paper; letters keep their size. Those
+        of `summary` and `formations` have a width of their own
 
     Returns
     -------
@@ -158,7 +164,7 @@ def plot(
     Raises
     ------
     ValueError
-        A format or a name is unknown.
+        A format or a name is unknown, or the width is out of its range.
     ResultError
         A file cannot be written, or the result or the mission inside it cannot be read.
     TypeError
@@ -169,24 +175,32 @@ def plot(
     formats = _known("format", formats, FORMATS)
     names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
     if target is None:
-        return Figures(_drawn(result, name, titles=titles) for name in names)
+        return Figures(_drawn(result, name, titles, width) for name in names)
     paths = []
     for name in names:
-        paths += write_files(target / name, rendered(result, name, formats, titles=titles))
+        drawn = rendered(result, name, formats, titles=titles, width=width)
+        paths += write_files(target / name, drawn)
     return paths
 
 
-def _drawn(result: Result, name: str, *, titles: bool) -> Figure:
-    with shown_titles(shown=titles):
+def _drawn(result: Result, name: str, titles: bool, width: float | None) -> Figure:
+    if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise ValueError(f"the width must be {WIDTHS[0]:g} to {WIDTHS[1]:g} mm, not {width:g}")
+    with shape(titles=titles, width=width):
         return _FIGURES[name](result)
 
 
 def rendered(
-    result: Result, name: str, formats: Iterable[str], *, titles: bool = True
+    result: Result,
+    name: str,
+    formats: Iterable[str],
+    *,
+    titles: bool = True,
+    width: float | None = None,
 ) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
     with settings():
-        figure = _drawn(result, name, titles=titles)
+        figure = _drawn(result, name, titles, width)
         keep_layout(figure)
         return contents(figure, formats, close=not titles)
 

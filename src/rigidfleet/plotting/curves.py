@@ -424,7 +424,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
         if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
             st.annotate(
                 ax,
-                f"values below {_SMALLEST:g} m (rounding) are not drawn",
+                f"not drawn: below {_SMALLEST:g} m (rounding)",
                 st.corners()[::-1],
                 color=st.GREY,
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from typing import TYPE_CHECKING, Any
 
@@ -71,7 +72,10 @@ def summary(result: Result) -> Figure:
     (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(apart, result)
     key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
     entries = space.handles(result, view)
-    fig.legend(handles=entries, loc="center", ncols=len(entries), bbox_to_anchor=(0.5, 0.075))
+    fig.legend(
+        handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
+        bbox_to_anchor=(0.5, 0.058), labelspacing=0.2,
+    )  # fmt: skip
     fig.text(
         0.5, 0.05, "\n".join(key[:3]), ha="center", va="top", fontsize=7.5, color=st.GREY,
         parse_math=False,

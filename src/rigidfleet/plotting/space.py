@@ -395,19 +395,24 @@ def trajectory(result: Result) -> Figure:
     """Trajectory in three dimensions and from above, with the formation drawn at chosen times."""
     from rigidfleet.plotting.figure import Figure
 
-    fig = Figure(figsize=(10.5, 6.2))
+    wide = st.width(10.5)
+    fig = Figure(figsize=(wide, 2.2 * wide if st.narrow() else 6.2))
     fig.settings = st.settings
     st.head(fig, result, "Trajectory")
     view = scene(result)
-    draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
-    above = fig.add_axes((0.66, 0.16, 0.32, 0.74))
+    if st.narrow():  # the view from above stands below
+        draw_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))
+        above = fig.add_axes((0.16, 0.13, 0.8, 0.35))
+    else:
+        draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
+        above = fig.add_axes((0.66, 0.16, 0.32, 0.74))
     draw_above(above, result, view)
     above.set_anchor("C")
     entries = handles(result, view)
     fig.legend(
         handles=entries,
         loc="lower center",
-        ncols=min(len(entries), 11),
+        ncols=min(len(entries), max(int(0.9 * wide), 2) if st.narrow() else 11),
         borderaxespad=0.8,
         columnspacing=1.4,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 import warnings
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
@@ -42,6 +43,7 @@ DASHES = (0, (4, 2.5))
 ALERT = "#B00020"
 
 WIDTH = 9.0  # width of a figure over time [in]
+_COLUMN = 5.5  # a figure that is narrower has one column of axes [in]
 _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
 _DOT = _DPI / 100  # a hundredth of an inch [pixels]
@@ -64,6 +66,7 @@ Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
 _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 _places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
 _titled: ContextVar[bool] = ContextVar("titled", default=True)
+_width: ContextVar[float | None] = ContextVar("width", default=None)
 
 _RC: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -105,6 +108,7 @@ _RC: dict[str, Any] = {
     "figure.constrained_layout.w_pad": _PAD,
     "figure.constrained_layout.h_pad": _PAD,
     "savefig.dpi": _DPI,
+    "pdf.fonttype": 42,  # TrueType: publishers refuse Type 3
     "svg.fonttype": "none",  # text remains text
     "svg.hashsalt": "rigidfleet",  # the same flight gives the same file
 }
@@ -144,13 +148,24 @@ def styled(draw: Draw) -> Draw:
 
 
 @contextmanager
-def titles(*, shown: bool) -> Generator[None]:
-    """Draw figures in this context with a title and the name of the mission, or without both."""
-    before = _titled.set(shown)
+def shape(*, titles: bool = True, width: float | None = None) -> Generator[None]:
+    """Draw figures in this context with a title and the mission's name, or without both; of another width [mm]."""
+    before = _titled.set(titles), _width.set(None if width is None else width / 25.4)
     try:
         yield
     finally:
-        _titled.reset(before)
+        _titled.reset(before[0])
+        _width.reset(before[1])
+
+
+def width(usual: float) -> float:
+    """Width of a figure [in]: the one that is wanted, or the usual one."""
+    return _width.get() or usual
+
+
+def narrow() -> bool:
+    """Whether figures are to fit one column of a page."""
+    return width(WIDTH) < _COLUMN
 
 
 def agent_colours(n: int) -> list[str]:
@@ -185,8 +200,11 @@ def time_figure(
     from rigidfleet.plotting.layout import Layout
 
     shares = [1.0] * rows if shares is None else shares
+    stacked = (columns, rows) if narrow() else None  # the second column then stands below the first
+    if stacked:
+        rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)
-    fig = Figure(figsize=(WIDTH, whole), layout=Layout(_PAD))
+    fig = Figure(figsize=(width(WIDTH), whole), layout=Layout(_PAD))
     fig.settings = settings
     # Nearly the heights that the axes will have, as the number of their ticks depends on it
     inside = whole - 1.2 - 2 * _PAD * (rows - 1)
@@ -203,7 +221,7 @@ def time_figure(
         ax.xaxis.set_label_coords(0.5, 0.0)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
-    return fig, axes
+    return fig, axes.reshape(stacked).T if stacked else axes
 
 
 def head(fig: Figure, result: Result, title: str) -> None:
@@ -225,11 +243,20 @@ def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
                 warning.set_y(top)
         return
     title_text = fig.suptitle(
-        title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
+        textwrap.fill(title, int(9 * fig.get_figwidth())),
+        x=0.012,
+        ha="left",
+        va="top",
+        fontsize=11,
+        fontweight="bold",
+        parse_math=False,
     )
     if fig.get_layout_engine() is None:  # a layout engine places it itself, clear of the axes
         title_text.set_y(top)
-    fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
+    if colour == ALERT or not narrow():
+        fig.text(
+            0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False
+        )
 
 
 def over_time(ax: Axes, result: Result) -> None:
@@ -367,7 +394,8 @@ def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
             n += bool(band.get_transform().transform_path(path).intersects_bbox(box, filled=True))
     inside = ax.bbox.padded(_DOT)
     if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
-        n += 100
+        over = (inside.x0 - box.x0, box.x1 - inside.x1, inside.y0 - box.y0, box.y1 - inside.y1)
+        n += 100 + int(max(over))
     return n
 
 
@@ -485,11 +513,20 @@ def some(n: int, most: int) -> list[int]:
 
 
 def legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
-    """Legend to the right of an axes."""
+    """Legend to the right of an axes, in a narrow figure below."""
+    look: dict[str, Any] = {"bbox_to_anchor": (1.012, 1.0)}
+    if narrow():  # clear of the numbers and the name of the time axis, which the last axes has
+        last = (spec := ax.get_subplotspec()) is None or spec.is_last_row()
+        longest = max((len(str(h.get_label())) for h in handles), default=1)
+        look = {
+            "bbox_to_anchor": (0, 0),
+            "borderaxespad": 4.5 if last else 0.8,
+            "ncols": max(int(16 * (width(WIDTH) - 0.7)) // (longest + 7), 1),
+        }
     if handles:
         ax.legend(
-            handles=handles, loc="upper left", bbox_to_anchor=(1.012, 1.0), title=title or None,
-            title_fontsize=8, alignment="left", labelspacing=0.3,
+            handles=handles, loc="upper left", title=title or None, title_fontsize=8, alignment="left",
+            labelspacing=0.3, **look,
         )  # fmt: skip
 
 
@@ -508,7 +545,7 @@ def name_phases(axes: Iterable[Axes], result: Result) -> None:
     If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
     phases are short, with a line to their phase. If even this is too narrow, the shortest phases have no name.
     """
-    for ax in axes:
+    for ax in list(axes)[: 1 if narrow() else None]:
         labels = _upright(ax, result) or _slanting(ax, result)
         for label in labels:
             label.set_gid("phase")

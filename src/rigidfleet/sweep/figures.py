@@ -95,7 +95,7 @@ def rendered(
         "drivers": correlations,
         "map": partial(over_two, over=over, metric=metric),
     }
-    with st.settings(), st.titles(shown=titles):
+    with st.settings(), st.shape(titles=titles):
         figure = draw[name](table)
     return {} if figure is None else contents(figure, formats, close=not titles)
 

@@ -276,7 +276,9 @@ def _event(name: str, data: str) -> bytes:
 
 
 def _number(value: Any, most: float) -> float:
-    whole = isinstance(value, int) and not isinstance(value, bool)  # of any size: it may exceed every float
+    whole = isinstance(value, int) and not isinstance(
+        value, bool
+    )  # of any size: it may exceed every float
     if not (whole or (isinstance(value, float) and math.isfinite(value))):
         raise ValueError("the value must be a finite number")
     return float(min(max(value, -most), most))
