@@ -402,7 +402,7 @@ def trajectory(result: Result) -> Figure:
     view = scene(result)
     if st.narrow():  # the view from above stands below
         draw_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))
-        above = fig.add_axes((0.16, 0.13, 0.8, 0.35))
+        above = fig.add_axes((0.55 / wide, 0.13, 0.96 - 0.55 / wide, 0.35))
     else:
         draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
         above = fig.add_axes((0.66, 0.16, 0.32, 0.74))
