@@ -20,7 +20,7 @@ def tune(
     mission: str,
     /,
     *,
-    objective: Literal["shape", "shape-rms", "tracking", "tracking-rms"] = "shape",
+    objective: Literal["shape", "shape-rms", "shape-forces", "tracking", "tracking-rms"] = "shape",
     budget: Annotated[int, Parameter(converter=exact)] = 300,
     seeds: Annotated[int, Parameter(converter=exact)] = 3,
     validation: Annotated[int, Parameter(converter=exact)] = 8,
@@ -43,8 +43,8 @@ def tune(
     mission : str
         A shipped mission or a mission file, with its vehicles, delays and noise.
     objective : str
-        What is minimised: shape, the largest shape error of a flight; tracking, the largest distance from a slot;
-        shape-rms or tracking-rms, root mean squares over time.
+        What is minimised: shape, the largest shape error while slots are tracked; shape-forces, that where constraint
+        forces alone act; tracking, the largest distance from a slot; shape-rms or tracking-rms, root mean squares.
     budget : int
         Maximum number of flights of the search. Default: 300.
     seeds : int

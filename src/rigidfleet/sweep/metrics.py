@@ -37,6 +37,9 @@ METRICS: dict[str, Metric] = {
         "largest shape error in flight: of all pairs of tracked slots, else of the edges against their references",
     ),
     "shape_rms": Metric("m", "root mean square over time of the largest of these errors"),
+    "shape_tracked": Metric("m", "largest shape error in flight while slots are tracked"),
+    "shape_tracked_rms": Metric("m", "root mean square of these errors while slots are tracked"),
+    "shape_forces": Metric("m", "largest shape error in flight where constraint forces alone act"),
     "tracking_error": Metric("m", "largest distance of a vehicle from its slot"),
     "tracking_rms": Metric("m", "root mean square over time of the largest of these distances"),
     "constraint_end": Metric("m", "largest constraint error |c| = |L - d| at the end"),
@@ -128,12 +131,16 @@ def _greatest(values: Iterable[float | None]) -> float:
 def _in_flight(result: Result) -> dict[str, float]:
     """Errors of shape and of tracking at all samples, lost vehicles left out."""
     off = np.ascontiguousarray((_left(result) - result.slot_position).T)
+    apart, shape = _most(proximity.root_of_squares(off)), shape_errors(result)
+    tracked = np.isfinite(apart)
     errors = {
-        "shape_flight": shape_errors(result),
-        "tracking_error": _most(proximity.root_of_squares(off)),
+        ("shape_flight", "shape_rms"): shape,
+        ("shape_tracked", "shape_tracked_rms"): shape[tracked],
+        ("shape_forces", ""): shape[~tracked],
+        ("tracking_error", "tracking_rms"): apart,
     }
     found = {}
-    for (name, error), mean in zip(errors.items(), ("shape_rms", "tracking_rms"), strict=True):
+    for (name, mean), error in errors.items():
         there = error[np.isfinite(error)]
         found[name] = float(there.max()) if len(there) else math.nan
         found[mean] = float(np.sqrt(np.mean(there**2))) if len(there) else math.nan

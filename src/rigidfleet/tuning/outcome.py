@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _WORDS = {
-    "shape_flight": "largest shape error",
-    "shape_rms": "shape error, r.m.s.",
+    "shape_tracked": "largest shape error with slots",
+    "shape_tracked_rms": "r.m.s. of it over time",
+    "shape_forces": "largest shape error without slots",
     "tracking_error": "largest position error",
     "tracking_rms": "position error, r.m.s.",
 }

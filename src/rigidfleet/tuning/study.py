@@ -39,8 +39,9 @@ from rigidfleet.typing import Floats
 
 #: What is minimised, and the metric of a sweep that measures it.
 OBJECTIVES = {
-    "shape": "shape_flight",
-    "shape-rms": "shape_rms",
+    "shape": "shape_tracked",
+    "shape-rms": "shape_tracked_rms",
+    "shape-forces": "shape_forces",
     "tracking": "tracking_error",
     "tracking-rms": "tracking_rms",
 }
@@ -83,8 +84,9 @@ def tune(
     ----------
     mission : a shipped name, a path or a `Mission`
     folder : where flights and results are kept; a study that was stopped goes on there, and nothing is flown twice
-    objective : "shape", the largest shape error of a flight; "tracking", the largest distance from a slot;
-        "shape-rms" and "tracking-rms", root mean squares over time
+    objective : "shape", the largest shape error while slots are tracked; "shape-forces", that where constraint forces
+        alone act; "tracking", the largest distance from a slot; "shape-rms" and "tracking-rms", root mean squares over
+        time while slots are tracked. "shape" of a mission that tracks none is "shape-forces"
     budget : greatest number of flights of the search. A finished study goes on with a greater one
     seeds, validation : numbers of seeds in the search, and of further ones on which the best gains are judged
     seed : first of these seeds, and seed of the optimiser
@@ -111,6 +113,8 @@ def tune(
     flown = given.rewritten(_merged(given.to_dict(), assume or {}))
     paths, random = _seed_paths(flown)
     seeds, validation = (seeds, validation) if random else (1, 0)
+    if objective == "shape" and True not in _tracks(flown):
+        objective = "shape-forces"
     options = {
         "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
         "margin_share": margin_share,
@@ -128,6 +132,11 @@ def tune(
             study.validate(found, after)
     claim.write(found)
     return found
+
+
+def _tracks(mission: Mission) -> set[bool]:
+    """Whether phases track slots: what is true of any of them."""
+    return {phase.control == "tracking" for phase in mission.phases}
 
 
 def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
@@ -152,10 +161,11 @@ def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
         raise RigidfleetError(
             f"{mission.name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
         )
-    tracked = any(phase.control == "tracking" for phase in mission.phases)
-    if options["objective"].startswith("tracking") and not tracked:
+    slots = options["objective"] != "shape-forces"
+    if slots not in _tracks(mission):
+        which, other = ("no", "shape-forces") if slots else ("every", "shape")
         raise RigidfleetError(
-            f"objective = {options['objective']!r}: no phase of {mission.name} tracks slots. Use shape."
+            f"objective = {options['objective']!r}: {which} phase of {mission.name} tracks slots. Use {other}."
         )
     if mission.vehicle_models is None and mission.disturbances is None:
         raise RigidfleetError(
