@@ -3,14 +3,14 @@
 Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law
 gives each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick.
 Between ticks the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts
-are evaluated at each stage, downwash once per step.
+are evaluated at each stage, downwash and a user's force once per step, at its start.
 """
 
 import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
-from rigidfleet.kernel.compiler.calls import call_recorder
+from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
@@ -166,9 +166,6 @@ def take_force(k, i, dt, p, w, flight, state):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
         state.force[i, q] = w.f_u[i, q] + w.f_C[i, q]
         pull += w.f_C[i, q] * w.f_C[i, q]
-        state.push[i, q] = 0.0
-        if p.external != 0:
-            state.push[i, q] = w.f_E[i, q] + (m * p.vehicles.g if q == 2 else 0.0)
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
@@ -197,9 +194,9 @@ def worse(i, kind, value, t, state):
 def presume(k, t, w, flight, state):
     """Let vehicles without a link take each other to be as far off their slots as they are themselves.
 
-    At tick k, time t [s]. The slots are those of the last evaluation of the law, moved on by velocity and acceleration.
+    At tick k, time t [s]. The slots are those last evaluated, moved on by velocity and acceleration.
     """
-    pairs, since, heard = flight.sensing.parted, t - state.clock[1], state.heard
+    pairs, since, heard = flight.sensing.parted, t - state.clock[2], state.heard
     for row in range(pairs.shape[0]):
         for side in range(2):
             i, j = pairs[row, side], pairs[row, 1 - side]
@@ -218,6 +215,9 @@ def desire(k, t, p, w, flight, state, call):
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
+    if flight.sensing.parted.shape[0] > 0 and p.control.kind == TRACKING:  # slots of now
+        evaluate_law(k, t, state.seen, state.integral[0], p, w, flight, state, call)
+        state.clock[2] = t
     presume(k, t, w, flight, state)
     for i in range(n if linked else 1):
         known = state.heard[i] if linked else state.seen
@@ -286,6 +286,21 @@ def advance(S, h, flight, state):
         for q in range(17):
             work.y[0, 17 * i + q] = S[i, q]
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
+
+
+@compiled
+def push(t, p, w, state):
+    """A user's force on the vehicles at t [s], into ``state.push``; returns whether it is finite."""
+    n, total = state.S.shape[0], 0.0
+    for i in range(n):
+        for q in range(3):
+            w.r[i, q], w.v[i, q], state.push[i, q] = state.S[i, q], state.S[i, 3 + q], 0.0
+    if p.external != 0:
+        call_external(p.external, t, w.r, w.v, state.push)
+    for i in range(n):
+        for q in range(3):
+            total += state.push[i, q]
+    return abs(total) < math.inf
 
 
 @compiled
@@ -413,24 +428,30 @@ def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 
     Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
-    gives no force (a singular law): states and time are then those before. A pause changes no bit of the flight, unless
-    ``t_end`` lies between two steps, where it divides one.
+    gives no force (a singular law) or a user's function none: states and time are then those before. A pause changes no
+    bit of the flight, unless ``t_end`` lies between two steps, where it divides one. At a tick, a flight that is
+    FINISHED has measured what the law will know there: to measure once more changes nothing.
     """
     count, clock = state.count, state.clock
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[0], count[STEPS]
+        k = step // flight.steps
+        due = step % flight.steps == 0 and count[TICKS] == k
         if t >= call.t_end - _SAME * flight.h:
+            if due and k < flight.tables.last:
+                measure(k, flight, state)
             return FINISHED
         if room > 0 and count[TRAILED] >= room:
             return PAUSED
-        k = step // flight.steps
-        if step % flight.steps == 0 and count[TICKS] == k:
+        if due:
             if k >= flight.tables.last:
                 return PAUSED
             if not tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1
+        if not push(t, p, w, state):
+            return COLLAPSED
         grid, until = flight.start + (step + 1) * flight.h, flight.start + step * flight.h
         whole = grid <= call.t_end + _SAME * flight.h
         end = grid if whole else call.t_end

@@ -48,6 +48,8 @@ _STEPS, _PAUSE = 2000, 0.05
 #: Least number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
 #: Without a user's force, steps of this many numbers in all take less than a tenth of `_PAUSE`.
 _FIRST_STEPS, _FIRST_NUMBERS = 10, 3000
+#: Share of a control period within which two instants are the same.
+_SAME = 1e-6
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
 
@@ -150,6 +152,8 @@ class ActivePhase:
 
     #: Time by which the events of the phase come later than planned [s].
     delay = 0.0
+    #: Whether a controller's calls are counted from the start of the flight, as ticks are, and not of the phase.
+    by_ticks = False
 
     # -- flying -----------------------------------------------------------------------------------
 
@@ -164,12 +168,12 @@ class ActivePhase:
         if controller is None or self.plan.phase.control != "tracking":
             self._integrate(self.plan.problem, t_end)
             return
-        start = self.plan.start
+        start = 0.0 if self.by_ticks else self.plan.start
         while self.t < t_end:
-            # Control instants are counted from the start of the phase, not from the ends of its segments.
+            # Control instants are the start of the phase and multiples since, not the ends of its segments.
             if self.held is None or self.t >= start + self.asked / rate:
                 self.held = self._under(controller)
-                self.asked += 1
+                self.asked = max(self.asked, math.floor((self.t - start) * rate + _SAME)) + 1
             self._integrate(self.held, min(start + self.asked / rate, t_end))
 
     def _under(self, controller: Controller) -> Problem:

@@ -68,6 +68,8 @@ class SampledPhase(ActivePhase):
     true state, in the layout of the continuous flight.
     """
 
+    by_ticks = True
+
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
@@ -172,13 +174,28 @@ class SampledPhase(ActivePhase):
         self.led = True
         ActivePhase.lead(self, problem)
 
+    def evaluate(self) -> None:
+        """Evaluate the law at the current state."""
+        super().evaluate()
+        if self.vehicles.state is not None:  # the slots in the workspace are those of now
+            self.vehicles.state.clock[2] = self.t
+
     def observe(self) -> Observation:
-        """What a controller sees: measured positions and velocities."""
-        found, seen = super().observe(), self.sampled.seen.copy()
-        tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
+        """What a controller sees: at a tick what the law knows there, between two what it knew at the last one.
+
+        States that are measured without noise and delay are those of now, also between ticks.
+        """
+        self._supply()
+        n, m = len(self.plan.masses), len(self.plan.edges)
+        here = fleet.segment(n, m, self.t)
+        fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, here)  # measures
+        found, S, seen = super().observe(), self.sampled.S, self.sampled.seen.copy()
+        tables, count = self.flight.tables, self.sampled.count
         if len(tables.path):
-            seen += tables.path[min(max(tick - 1 - tables.first, 0), len(tables.path) - 1)]
-        S = self.sampled.S
+            ticks = int(count[fleet.STEPS]) // self.flight.steps  # the last one, or that of now
+            seen += tables.path[max(ticks - tables.first, 0)]
+        if self.vehicles.tables.noise is None:
+            seen = S[:, :6].copy()
         return replace(
             found, position=seen[:, :3], velocity=seen[:, 3:], attitude=S[:, 6:10].copy(), rates=S[:, 10:13].copy(),
             rotor_speed=S[:, 13:].copy(),
@@ -333,6 +350,7 @@ class SampledPhase(ActivePhase):
             frame = call.frame[:done]
             parts.append(frame)
         planned = native.record(plan.problem, self.workspace, times, np.concatenate(parts, axis=1))
+        self.sampled.clock[2] = times[-1]
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
         self.pieces.append(
             Piece(
