@@ -191,21 +191,18 @@ def worse(i, kind, value, t, state):
 
 
 @compiled
-def presume(k, t, w, flight, state):
-    """Let vehicles without a link take each other to be as far off their slots as they are themselves.
+def presume(k, w, flight, state):
+    """Let vehicles without a link take each other to be as far off their slots at tick k as they are themselves.
 
-    At tick k, time t [s]. The slots are those last evaluated, moved on by velocity and acceleration.
+    States that are measured about the slots differ by nothing else; otherwise the slots are those last evaluated.
     """
-    pairs, since, heard = flight.sensing.parted, t - state.clock[2], state.heard
+    pairs, heard, about = flight.sensing.parted, state.heard, flight.tables.path.shape[0] > 0
     for row in range(pairs.shape[0]):
         for side in range(2):
             i, j = pairs[row, side], pairs[row, 1 - side]
             for q in range(3):
-                v, a = w.v_ref[j, q] - w.v_ref[i, q], w.a_ref[j, q] - w.a_ref[i, q]
-                r = w.r_ref[j, q] - w.r_ref[i, q] + since * (v + 0.5 * since * a)
-                v += since * a
-                r += path_at(k, i, q, flight.tables) - path_at(k, j, q, flight.tables)
-                v += path_at(k, i, 3 + q, flight.tables) - path_at(k, j, 3 + q, flight.tables)
+                r = 0.0 if about else w.r_ref[j, q] - w.r_ref[i, q]
+                v = 0.0 if about else w.v_ref[j, q] - w.v_ref[i, q]
                 heard[i, j, q], heard[i, j, 3 + q] = heard[i, i, q] + r, heard[i, i, 3 + q] + v
 
 
@@ -215,10 +212,9 @@ def desire(k, t, p, w, flight, state, call):
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
-    if flight.sensing.parted.shape[0] > 0 and p.control.kind == TRACKING:  # slots of now
+    if flight.sensing.parted.shape[0] > 0 and flight.tables.path.shape[0] == 0:  # slots of now
         evaluate_law(k, t, state.seen, state.integral[0], p, w, flight, state, call)
-        state.clock[2] = t
-    presume(k, t, w, flight, state)
+    presume(k, w, flight, state)
     for i in range(n if linked else 1):
         known = state.heard[i] if linked else state.seen
         integral = state.integral[i]
@@ -238,13 +234,10 @@ def desire(k, t, p, w, flight, state, call):
         quaternion_rate(state.frame[0], w.cm[4], state.frame[1])
     state.clock[1] = t
     state.count[LAWS] += 1
-    total = 0.0
-    for i in range(n):
-        for q in range(3):
-            total += state.force[i, q]
-    if abs(total) < math.inf and call.guard != 0:
+    finite = abs(state.force.sum()) < math.inf
+    if finite and call.guard != 0:
         return call_recorder(call.guard, flight, state, call.avoidance, 0) != 0
-    return abs(total) < math.inf
+    return finite
 
 
 @compiled
@@ -291,16 +284,12 @@ def advance(S, h, flight, state):
 @compiled
 def push(t, p, w, state):
     """A user's force on the vehicles at t [s], into ``state.push``; returns whether it is finite."""
-    n, total = state.S.shape[0], 0.0
-    for i in range(n):
+    for i in range(state.S.shape[0]):
         for q in range(3):
             w.r[i, q], w.v[i, q], state.push[i, q] = state.S[i, q], state.S[i, 3 + q], 0.0
     if p.external != 0:
         call_external(p.external, t, w.r, w.v, state.push)
-    for i in range(n):
-        for q in range(3):
-            total += state.push[i, q]
-    return abs(total) < math.inf
+    return abs(state.push.sum()) < math.inf
 
 
 @compiled
@@ -429,22 +418,21 @@ def fly_ticks(p, w, flight, state, call):
 
     Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
     gives no force (a singular law) or a user's function none: states and time are then those before. A pause changes no
-    bit of the flight, unless ``t_end`` lies between two steps, where it divides one. At a tick, a flight that is
-    FINISHED has measured what the law will know there: to measure once more changes nothing.
+    bit of the flight, unless ``t_end`` lies between two steps, where it divides one. With no steps to do, a flight at a
+    tick measures what the law will know there; to measure once more changes nothing.
     """
     count, clock = state.count, state.clock
+    if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
+        measure(count[TICKS], flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[0], count[STEPS]
-        k = step // flight.steps
-        due = step % flight.steps == 0 and count[TICKS] == k
         if t >= call.t_end - _SAME * flight.h:
-            if due and k < flight.tables.last:
-                measure(k, flight, state)
             return FINISHED
         if room > 0 and count[TRAILED] >= room:
             return PAUSED
-        if due:
+        k = step // flight.steps
+        if step % flight.steps == 0 and count[TICKS] == k:
             if k >= flight.tables.last:
                 return PAUSED
             if not tick(k, t, p, w, flight, state, call):

@@ -223,9 +223,11 @@ class ActivePhase:
         w, vehicles = self.workspace, self.plan.problem.vehicles
         noisy = len(self.plan.problem.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
+        tracked = self.plan.problem.control.kind == TRACKING  # elsewhere, there are no slots
+        slots = [np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref)]
         return Observation(
-            self.t, self.plan.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
-            w.a_ref.copy(), self.plan.masses.copy(), vehicles.g,
+            self.t, self.plan.phase.name, r.copy(), v.copy(), slots[0], slots[1], slots[2],
+            self.plan.masses.copy(), vehicles.g,
         )  # fmt: skip
 
     def watch(self, *, last: bool) -> None:

@@ -174,31 +174,20 @@ class SampledPhase(ActivePhase):
         self.led = True
         ActivePhase.lead(self, problem)
 
-    def evaluate(self) -> None:
-        """Evaluate the law at the current state."""
-        super().evaluate()
-        if self.vehicles.state is not None:  # the slots in the workspace are those of now
-            self.vehicles.state.clock[2] = self.t
-
     def observe(self) -> Observation:
-        """What a controller sees: at a tick what the law knows there, between two what it knew at the last one.
-
-        States that are measured without noise and delay are those of now, also between ticks.
-        """
-        self._supply()
-        n, m = len(self.plan.masses), len(self.plan.edges)
-        here = fleet.segment(n, m, self.t)
-        fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, here)  # measures
-        found, S, seen = super().observe(), self.sampled.S, self.sampled.seen.copy()
-        tables, count = self.flight.tables, self.sampled.count
-        if len(tables.path):
-            ticks = int(count[fleet.STEPS]) // self.flight.steps  # the last one, or that of now
-            seen += tables.path[max(ticks - tables.first, 0)]
-        if self.vehicles.tables.noise is None:
-            seen = S[:, :6].copy()
+        """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
+        found, S = super().observe(), self.sampled.S
+        seen = S[:, :6]
+        if self.vehicles.tables.noise is not None:
+            self._supply()
+            now = fleet.segment(len(S), len(self.plan.edges), self.t, max_steps=0)  # to measure
+            fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
+            tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
+            path = tables.path[max(tick - tables.first, 0)] if len(tables.path) else 0.0
+            seen = self.sampled.seen + path
         return replace(
-            found, position=seen[:, :3], velocity=seen[:, 3:], attitude=S[:, 6:10].copy(), rates=S[:, 10:13].copy(),
-            rotor_speed=S[:, 13:].copy(),
+            found, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
+            rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
 
     def _under(self, controller: Controller) -> Problem:
@@ -350,7 +339,6 @@ class SampledPhase(ActivePhase):
             frame = call.frame[:done]
             parts.append(frame)
         planned = native.record(plan.problem, self.workspace, times, np.concatenate(parts, axis=1))
-        self.sampled.clock[2] = times[-1]
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
         self.pieces.append(
             Piece(
