@@ -17,7 +17,7 @@ SMALLER = {"shape": "triangle", "size": 3.5, "count": 3, "centre": [3.0, 5.0, 3.
 TRIANGLE = {"triangle": {"shape": "triangle", "size": 4.0}}
 
 
-def mission(model: str = "paper", **tables: Any) -> rf.Mission:
+def mission(model: str = "paper", /, **tables: Any) -> rf.Mission:
     """Three vehicles that form a triangle for 2 s and fly for 2 s."""
     vehicle = {"model": model} | ({"mass": 1.0} if model == "point" else {})
     data = {
@@ -100,6 +100,7 @@ def test_without_noise_a_controller_sees_the_state_of_now(rate):
         ("position", record.position), ("velocity", record.velocity),
         ("attitude", record.vehicle_attitude), ("reference_position", record.slot_position),
     ):  # fmt: skip
+        assert recorded is not None
         seen = np.array([getattr(o, name) for o in watched.seen[1:]])
         np.testing.assert_allclose(seen, recorded, rtol=0, atol=1e-9, err_msg=name)
 

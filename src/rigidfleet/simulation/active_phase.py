@@ -48,8 +48,6 @@ _STEPS, _PAUSE = 2000, 0.05
 #: Least number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
 #: Without a user's force, steps of this many numbers in all take less than a tenth of `_PAUSE`.
 _FIRST_STEPS, _FIRST_NUMBERS = 10, 3000
-#: Share of a control period within which two instants are the same.
-_SAME = 1e-6
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
 
@@ -173,7 +171,8 @@ class ActivePhase:
             # Control instants are the start of the phase and multiples since, not the ends of its segments.
             if self.held is None or self.t >= start + self.asked / rate:
                 self.held = self._under(controller)
-                self.asked = max(self.asked, math.floor((self.t - start) * rate + _SAME)) + 1
+                # Instants that differ by a rounding error, far less than a millionth of a period, are one.
+                self.asked = max(self.asked, math.floor((self.t - start) * rate + 1e-6)) + 1
             self._integrate(self.held, min(start + self.asked / rate, t_end))
 
     def _under(self, controller: Controller) -> Problem:
@@ -224,10 +223,9 @@ class ActivePhase:
         noisy = len(self.plan.problem.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
         tracked = self.plan.problem.control.kind == TRACKING  # elsewhere, there are no slots
-        slots = [np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref)]
+        r_ref, v_ref, a_ref = (np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref))
         return Observation(
-            self.t, self.plan.phase.name, r.copy(), v.copy(), slots[0], slots[1], slots[2],
-            self.plan.masses.copy(), vehicles.g,
+            self.t, self.plan.phase.name, r.copy(), v.copy(), r_ref, v_ref, a_ref, self.plan.masses.copy(), vehicles.g
         )  # fmt: skip
 
     def watch(self, *, last: bool) -> None:

@@ -183,8 +183,8 @@ class SampledPhase(ActivePhase):
             now = fleet.segment(len(S), len(self.plan.edges), self.t, max_steps=0)  # to measure
             fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
-            path = tables.path[max(tick - tables.first, 0)] if len(tables.path) else 0.0
-            seen = self.sampled.seen + path
+            # About the path of that tick, if there are any
+            seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
         return replace(
             found, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
             rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
