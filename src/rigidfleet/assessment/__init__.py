@@ -79,7 +79,9 @@ def assess(result: Result | str | Path) -> Verdict:
     result = as_result(result)
     measured = Measurements(result)
     phases = [measured.phase(i, record) for i, record in enumerate(result.phases)]
-    verdict = Verdict(measured.mission.name, measured.mission.title, [], phases, [])
+    names = ", ".join(f"'{p.name}'" for p in result.phases if p.controller is False)
+    uncalled = names and f"the controller was not called in {names}, as no slots are tracked there"
+    verdict = Verdict(measured.mission.name, measured.mission.title, [], phases, [], uncalled)
     verdict.checks.extend(all_checks(measured, verdict))
     verdict.notes.extend(notes(measured, phases))
     return verdict

@@ -48,6 +48,7 @@ class Verdict:
     checks : each check with its worst value, its limit, when and who
     phases : the numbers of each phase, in order of flight
     notes : what else to know of the flight
+    uncalled : in which phases a user's controller was not called, so that the verdict is on another law; "" if in none
 
     >>> import rigidfleet as rf
     >>> verdict = rf.assess(rf.simulate("square"))
@@ -61,6 +62,7 @@ class Verdict:
     checks: list[CheckResult]
     phases: list[PhaseVerdict]
     notes: list[str]
+    uncalled: str = ""
 
     @property
     def passed(self) -> bool:
@@ -80,7 +82,14 @@ class Verdict:
 
     @property
     def summary(self) -> str:
-        """The verdict in words: the worst values of a flight that passed, or a line for each failed check."""
+        """The verdict in words: the worst values of a flight that passed, or a line for each failed check.
+
+        Then the phases in which a user's controller was not called.
+        """
+        told = f"\n{self.uncalled[0].upper()}{self.uncalled[1:]}." if self.uncalled else ""
+        return self._judgement() + told
+
+    def _judgement(self) -> str:
         judged = [check for check in self.checks if check.judged]
         failed = [check for check in judged if not check.passed]
         if failed:

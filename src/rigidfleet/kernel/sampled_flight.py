@@ -3,14 +3,14 @@
 Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law
 gives each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick.
 Between ticks the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts
-are evaluated at each stage, downwash once per step.
+are evaluated at each stage, downwash and a user's force once per step, at its start.
 """
 
 import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
-from rigidfleet.kernel.compiler.calls import call_recorder
+from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
@@ -166,9 +166,6 @@ def take_force(k, i, dt, p, w, flight, state):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
         state.force[i, q] = w.f_u[i, q] + w.f_C[i, q]
         pull += w.f_C[i, q] * w.f_C[i, q]
-        state.push[i, q] = 0.0
-        if p.external != 0:
-            state.push[i, q] = w.f_E[i, q] + (m * p.vehicles.g if q == 2 else 0.0)
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
@@ -194,21 +191,18 @@ def worse(i, kind, value, t, state):
 
 
 @compiled
-def presume(k, t, w, flight, state):
-    """Let vehicles without a link take each other to be as far off their slots as they are themselves.
+def presume(k, w, flight, state):
+    """Let vehicles without a link take each other to be as far off their slots at tick k as they are themselves.
 
-    At tick k, time t [s]. The slots are those of the last evaluation of the law, moved on by velocity and acceleration.
+    States that are measured about the slots differ by nothing else; otherwise the slots are those last evaluated.
     """
-    pairs, since, heard = flight.sensing.parted, t - state.clock[1], state.heard
+    pairs, heard, about = flight.sensing.parted, state.heard, flight.tables.path.shape[0] > 0
     for row in range(pairs.shape[0]):
         for side in range(2):
             i, j = pairs[row, side], pairs[row, 1 - side]
             for q in range(3):
-                v, a = w.v_ref[j, q] - w.v_ref[i, q], w.a_ref[j, q] - w.a_ref[i, q]
-                r = w.r_ref[j, q] - w.r_ref[i, q] + since * (v + 0.5 * since * a)
-                v += since * a
-                r += path_at(k, i, q, flight.tables) - path_at(k, j, q, flight.tables)
-                v += path_at(k, i, 3 + q, flight.tables) - path_at(k, j, 3 + q, flight.tables)
+                r = 0.0 if about else w.r_ref[j, q] - w.r_ref[i, q]
+                v = 0.0 if about else w.v_ref[j, q] - w.v_ref[i, q]
                 heard[i, j, q], heard[i, j, 3 + q] = heard[i, i, q] + r, heard[i, i, 3 + q] + v
 
 
@@ -218,7 +212,9 @@ def desire(k, t, p, w, flight, state, call):
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
     linked = flight.sensing.linked
-    presume(k, t, w, flight, state)
+    if flight.sensing.parted.shape[0] > 0 and flight.tables.path.shape[0] == 0:  # slots of now
+        evaluate_law(k, t, state.seen, state.integral[0], p, w, flight, state, call)
+    presume(k, w, flight, state)
     for i in range(n if linked else 1):
         known = state.heard[i] if linked else state.seen
         integral = state.integral[i]
@@ -238,13 +234,10 @@ def desire(k, t, p, w, flight, state, call):
         quaternion_rate(state.frame[0], w.cm[4], state.frame[1])
     state.clock[1] = t
     state.count[LAWS] += 1
-    total = 0.0
-    for i in range(n):
-        for q in range(3):
-            total += state.force[i, q]
-    if abs(total) < math.inf and call.guard != 0:
+    finite = abs(state.force.sum()) < math.inf
+    if finite and call.guard != 0:
         return call_recorder(call.guard, flight, state, call.avoidance, 0) != 0
-    return abs(total) < math.inf
+    return finite
 
 
 @compiled
@@ -286,6 +279,17 @@ def advance(S, h, flight, state):
         for q in range(17):
             work.y[0, 17 * i + q] = S[i, q]
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
+
+
+@compiled
+def push(t, p, w, state):
+    """A user's force on the vehicles at t [s], into ``state.push``; returns whether it is finite."""
+    for i in range(state.S.shape[0]):
+        for q in range(3):
+            w.r[i, q], w.v[i, q], state.push[i, q] = state.S[i, q], state.S[i, 3 + q], 0.0
+    if p.external != 0:
+        call_external(p.external, t, w.r, w.v, state.push)
+    return abs(state.push.sum()) < math.inf
 
 
 @compiled
@@ -413,10 +417,13 @@ def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 
     Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
-    gives no force (a singular law): states and time are then those before. A pause changes no bit of the flight, unless
-    ``t_end`` lies between two steps, where it divides one.
+    gives no force (a singular law) or a user's function none: states and time are then those before. A pause changes no
+    bit of the flight, unless ``t_end`` lies between two steps, where it divides one. With no steps to do, a flight at a
+    tick measures what the law will know there; to measure once more changes nothing.
     """
     count, clock = state.count, state.clock
+    if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
+        measure(count[TICKS], flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[0], count[STEPS]
@@ -431,6 +438,8 @@ def fly_ticks(p, w, flight, state, call):
             if not tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1
+        if not push(t, p, w, state):
+            return COLLAPSED
         grid, until = flight.start + (step + 1) * flight.h, flight.start + step * flight.h
         whole = grid <= call.t_end + _SAME * flight.h
         end = grid if whole else call.t_end

@@ -88,6 +88,7 @@ class PhaseRecord:
         (clearance_start), for those in flight (clearance_flight), and for those that stand on one until the end
         (clearance_end). Empty if only samples are
         known
+    controller : whether a user's controller was called; None if the flight had none
     """
 
     name: str
@@ -103,6 +104,7 @@ class PhaseRecord:
         default_factory=dict
     )
     abandoned: bool = False
+    controller: bool | None = None
 
     def __post_init__(self) -> None:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}

@@ -150,6 +150,8 @@ class ActivePhase:
 
     #: Time by which the events of the phase come later than planned [s].
     delay = 0.0
+    #: Whether a controller's calls are counted from the start of the flight, as ticks are, and not of the phase.
+    by_ticks = False
 
     # -- flying -----------------------------------------------------------------------------------
 
@@ -164,12 +166,13 @@ class ActivePhase:
         if controller is None or self.plan.phase.control != "tracking":
             self._integrate(self.plan.problem, t_end)
             return
-        start = self.plan.start
+        start = 0.0 if self.by_ticks else self.plan.start
         while self.t < t_end:
-            # Control instants are counted from the start of the phase, not from the ends of its segments.
+            # Control instants are the start of the phase and multiples since, not the ends of its segments.
             if self.held is None or self.t >= start + self.asked / rate:
                 self.held = self._under(controller)
-                self.asked += 1
+                # Instants that differ by a rounding error, far less than a millionth of a period, are one.
+                self.asked = max(self.asked, math.floor((self.t - start) * rate + 1e-6)) + 1
             self._integrate(self.held, min(start + self.asked / rate, t_end))
 
     def _under(self, controller: Controller) -> Problem:
@@ -219,9 +222,10 @@ class ActivePhase:
         w, vehicles = self.workspace, self.plan.problem.vehicles
         noisy = len(self.plan.problem.disturbance.noise_r) > 0
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
+        tracked = self.plan.problem.control.kind == TRACKING  # elsewhere, there are no slots
+        r_ref, v_ref, a_ref = (np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref))
         return Observation(
-            self.t, self.plan.phase.name, r.copy(), v.copy(), w.r_ref.copy(), w.v_ref.copy(),
-            w.a_ref.copy(), self.plan.masses.copy(), vehicles.g,
+            self.t, self.plan.phase.name, r.copy(), v.copy(), r_ref, v_ref, a_ref, self.plan.masses.copy(), vehicles.g
         )  # fmt: skip
 
     def watch(self, *, last: bool) -> None:

@@ -21,15 +21,18 @@ Force = Callable[[float, "Floats", "Floats"], ArrayLike]
 class Observation:
     """What a controller sees at a control step; arrays are copies.
 
-    Positions and velocities are measured, masses are those the control laws assume. The attitude, rates and rotors of
-    vehicles are known without delay; they are None for point masses that give any force at once.
+    All of it is of the time ``t``, but positions and velocities are measured: with noise, they are each vehicle's last
+    measurement, as the built-in law knows it at the same tick; without, they are those of ``t``. Masses are those the
+    control laws assume. The attitude, rates and rotors of vehicles are known without delay; they are None for point
+    masses that give any force at once.
 
     Attributes
     ----------
     t : mission time [s]
     phase : name of the phase
     position, velocity : (N, 3) of each agent, world axes [m, m/s]
-    reference_position, reference_velocity, reference_acceleration : (N, 3) of its slot, world axes [m, m/s, m/s^2]
+    reference_position, reference_velocity, reference_acceleration : (N, 3) of its slot, world axes [m, m/s, m/s^2];
+        NaN where no slots are tracked
     masses : (N,) [kg]
     gravity : [m/s^2]
     attitude : (N, 4) of each vehicle, world to body, scalar first

@@ -101,7 +101,7 @@ def simulate(
     controller : replaces the input law wherever slots are tracked: a function of an `Observation` that
         returns the input force (N, 3) [N] of every agent, weight included. It is called ``rate`` times a
         second; its force is held between calls, as on a vehicle. For vehicles it may return an `AttitudeCommand` or
-        a `RotorCommand` instead, which no constraint force joins.
+        a `RotorCommand` instead, which no constraint force joins. The verdict names phases in which it was not called.
     rate : control rate [Hz]
     force : an external force f(t, r, v) -> (N, 3) [N] in addition to gravity, world axes, continuous in
         time. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n) is called
@@ -122,7 +122,8 @@ def simulate(
         KeyboardInterrupt.
     FlightError
         The controller or the force raised an exception, which is the error's cause, or did not return
-        forces. The error's ``result`` is the incomplete flight, or None.
+        forces. The error's ``result`` is the incomplete flight, or None. Or no phase tracks slots, so that the
+        controller would never be called.
     MissionError
         The mission does not exist, or has errors.
     TypeError
@@ -133,6 +134,12 @@ def simulate(
     flight = Flight(
         mission, controller=controller, rate=rate, force=force, times=times, progress=progress
     )
+    controls = {phase.name: phase.control for phase in flight.mission.phases}
+    if controller is not None and "tracking" not in controls.values():
+        raise FlightError(
+            f"the controller would never be called, as no phase of the mission tracks slots: control is {controls};"
+            " use control = 'tracking' in the phases that it is to fly, or leave the controller out"
+        )
     try:
         while flight.begin():
             flight.advance()
@@ -247,7 +254,7 @@ class Flight:
         return self.under_way().plan
 
     def observe(self) -> Observation:
-        """Measured and desired states of the vehicles.
+        """Measured and desired states of the vehicles now; to observe changes nothing of the flight.
 
         Raises
         ------
@@ -606,6 +613,7 @@ class Flight:
         record = self.phases[-1]
         record.extremes = self._extremes.phase()
         record.abandoned = abandoned
+        record.controller = None if self.controller is None else active.asked > 0
         if active.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.settled

@@ -68,6 +68,8 @@ class SampledPhase(ActivePhase):
     true state, in the layout of the continuous flight.
     """
 
+    by_ticks = True
+
     def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
@@ -173,15 +175,19 @@ class SampledPhase(ActivePhase):
         ActivePhase.lead(self, problem)
 
     def observe(self) -> Observation:
-        """What a controller sees: measured positions and velocities."""
-        found, seen = super().observe(), self.sampled.seen.copy()
-        tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
-        if len(tables.path):
-            seen += tables.path[min(max(tick - 1 - tables.first, 0), len(tables.path) - 1)]
-        S = self.sampled.S
+        """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
+        found, S = super().observe(), self.sampled.S
+        seen = S[:, :6]
+        if self.vehicles.tables.noise is not None:
+            self._supply()
+            now = fleet.segment(len(S), len(self.plan.edges), self.t, max_steps=0)  # to measure
+            fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
+            tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
+            # About the path of that tick, if there are any
+            seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
         return replace(
-            found, position=seen[:, :3], velocity=seen[:, 3:], attitude=S[:, 6:10].copy(), rates=S[:, 10:13].copy(),
-            rotor_speed=S[:, 13:].copy(),
+            found, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
+            rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
 
     def _under(self, controller: Controller) -> Problem:
