@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -44,6 +45,8 @@ _FREQUENCIES, _SAMPLES = (1e-3, 1e5), 120
 _FAINT = 0.02
 # Greatest change of log(locus) between samples.
 _STEP = 0.4
+# Number of instants of an impulse response, and the time between them [s]: a minute.
+_INSTANTS, _APART = 1 << 15, 2e-3
 # Least and greatest rate p of a triple pole that is tried [1/s], ratio of successive trials, relative accuracy.
 _POLES, _RATIO, _ACCURACY = (0.1, 400.0), 1.5, 5e-4
 
@@ -136,6 +139,34 @@ class Feedback:
         return replace(self, alpha=alpha, beta=beta, gamma=gamma)
 
 
+@lru_cache
+def overshoot(lag: Lag, laws: Feedback, drag: float) -> float:
+    """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
+
+    The reference's acceleration, jerk and snap are fed forward past the attitude control, so that only rotors and the
+    hold lag behind it: G_r is their response, G that of the feedback K, and d the ``drag`` per mass [1/s] that is not
+    fed forward. The error of the acceleration is then that of the filter
+
+        H(s) = ((1 - G_r) s + d) / (s^2 + d s + G K)
+
+    on the reference's jerk, and the error of the velocity the same of its acceleration. Neither exceeds T = int |h| dt
+    times the greatest value of its input, whatever the reference (linear, near hover).
+    """
+    s = (2j * np.pi * np.fft.rfftfreq(_INSTANTS, _APART)).astype(np.complex128)
+    s[0] = 1e-6j
+    track = laws.k1 + laws.k2 * s + laws.ki / s
+    constrain = 2.0 * laws.alpha * s + laws.beta**2 + laws.gamma / s
+    most, window = 0.0, np.cos(np.linspace(0.0, 0.5 * np.pi, len(s))) ** 2  # against ripples
+    for vertical in (False, True):
+        G = lag.response(s, vertical=vertical)
+        ahead = replace(lag, delay=0.0).response(s, vertical=vertical)
+        ahead *= 1.0 if vertical else 1.0 + s * (s + lag.k_omega) / lag.k_R
+        for K in (track, constrain):
+            H = ((1.0 - ahead) * s + drag) / (s * (s + drag) + G * K)
+            most = max(most, float(np.abs(np.fft.irfft(window * H, _INSTANTS)).sum()))
+    return most
+
+
 class Loop(NamedTuple):
     """A part of the loop that no other part acts on, in an orthonormal basis of n directions.
 
@@ -221,7 +252,7 @@ def formation_loops(
     for name, count in (("lags", len(lags)), ("masses", len(m))):
         if count != n:
             raise ValueError(f"{n} agents need {n} {name}, one each, not {count}")
-    S = _shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
+    S = shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
     own = np.kron(np.eye(n), np.ones((3, 3)))  # what a vehicle adds of its own state
@@ -254,7 +285,7 @@ def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
 
-def _shares(r: Floats, edges: Ints, m: Floats, law: Feedback) -> Floats:
+def shares(r: Floats, edges: Ints, m: Floats, law: Feedback) -> Floats:
     """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
     if not len(edges):
         return np.zeros((r.size, r.size))

@@ -187,6 +187,14 @@ class Mission(Contents):
         mission._text = self.text
         return mission
 
+    def with_assignment(self, assignment: str) -> Self:
+        """Return the mission as it is, with its times known, but with agents assigned to slots otherwise; unchecked.
+
+        It has no text: from a text, automatic times would be unknown again.
+        """
+        parts = {name: getattr(self, name) for name in Contents.model_fields}
+        return self.model_construct(self.model_fields_set, **parts | {"assignment": assignment})
+
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""

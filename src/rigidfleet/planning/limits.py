@@ -17,6 +17,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
 from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.vehicles import air_force
 from rigidfleet.typing import Floats, Ints
 
 #: Samples of a phase and of a blend, of a piece, and of a phase of many pieces in all.
@@ -51,26 +52,43 @@ class Reached(NamedTuple):
         return self.value / float(self.limit.most[self.agent])
 
 
-def limits_of(mission: Mission, given: Limits | None = None) -> list[Limit]:
-    """The limits that a mission sets to its references, or those ``given`` in place of `limits`."""
+def limits_of(
+    mission: Mission, given: Limits | None = None, reserve: Floats | None = None
+) -> list[Limit]:
+    """The limits that a mission sets to its references, or those ``given`` in place of `limits`.
+
+    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.reserves`).
+    """
     given, n = given or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
+    def more(order: int, x: Floats, who: Ints) -> Floats | float:
+        if reserve is None or order + 1 >= x.shape[1]:
+            return 0.0  # no flight is judged by its jerk
+        return reserve[who] * np.linalg.norm(x[:, order + 1], axis=-1).max(axis=0)
+
     def size(order: int) -> Callable[[Floats, Ints], Floats]:
-        return lambda x, _: np.linalg.norm(x[:, order], axis=-1)
+        return lambda x, who: np.linalg.norm(x[:, order], axis=-1) + more(order, x, who)
 
     def level(order: int) -> Callable[[Floats, Ints], Floats]:
-        return lambda x, _: np.hypot(x[:, order, ..., 0], x[:, order, ..., 1])
+        return lambda x, who: (
+            np.hypot(x[:, order, ..., 0], x[:, order, ..., 1]) + more(order, x, who)
+        )
 
     def upright(order: int) -> Callable[[Floats, Ints], Floats]:
-        return lambda x, _: np.abs(x[:, order, ..., 2])
+        return lambda x, who: np.abs(x[:, order, ..., 2]) + more(order, x, who)
 
-    def tilt(x: Floats, _: Ints) -> Floats:
-        force = x[:, 2] + up
-        return np.rad2deg(np.arctan2(np.hypot(force[..., 0], force[..., 1]), force[..., 2]))
+    def lifted(x: Floats, who: Ints) -> Floats:
+        """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
+        air = 0.0 if reserve is None else air_force(mission, -x[:, 1], who) / mass[who, None]
+        return x[:, 2] + up - air
+
+    def tilt(x: Floats, who: Ints) -> Floats:
+        f, off = lifted(x, who), more(2, x, who)
+        return np.rad2deg(np.arctan2(np.hypot(f[..., 0], f[..., 1]) + off, f[..., 2] - off))
 
     def thrust(x: Floats, who: Ints) -> Floats:
-        return mass[who] * np.linalg.norm(x[:, 2] + up, axis=-1)
+        return mass[who] * (np.linalg.norm(lifted(x, who), axis=-1) + more(2, x, who))
 
     found = [
         Limit(name, unit, np.full(n, most), quantity)

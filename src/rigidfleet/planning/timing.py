@@ -17,10 +17,11 @@ from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import SmoothTrajectory
 from rigidfleet.planning.courses import course, misled
-from rigidfleet.planning.limits import Reached, limits_of, reached
+from rigidfleet.planning.limits import Limit, Reached, limits_of, reached
 from rigidfleet.planning.preview import Leg, at_start, leg
 from rigidfleet.planning.reference import PhaseState, attach
 from rigidfleet.planning.transitions import expanded
+from rigidfleet.planning.vehicles import reserves
 
 #: Shortest and longest time tried [s], and the number of times tried.
 _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
@@ -151,10 +152,21 @@ def said(worst: Reached, phase: Phase) -> str:
 
 
 def _least(
-    mission: Mission, vary: Callable[[float], Phase], now: PhaseState, shortest: float
+    mission: Mission,
+    vary: Callable[[float], Phase],
+    now: PhaseState,
+    shortest: float,
+    limits: list[Limit] | None = None,
 ) -> tuple[float | None, Reached]:
-    """The least time [s] from ``shortest`` on that keeps the limits; if there is none, what breaks them."""
-    limits = limits_of(mission)
+    """The least time [s] from ``shortest`` on that keeps the limits; if there is none, what breaks them.
+
+    Vehicles leave a reserve of their limits, unless no time does: of a circle near a limit, for example.
+    """
+    if limits is None and (reserve := reserves(mission)).any():
+        found = _least(mission, vary, now, shortest, limits_of(mission, reserve=reserve))
+        if found[0] is not None:
+            return found
+    limits = limits_of(mission) if limits is None else limits
 
     def each(time: float, *, fine: bool = False) -> list[Reached]:
         found = leg(mission, vary(time), now)

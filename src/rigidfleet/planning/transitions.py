@@ -318,7 +318,7 @@ def _phases(
     """The three phases; a blend is shared such that all have about the same peak acceleration."""
     blends: list[Any] = [AUTO] * 3
     if phase.blend != AUTO:
-        shares = np.sqrt(np.maximum(lengths, 1e-3 * max(lengths)))
+        shares = np.sqrt(np.maximum(lengths, 1e-3 * max(*lengths, 1e-6)))
         blends = [round(float(x), 6) for x in phase.blend * shares / shares.sum()]
     parts = []
     for name, blend in zip(names, blends, strict=False):

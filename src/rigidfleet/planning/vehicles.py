@@ -15,6 +15,7 @@ import numpy as np
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
+from rigidfleet.math.margins import Feedback, Lag, overshoot
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
@@ -39,6 +40,8 @@ _NOISE, _DROPPED, _UNHEARD = 2, 3, 4
 DENSITY = 1.225
 #: Speed below which the direction of quadratic drag is rounded off [m/s].
 _STILL = 0.1
+#: Share of the drag that its feedforward leaves in fast descents, where rotors turn slower than at the thrust desired.
+_LEFT = 0.2
 #: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
 _TURN_TIME = 3.0
 
@@ -74,6 +77,79 @@ def sampled_flight(mission: Mission) -> fleet.Flight:
         floor=around.floor,
     )
     return found._replace(air=air, guidance=guidance, sensing=_sensing(mission))
+
+
+def vehicle_lags(mission: Mission) -> list[Lag]:
+    """Lag and delay of each vehicle; empty for points that give any force at once."""
+    models = mission.vehicle_models
+    if models is None:
+        return []
+    d, autopilot = mission.disturbances, mission.autopilot
+    noise = None if d is None else d.noise
+    delay, rate = 0.0, autopilot.formation_rate
+    if noise is not None:
+        # Delays are whole ticks; a law that is quicker than its measurements acts at their rate.
+        delay = round(noise.delay * autopilot.rate) / autopilot.rate
+        rate = min(rate, noise.rate)
+    return [
+        Lag(delay=delay, rate=rate, point=True)
+        if model.point
+        else Lag(
+            model.attitude_gains[0], model.attitude_gains[1], max(model.motor_time), delay, rate
+        )
+        for model in models
+    ]
+
+
+def reserves(mission: Mission) -> Floats:
+    """Times T (N,) [s] by which each vehicle leaves its reference at most (`math.margins.overshoot`); 0 for points.
+
+    Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
+    acceleration.
+    """
+    found = np.zeros(mission.n_agents)
+    (k1, k2), c = mission.tracking_gains, mission.constraint
+    law = Feedback(c.alpha, c.beta, c.gamma, k1, k2, mission.tracking.integral)
+    models = mission.vehicle_models or []
+    for i, lag in enumerate(vehicle_lags(mission)):
+        model = models[i]
+        if not model.point:
+            drag = model.linear_drag[0]
+            if mission.tracking.drag_feedforward:
+                drag = _LEFT * max(model.linear_drag)
+            found[i] = overshoot(lag, law, drag / model.mass)
+    return found
+
+
+def air_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> Floats:
+    """Drag and lift (..., N, 3) [N] of air that moves at u (..., N, 3) [m/s] past vehicles, level near hover."""
+    models = mission.vehicle_models
+    if models is None:
+        return mission.drag[who, None] * u
+    linear, body = (
+        np.array([getattr(model, name) for model in models])[who]
+        for name in ("linear_drag", "body_drag")
+    )
+    force = (linear + body * np.linalg.norm(u, axis=-1, keepdims=True)) * u
+    force[..., 2] += (
+        4.0 * np.array([m.rotor_lift for m in models])[who] * (u[..., :2] ** 2).sum(axis=-1)
+    )
+    return force
+
+
+def jets(mission: Mission, r: Floats) -> Floats:
+    """Speed [m/s] of the air downwards at each vehicle due to each other one above, (K, N, N) at r (K, N, 3) [m]."""
+    below = r[:, None] - r[:, :, None]
+    flow = np.zeros(below.shape[:3])
+    for j, model in enumerate(mission.vehicle_models or ()):
+        if not model.point:
+            s, beside = below[:, :, j, 2], (below[:, :, j, :2] ** 2).sum(axis=-1)
+            weight, span = model.mass * mission.gravity, 2.0 * model.arm
+            speed = fleet.jet_speed(
+                weight, DENSITY, model.rotor_radius, span, np.maximum(s, 0.0), beside
+            )
+            flow[:, :, j] = np.where(s > 0.0, speed, 0.0)
+    return flow
 
 
 def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.Vehicle:

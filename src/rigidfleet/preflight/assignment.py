@@ -31,7 +31,7 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     for name in ("as it is", "shortest", "safe"):
         other, planned = mission, found.planned_phases[index]
         if name not in ("as it is", mission.assignment):
-            other = mission.rewritten(mission.to_dict() | {"assignment": name})
+            other = mission.with_assignment(name)
             planned = preview(other, index + 1)[0][index]
         if planned.path_ends is None:  # on bent ways
             return

@@ -14,6 +14,7 @@ from pathlib import Path
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import timed
+from rigidfleet.planning.vehicles import reserves, vehicle_lags
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
@@ -21,6 +22,7 @@ from rigidfleet.preflight.gains import check_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
 from rigidfleet.preflight.obstacles import obstacle_remarks
+from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
@@ -29,7 +31,7 @@ from rigidfleet.preflight.trajectory import (
     thrust_remarks,
     waypoint_remarks,
 )
-from rigidfleet.preflight.vehicles import check_vehicles, vehicle_lags, vehicle_remarks
+from rigidfleet.preflight.vehicles import check_vehicles, vehicle_remarks
 
 
 def check(
@@ -66,6 +68,7 @@ def check(
         progress("margins")
         found.margins = check_margins(mission, planned, lags)
         found.vehicles = check_vehicles(mission, planned)
+        found.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     found.remarks = [
         *formation_remarks(mission, formations),
@@ -77,6 +80,7 @@ def check(
         *thrust_remarks(mission, found),
         *vehicle_remarks(mission, found),
         *disturbance_remarks(mission, found),
+        *offset_remarks(mission, found),
         *obstacle_remarks(mission, found),
         *limit_remarks(mission, found),
         *waypoint_remarks(mission, found),

@@ -42,7 +42,7 @@ class Remark:
     ----------
     level : "fails" or "note"
     topic : formation, gains, margins, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
-        acceleration, waypoint or paths (that were not checked, or are estimates)
+        acceleration, waypoint, attitude, tracking error, settle or paths (that were not checked, or are estimates)
     text : the problem or note in words
     """
 
@@ -242,6 +242,7 @@ class Preflight:
     disturbed : effects of the disturbances; None without disturbances
     margins : what lag and delay the laws bear; None if vehicles have none
     vehicles : what the planned paths ask of rotors; None if vehicles have none
+    reserve : of the limits, what automatic times leave for lag and drag of vehicles (`planning.vehicles.reserves`) [s]
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
     remarks : problems and notes
 
@@ -264,6 +265,7 @@ class Preflight:
     disturbed: Disturbed | None = None
     margins: MarginsCheck | None = None
     vehicles: VehicleCheck | None = None
+    reserve: float = 0.0
     judged_to: float = math.inf
     remarks: list[Remark] = field(default_factory=list)
 
@@ -304,6 +306,10 @@ class Preflight:
             yield "thrust", f"maximum {force:.1f} N{of}, {who} at {t:.2f} s"
         if self.vehicles is not None:
             yield from self.vehicles.describe()
+        if self.reserve:
+            text = f"automatic times leave {self.reserve:.2g} s times the greatest jerk of limits of acceleration, tilt"
+            text += " and thrust, and times the greatest acceleration of those of speed, for lag and drag of vehicles"
+            yield "reserve", text
         if self.disturbed is not None:
             yield "disturbances", _disturbed_words(self.disturbed)
         for name, least, t, who in self.clearance:
@@ -377,6 +383,7 @@ class Preflight:
             },
             "margins": None if self.margins is None else self.margins.data(),
             "vehicles": None if self.vehicles is None else self.vehicles.data(),
+            "reserve_s": self.reserve,
             "disturbances": None
             if (d := self.disturbed) is None
             else {

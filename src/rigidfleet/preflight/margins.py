@@ -74,7 +74,7 @@ def tracking_law(mission: Mission, lags: Sequence[Lag]) -> Looped | None:
     """The tracking of single vehicles; None if no phase tracks slots."""
     if not any(phase.control == "tracking" for phase in mission.phases):
         return None
-    return Looped("tracking", tracking_loops(lags), _feedback(mission, None, None), GROWTH)
+    return Looped("tracking", tracking_loops(lags), feedback(mission, None, None), GROWTH)
 
 
 def formation_laws(
@@ -89,7 +89,7 @@ def formation_laws(
         name = planned.shapes[1]
         if name is None or not len(edges := mission.formation_edges(name)):
             continue
-        law = _feedback(mission, phase, None if _changes(planned) else name)
+        law = feedback(mission, phase, None if _changes(planned) else name)
         # On a way that ends, slow growth does no harm: weak shapes pass.
         growth = 1.0 / np.ptp(planned.time) if _changes(planned) else GROWTH
         for r in _shapes(planned, phase):
@@ -107,7 +107,7 @@ def formation_laws(
     return found, skipped
 
 
-def _feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedback:
+def feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedback:
     """The laws of a phase; ``held`` is the formation in which it begins, None if the shape changes."""
     c = mission.constraint
     k1, k2 = mission.tracking_gains

@@ -20,6 +20,7 @@ from rigidfleet.planning.certificate import straight
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
+from rigidfleet.planning.vehicles import air_force
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import (
     jacobian,
@@ -182,7 +183,8 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         if over[k, i] > worst:
             worst = float(over[k, i])
             most = float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
-    steady = drag[:, None] * wind - ((true - believed) * g)[:, None] * up
+    steady = air_force(mission, np.tile(wind, (len(drag), 1)))
+    steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
     if mission.tracking.integral:
         off[:] = 0.0  # in the end
@@ -298,7 +300,6 @@ def _missed(
 
 def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on speed, acceleration and geofence beyond their limits."""
-    limits = mission.limits
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in found.planned_phases:
         phase = planned.leg.phase
@@ -306,14 +307,21 @@ def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             yield from _broken(mission, planned, hopeless)
         else:
             yield from _sampled(mission, planned)
-        if limits.geofence is not None:
-            low, high = np.array(limits.geofence.min), np.array(limits.geofence.max)
-            out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
-            k, i = np.unravel_index(int(out.argmax()), out.shape)
-            if out[k, i] > SLACK:
-                by, t = float(out[k, i]), float(planned.time[k])
-                text = f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s in '{planned.phase}'"
-                yield Remark("fails" if planned.exact else "note", "geofence", text)
+        yield from geofence_remarks(mission, planned)
+
+
+def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+    """Remark on an agent that leaves the geofence in a phase."""
+    if (fence := mission.limits.geofence) is not None:
+        low, high = np.array(fence.min), np.array(fence.max)
+        out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
+        k, i = np.unravel_index(int(out.argmax()), out.shape)
+        if out[k, i] > SLACK:
+            by, t = float(out[k, i]), float(planned.time[k])
+            text = (
+                f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s in '{planned.phase}'"
+            )
+            yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
 def _broken(mission: Mission, planned: PlannedPhase, hopeless: set[str]) -> Iterator[Remark]:

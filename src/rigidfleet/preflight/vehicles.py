@@ -9,18 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet._common.text import percent
-from rigidfleet.kernel.fleet import jet_speed
 from rigidfleet.math import series
-from rigidfleet.math.margins import Lag
 from rigidfleet.math.quadrotor import Flat, flat, mixing
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import (
-    DENSITY,
+    air_force,
     asked_yaw,
     first_yaw,
+    jets,
     slots_and_yaw,
     turn_along,
 )
@@ -28,29 +27,7 @@ from rigidfleet.preflight.findings import Preflight, Remark, VehicleCheck
 from rigidfleet.typing import Floats
 
 #: Greatest number of samples times agents, and of agents of which all pairs are looked at for jets.
-_PLACES, _STACKED = 200_000, 60
-
-
-def vehicle_lags(mission: Mission) -> list[Lag]:
-    """Lag and delay of each vehicle; empty for points that give any force at once."""
-    models = mission.vehicle_models
-    if models is None:
-        return []
-    d, autopilot = mission.disturbances, mission.autopilot
-    noise = None if d is None else d.noise
-    delay, rate = 0.0, autopilot.formation_rate
-    if noise is not None:
-        # Delays are whole ticks; a law that is quicker than its measurements acts at their rate.
-        delay = round(noise.delay * autopilot.rate) / autopilot.rate
-        rate = min(rate, noise.rate)
-    return [
-        Lag(delay=delay, rate=rate, point=True)
-        if model.point
-        else Lag(
-            model.attitude_gains[0], model.attitude_gains[1], max(model.motor_time), delay, rate
-        )
-        for model in models
-    ]
+_PLACES, STACKED = 200_000, 60
 
 
 #: Samples of a phase, and the time between them [s], within bounds: where derivatives of the reference are evaluated.
@@ -178,37 +155,19 @@ def _jets(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remark on the vehicle that another one's jet pushes down the most, as a share of its weight."""
     models = mission.vehicle_models
     assert models is not None
-    worst = None
-    for planned in way if mission.n_agents <= _STACKED else ():
-        r = planned.position
-        for j, above in enumerate(models):
-            if above.point:
-                continue
-            weight, span = above.mass * mission.gravity, 2.0 * above.arm
-            below = r[:, [j]] - r
-            for i, model in enumerate(models):
-                s = below[:, i, 2]
-                if i == j or not (s > 0.0).any():
-                    continue
-                k = int(np.argmin(np.where(s > 0.0, np.hypot(*below[:, i, :2].T), np.inf)))
-                if s[k] <= 0.0:
-                    continue
-                beside = float((below[k, i, :2] ** 2).sum())
-                flow = jet_speed(weight, DENSITY, above.rotor_radius, span, float(s[k]), beside)
-                push = model.linear_drag[2] * flow + model.body_drag[2] * flow**2
-                share = push / (model.mass * mission.gravity)
-                if worst is None or share > worst[0]:
-                    worst = (
-                        share,
-                        push,
-                        flow,
-                        i,
-                        j,
-                        float(s[k]),
-                        float(planned.time[k]),
-                        planned.phase,
-                    )
-    if worst is None or worst[0] < _BLOW:
+    worst = (0.0, 0.0, 0.0, 0, 0, 0.0, 0.0, "")
+    for planned in way if mission.n_agents <= STACKED else ():
+        flow = jets(mission, planned.position)
+        down = np.zeros((*flow.shape, 3))
+        down[..., 2] = flow
+        push = air_force(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]
+        share = push / (mission.fleet.mass * mission.gravity)[:, None]
+        k, i, j = np.unravel_index(int(share.argmax()), share.shape)
+        if share[k, i, j] > worst[0]:
+            r, t = planned.position[k], float(planned.time[k])
+            there = (push[k, i, j], flow[k, i, j], i, j, r[j, 2] - r[i, 2], t, planned.phase)
+            worst = share[k, i, j], *there
+    if worst[0] < _BLOW:
         return
     _, push, flow, i, j, s, t, phase = worst
     on = mission.disturbances is not None and mission.disturbances.downwash

@@ -20,8 +20,8 @@ from rigidfleet.mission.files import digests
 from rigidfleet.mission.schema import Tracking
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import timed
+from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.margins import Looped, formation_laws, tracking_law
-from rigidfleet.preflight.vehicles import vehicle_lags
 from rigidfleet.typing import Floats
 
 #: A gain by its path in the mission, as in a variation.
