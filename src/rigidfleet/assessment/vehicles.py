@@ -34,14 +34,22 @@ def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
         tilt = _tilt(measured)
         if tilt is not None:
             yield _checked("tilt", tilt, "deg", limits.tilt_deg, "tilts by")
-    error = _worst(measured, "tracking_error", lambda x: x.value)
-    sampled = measured.extreme(
-        measured.of_left(np.linalg.norm(result.position - result.slot_position, axis=2)),
-        agent,
+
+
+def tracking_check(measured: Measurements) -> Iterator[CheckResult]:
+    """Check how far agents are off the slots that they track: of vehicles at every tick, of points at samples."""
+    ticks = _worst(measured, "tracking_error", lambda x: x.value)
+    limit, sampled = (
+        measured.mission.limits.tracking_error,
+        measured.extreme(measured.off_slot, agent),
     )
-    error = max((e for e in (error, sampled) if e is not None), key=lambda e: e.value, default=None)
+    error = max((e for e in (ticks, sampled) if e is not None), key=lambda e: e.value, default=None)
     if error is not None:
-        yield _checked("tracking_error", error, "m", limits.tracking_error, "is off its slot by")
+        deed = "is off its slot by" if ticks else "is, at samples, off its slot by"
+        yield _checked("tracking_error", error, "m", limit, deed)
+    elif limit is not None:
+        words = f"no slots are tracked (limit {limit:g} m)"
+        yield CheckResult("tracking_error", True, words, None, limit, "m")
 
 
 def _worst(measured: Measurements, name: str, rank: Callable[[Extremum], float]) -> Extreme | None:

@@ -30,7 +30,7 @@ from rigidfleet.mission.values import (
     Tolerance,
     Trajectories,
     Vector,
-    Velocity,
+    VelocityOrFree,
 )
 from rigidfleet.typing import Floats
 
@@ -109,8 +109,18 @@ class AnyPhase(Part):
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """Which of position, velocity, attitude and rates the verdict checks at the arrival."""
+        """Which of position, velocity, attitude and rates are commanded at the arrival."""
         return ()
+
+    @property
+    def stays(self) -> bool:
+        """Whether the phase promises to end at rest where the phase before has led: a law leads the vehicles there."""
+        return self.control != "open" and "position" not in self.meets
+
+    @property
+    def free(self) -> bool:
+        """Whether the velocity at the arrival is free."""
+        return False
 
     @property
     def turns_away(self) -> bool:
@@ -343,7 +353,10 @@ class Fly(Steering):
 
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
-    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
+    velocity: VelocityOrFree = Field(
+        (0.0, 0.0, 0.0),
+        description="its velocity at arrival [m/s]; free: any, which costs least, and is not judged",
+    )
     through: tuple[Through, ...] = Field(
         (),
         description="points to pass on the way, with the least snap (smooth missions): "
@@ -352,13 +365,22 @@ class Fly(Steering):
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """Position and velocity, and the attitude if one is commanded."""
-        return ("position", "velocity", *super().meets)
+        """Position and velocity (unless it is free), and the attitude if one is commanded."""
+        return ("position", *(() if self.free else ("velocity",)), *super().meets)
+
+    @property
+    def free(self) -> bool:
+        """Whether any velocity will do."""
+        return self.velocity == "free"
 
     @property
     def leads_to(self) -> str:
         """The waypoint and the attitude."""
-        velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
+        velocity = []
+        if isinstance(self.velocity, str):
+            velocity = ["at any velocity"]
+        elif any(self.velocity):
+            velocity = [_vector(self.velocity, "m/s")]
         rest = super().leads_to
         return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 

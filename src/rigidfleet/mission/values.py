@@ -77,6 +77,11 @@ Flag = Annotated[bool, Strict()]
 _Three = Field(min_length=3, max_length=3)
 Vector = Annotated[tuple[Coordinate, ...], _Three]
 Velocity = Annotated[tuple[Annotated[float, Strict(), signed(SPEED)], ...], _Three]
+#: A velocity, or "free": any.
+VelocityOrFree = Annotated[
+    Annotated[Velocity, Tag("list")] | Annotated[Literal["free"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "list"),
+]
 Force = Annotated[tuple[Annotated[float, Strict(), signed(FORCE)], ...], _Three]
 Rates = Annotated[tuple[Angle, ...], _Three]
 Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]
@@ -141,6 +146,7 @@ PerAxis = Annotated[
 
 Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
 Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
+ShapeShare = Annotated[float, Strict(), Field(ge=1e-6, le=1.0)]
 Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
 Scale = Annotated[float, Strict(), Field(ge=0.1, lt=1.0)]
 Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]

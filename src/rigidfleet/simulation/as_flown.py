@@ -174,5 +174,7 @@ def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
 def _written_out(mission: Mission, name: str) -> dict[str, Any]:
     """A formation with its slots and edges in the order of the agents."""
     edges = (mission.formation_edges(name) + 1).tolist()
-    given = mission.formations[name].distances
-    return {"slots": mission.formation_slots(name), "edges": edges, "distances": given}
+    form = mission.formations[name]
+    judged = form.model_dump(include={"tolerance", "tolerance_share"}, exclude_unset=True)
+    slots = mission.formation_slots(name)
+    return {"slots": slots, "edges": edges, "distances": form.distances} | judged
