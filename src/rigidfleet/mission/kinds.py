@@ -113,11 +113,6 @@ class AnyPhase(Part):
         return ()
 
     @property
-    def stays(self) -> bool:
-        """Whether the phase promises to end at rest where the phase before has led: a law leads the vehicles there."""
-        return self.control != "open" and "position" not in self.meets
-
-    @property
     def free(self) -> bool:
         """Whether the velocity at the arrival is free."""
         return False

@@ -148,19 +148,28 @@ class PhasePlan:
         }
 
     def stay(self, t: float) -> dict[str, Any] | None:
-        """What the phase promises of its end at t [s]; None for no more than its target says.
+        """What the phase promises of its end at t [s] beside its target; None for nothing.
 
-        A phase that stays is to be at rest there; another one, where its waypoint has moved since the arrival.
+        A phase that stays comes to rest, and another one goes on from its waypoint. An attitude that was commanded
+        before is kept, except where forces between agents alone change the shape.
         """
-        goal, since = self.goal, t - self.arrival
-        if goal is None or not (
-            self.phase.stays or ("velocity" in self.phase.meets and since > _LATER)
-        ):
+        goal, since, phase = self.goal, t - self.arrival, self.phase
+        if goal is None or phase.control == "open" or phase.free:
             return None
+        later = since > _LATER
+        moved = later or "position" not in phase.meets
+        kept = goal.named and phase.establishing is None
+        kept &= phase.control == "tracking" or phase.shaping is None
+        turned = kept and (later or "attitude" not in phase.meets)
+        if not (moved or turned):
+            return None
+        T = att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
         return {
             "time": t,
-            "position": (goal.r + goal.v * since).tolist(),
-            "velocity": goal.v.tolist(),
+            "position": (goal.r + goal.v * since).tolist() if moved else None,
+            "velocity": goal.v.tolist() if moved else None,
+            "attitude": [*_quaternion(T)] if turned else None,
+            "rates": goal.omega.tolist() if turned else None,
         }
 
     def state(self) -> Floats:
