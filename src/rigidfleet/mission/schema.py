@@ -567,7 +567,7 @@ class Limits(Part):
         description="maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
     )
     tracking_error: Length | None = Field(
-        None, description="maximum distance of a vehicle from its slot [m]; only with [vehicles]"
+        None, description="maximum distance of a vehicle from the slot that it tracks [m]"
     )
 
 

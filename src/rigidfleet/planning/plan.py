@@ -154,10 +154,10 @@ class PhasePlan:
         before is kept, except where forces between agents alone change the shape.
         """
         goal, since, phase = self.goal, t - self.arrival, self.phase
-        if goal is None or phase.control == "open" or phase.free:
+        if goal is None or phase.control == "open":
             return None
         later = since > _LATER
-        moved = later or "position" not in phase.meets
+        moved = (later and not phase.free) or "position" not in phase.meets
         kept = goal.named and phase.establishing is None
         kept &= phase.control == "tracking" or phase.shaping is None
         turned = kept and (later or "attitude" not in phase.meets)
