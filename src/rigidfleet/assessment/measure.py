@@ -590,7 +590,7 @@ class Measurements:
             miss[name] = dict(zip(asked, off, strict=True))
         for i, off in miss["position"].items():
             if result.phases[targets[i][0]].formation is None:
-                miss["position"][i] = max(off, float(np.nanmax(self.off_slot[at[i]], initial=0.0)))
+                miss["position"][i] = max(off, float(np.fmax.reduce(self.off_slot[at[i]])))
         return {
             k: Waypoint(
                 time=t,
@@ -605,10 +605,7 @@ class Measurements:
     @cached_property
     def off_slot(self) -> Floats:
         """Distance (K, N) [m] of each vehicle from its slot; NaN where slots are not tracked."""
-        result = self.result
-        tracked = np.array([phase.control == "tracking" for phase in result.phases])[result.phase]
-        off = self.of_left(length(result.position - result.slot_position))
-        return off if tracked.all() else np.where(tracked[:, None], off, np.nan)
+        return self.of_left(length(self.result.position - self.result.slot_position))
 
     def passed(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""

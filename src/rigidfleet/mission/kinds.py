@@ -114,8 +114,8 @@ class AnyPhase(Part):
 
     @property
     def free(self) -> bool:
-        """Whether the velocity at the arrival is free."""
-        return False
+        """Whether a place is to be reached at any velocity."""
+        return "position" in self.meets and "velocity" not in self.meets
 
     @property
     def turns_away(self) -> bool:
@@ -349,8 +349,7 @@ class Fly(Steering):
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
     velocity: VelocityOrFree = Field(
-        (0.0, 0.0, 0.0),
-        description="its velocity at arrival [m/s]; free: any, which costs least, and is not judged",
+        (0.0, 0.0, 0.0), description="its velocity at arrival [m/s]; free: any, not judged"
     )
     through: tuple[Through, ...] = Field(
         (),
@@ -361,21 +360,14 @@ class Fly(Steering):
     @property
     def meets(self) -> tuple[str, ...]:
         """Position and velocity (unless it is free), and the attitude if one is commanded."""
-        return ("position", *(() if self.free else ("velocity",)), *super().meets)
-
-    @property
-    def free(self) -> bool:
-        """Whether any velocity will do."""
-        return self.velocity == "free"
+        velocity = () if self.velocity == "free" else ("velocity",)
+        return ("position", *velocity, *super().meets)
 
     @property
     def leads_to(self) -> str:
         """The waypoint and the attitude."""
-        velocity = []
-        if isinstance(self.velocity, str):
-            velocity = ["at any velocity"]
-        elif any(self.velocity):
-            velocity = [_vector(self.velocity, "m/s")]
+        v = self.velocity
+        velocity = ["any velocity" if isinstance(v, str) else _vector(v, "m/s")] if any(v) else []
         rest = super().leads_to
         return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 

@@ -56,7 +56,6 @@ from rigidfleet.mission.values import (
     Rest,
     RotorSpeeds,
     Seed,
-    ShapeShare,
     Share,
     Size,
     Small,
@@ -472,12 +471,10 @@ class Formation(Part):
         "'sides': left and right of the formation, along x, mirrored so that its middle stays the same",
     )
     tolerance: Length | None = Field(
-        None,
-        description="greatest error of any distance where the shape is judged [m]; default: by tolerance_share",
+        None, description="greatest error of a distance [m]; default: by tolerance_share"
     )
-    tolerance_share: ShapeShare = Field(
-        SHAPE_TOLERANCE,
-        description="instead of tolerance: this error as a share of the shortest distance between slots [-]",
+    tolerance_share: Share = Field(
+        SHAPE_TOLERANCE, description="the same, as a share of the formation's shortest distance [-]"
     )
     colour: Colour | None = Field(
         None,

@@ -146,7 +146,6 @@ PerAxis = Annotated[
 
 Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
 Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
-ShapeShare = Annotated[float, Strict(), Field(ge=1e-6, le=1.0)]
 Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
 Scale = Annotated[float, Strict(), Field(ge=0.1, lt=1.0)]
 Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]

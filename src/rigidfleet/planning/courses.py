@@ -84,8 +84,7 @@ def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> 
     named = now.goal.named or angles is not None
     r, v = now.goal.r, np.zeros(3)
     if isinstance(phase, Fly):
-        r = np.array(phase.position)
-        v = v if isinstance(phase.velocity, str) else np.array(phase.velocity)
+        r, v = np.array(phase.position), v if phase.free else np.array(phase.velocity)
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
     return _led(mission, phase, now, goal, arrival, t_end)
 

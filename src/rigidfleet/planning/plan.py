@@ -158,19 +158,15 @@ class PhasePlan:
             return None
         later = since > _LATER
         moved = (later and not phase.free) or "position" not in phase.meets
-        kept = goal.named and phase.establishing is None
-        kept &= phase.control == "tracking" or phase.shaping is None
-        turned = kept and (later or "attitude" not in phase.meets)
-        if not (moved or turned):
-            return None
-        T = att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
-        return {
-            "time": t,
-            "position": (goal.r + goal.v * since).tolist() if moved else None,
-            "velocity": goal.v.tolist() if moved else None,
-            "attitude": [*_quaternion(T)] if turned else None,
-            "rates": goal.omega.tolist() if turned else None,
-        }
+        kept = goal.named and (phase.control == "tracking" or phase.shaping is None)
+        kept &= phase.establishing is None and (later or "attitude" not in phase.meets)
+        found: dict[str, Any] = {"time": t}
+        if moved:
+            found |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
+        if kept:
+            T = att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
+            found |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
+        return found if len(found) > 1 else None
 
     def state(self) -> Floats:
         """The kernel's state vector (n,) at the start; `rigidfleet.kernel.dynamics` says what it holds."""

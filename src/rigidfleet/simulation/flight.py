@@ -345,11 +345,11 @@ class Flight:
             self.ending = str(stop)
             return False
         self._asked.append(phase)
-        own = self.controller is not None  # which nobody asks to follow the plan
+        # Nobody asks a controller of the user's to follow the plan.
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
             settled=None if phase.settle is None else False, target=plan.target,
-            planned=None if own or plan.certificate is None else plan.certificate._asdict(),
+            planned=plan.certificate._asdict() if self.controller is None and plan.certificate else None,
         )  # fmt: skip
         self.phases.append(record)
         return True
@@ -624,8 +624,7 @@ class Flight:
             record.target = {"time": came[-1]["time"], "through": came} if came else None
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
-        left = not (active.settled or active.over) and active.t < active.plan.arrival
-        if not (abandoned or left):
+        if not abandoned and (active.settled or active.over or active.t >= active.plan.arrival):
             record.stay = active.plan.stay(active.t)
 
     def _check_frame(self, plan: PhasePlan) -> None:
