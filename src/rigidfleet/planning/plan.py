@@ -151,14 +151,14 @@ class PhasePlan:
         """What the phase promises of its end at t [s] beside its target; None for nothing.
 
         A phase that stays comes to rest, and another one goes on from its waypoint. An attitude that was commanded
-        before is kept, except where forces between agents alone change the shape.
+        before is kept; a virtual body that stays, alone, has no time by which it comes back to it.
         """
         goal, since, phase = self.goal, t - self.arrival, self.phase
         if goal is None or phase.control == "open":
             return None
         later = since > _LATER
         moved = (later and not phase.free) or "position" not in phase.meets
-        kept = goal.named and (phase.control == "tracking" or phase.shaping is None)
+        kept = goal.named and (phase.control == "tracking" or phase.moves)
         kept &= phase.establishing is None and (later or "attitude" not in phase.meets)
         found: dict[str, Any] = {"time": t}
         if moved:
