@@ -150,16 +150,16 @@ class PhasePlan:
     def stay(self, t: float) -> dict[str, Any] | None:
         """What the phase promises of its end at t [s] beside its target; None for nothing.
 
-        A phase that stays comes to rest, and another one goes on from its waypoint. An attitude that was commanded
-        before is kept; a virtual body that stays, alone, has no time by which it comes back to it.
+        A phase that stays comes to rest, and keeps the attitude commanded before if it tracks slots. Another one goes
+        on from its waypoint.
         """
         goal, since, phase = self.goal, t - self.arrival, self.phase
         if goal is None or phase.control == "open":
             return None
-        later = since > _LATER
-        moved = (later and not phase.free) or "position" not in phase.meets
-        kept = goal.named and (phase.control == "tracking" or phase.moves)
-        kept &= phase.establishing is None and (later or "attitude" not in phase.meets)
+        later, stays = since > _LATER, "position" not in phase.meets
+        moved = stays or (later and not phase.free)
+        kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
+        kept = later if "attitude" in phase.meets else kept
         found: dict[str, Any] = {"time": t}
         if moved:
             found |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
