@@ -673,9 +673,10 @@ def test_only_files_are_replaced(flight, tmp_path):
     assert pipe.is_fifo()
 
 
-def test_command(flight, tmp_path, monkeypatch, capsys):
+def test_command(tmp_path, monkeypatch, capsys):
     """The command says in one line what it kept and lost, keeps existing files, and refuses a truncated result."""
     result = tmp_path / "sines.nc"
+    flight = rf.simulate("crazyflies")
     flight.save(result)
     assert main(["export", str(result), "--format", "skyc"]) == 0
     kept, path = capsys.readouterr().out.splitlines()
@@ -687,7 +688,7 @@ def test_command(flight, tmp_path, monkeypatch, capsys):
     assert "already exists; use --force" in capsys.readouterr().err
     assert main(["export", str(result), "--format", "skyc", "--force", "--tolerance", "0.1"]) == 0
     assert main(["export", str(result), "--format", "poly4d"]) == 0
-    assert len(list((tmp_path / "sines-poly4d").iterdir())) == N
+    assert len(list((tmp_path / "sines-poly4d").iterdir())) == flight.n_agents
     capsys.readouterr()
     assert main(["export", str(result), "--format", "tlog", "--tolerance", "0.1"]) == 2
     assert "error: tolerance does not apply to tlog" in capsys.readouterr().err

@@ -140,7 +140,7 @@ def test_safety(calm):
     rows = {row.quantity: row for row in safety(calm, assess(calm))}
     assert list(rows) == [
         "proximity", "downwash", "speed", "acceleration", "lowest", "highest", "geofence", "thrust",
-        "clearance",
+        "clearance", "tracking error",
     ]  # fmt: skip
     z, r = calm.position[..., 2], calm.position
     assert worst(rows["highest"]).value == z.max()

@@ -11,13 +11,12 @@ count from 1.
 
 from pathlib import Path
 
-from rigidfleet._common.waypoints import WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.checks import all_checks
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.notes import notes
 from rigidfleet.assessment.outcome import (
     FLIPPED,
-    SHAPE_TOLERANCE,
     CheckResult,
     Extreme,
     PhaseVerdict,

@@ -15,14 +15,13 @@ from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import (
     FLIPPED,
-    SHAPE_TOLERANCE,
     TOUCH_DOWN,
     CheckResult,
     Extreme,
     PhaseVerdict,
     value,
 )
-from rigidfleet.assessment.vehicles import vehicle_checks
+from rigidfleet.assessment.vehicles import tracking_check, vehicle_checks
 from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import PAD, Result
 from rigidfleet.typing import Floats
@@ -78,6 +77,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     yield from _corners(measured)
     yield from _thrust(measured, worst.get("thrust"))
     yield from vehicle_checks(measured)
+    yield from tracking_check(measured)
     yield from guarantee_checks(measured)
     units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
     yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
@@ -133,7 +133,7 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
         moments = {"waypoint": target.get("time")}
         for k, point in enumerate(target.get("through", ()), start=1):
             moments[f"point {k} on the way"] = point["time"]
-        if KINDS[p.kind].shapes or i == last:
+        if KINDS[p.kind].shapes or i == last or p.stay is not None:
             moments["end"] = p.t_end
         for what, t in moments.items():
             if t is None:
@@ -168,7 +168,8 @@ def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[Chec
         edges, _ = measured.edges(p.formation, last)
         held = False
         if p.distances is not None:
-            limit = SHAPE_TOLERANCE * float(measured.formation(p.formation)[2].min())
+            shortest = float(measured.formation(p.formation)[2].min())
+            limit = measured.mission.formations[p.formation].greatest_error(shortest)
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
@@ -240,6 +241,7 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
         for what, at in (
             *((f"point {k} on the way", at) for k, at in enumerate(p.through, start=1)),
             ("the waypoint", p.waypoint),
+            ("the place at the end", p.stay),
         )
         if at is not None
     ]

@@ -9,7 +9,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from rigidfleet.assessment.outcome import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.constraint_jacobian import jacobian
@@ -91,7 +90,10 @@ class Fit:
     dimension, axis, shortest : of the slots: dimension; direction of a line or normal of a plane, in their axes;
         shortest distance [m]
     error, pair, flown, intended : the greatest error of a distance [m], of which agents, and the two distances [m]
+    limit : the greatest error that the formation allows [m]
     """
+
+    limit: float
 
     def __init__(
         self,
@@ -133,11 +135,6 @@ class Fit:
         if self.dimension != 1 or len(self._order) < 3:
             return None
         return self._laid.order[self._k] in (self._order, self._order[::-1])
-
-    @property
-    def limit(self) -> float:
-        """Greatest error of a pair [m]."""
-        return SHAPE_TOLERANCE * self.shortest
 
 
 def length(x: Floats, more: Floats | None = None) -> Floats:

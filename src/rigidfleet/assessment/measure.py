@@ -447,6 +447,7 @@ class Measurements:
             flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
             waypoint=self.waypoints.get(index) if finished else None,
+            stay=self.stays.get(index) if finished else None,
             through=tuple(self.passed(index)),
             worst=self.worst_of[index],
         )
@@ -515,7 +516,9 @@ class Measurements:
         for group in alike.values():
             laid = Laid(np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group]))
             for k, (index, p, slots, left) in enumerate(group):
-                fits[index] = Fit(p, slots, left, laid, k)
+                fit = fits[index] = Fit(p, slots, left, laid, k)
+                form = self.mission.formations[self.result.phases[index].formation or ""]
+                fit.limit = form.greatest_error(fit.shortest)
         return fits
 
     @cached_property
@@ -551,8 +554,20 @@ class Measurements:
     @cached_property
     def waypoints(self) -> dict[int, Waypoint]:
         """Miss of each phase with a target, at the target's time, or at the end of a phase that settles earlier."""
-        result, phases = self.result, self.result.phases
-        targets = [(k, x) for k in self.flown if (x := phases[k].target) is not None]
+        return self._misses([phase.target for phase in self.result.phases])
+
+    @cached_property
+    def stays(self) -> dict[int, Waypoint]:
+        """How far each phase that promises to stay is off its place at its end."""
+        return self._misses([phase.stay for phase in self.result.phases])
+
+    def _misses(self, every: Sequence[dict[str, Any] | None]) -> dict[int, Waypoint]:
+        """Miss of a target of each phase, if it has one.
+
+        Where no formation is held, each vehicle has a place of its own: the vehicle furthest from it counts.
+        """
+        result = self.result
+        targets = [(k, x) for k in self.flown if (x := every[k]) is not None]
         if not targets:
             return {}
         at = [self.nearest(target["time"], k) for k, target in targets]
@@ -573,6 +588,9 @@ class Measurements:
             else:
                 off = map(math.dist, rows, asked.values())
             miss[name] = dict(zip(asked, off, strict=True))
+        for i, off in miss["position"].items():
+            if result.phases[targets[i][0]].formation is None:
+                miss["position"][i] = max(off, float(np.fmax.reduce(self.off_slot[at[i]])))
         return {
             k: Waypoint(
                 time=t,
@@ -583,6 +601,11 @@ class Measurements:
             )
             for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
         }
+
+    @cached_property
+    def off_slot(self) -> Floats:
+        """Distance (K, N) [m] of each vehicle from its slot; NaN where slots are not tracked."""
+        return self.of_left(length(self.result.position - self.result.slot_position))
 
     def passed(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""

@@ -6,11 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-#: Greatest error of a distance, relative to the shortest intended one, at the end of a shaping phase
-#: and of the flight. A shape that is reached has errors below 1e-3; one folded another way, of some tenths.
-SHAPE_TOLERANCE = 0.01
-
-
 #: Greatest speed downwards at touch-down [m/s]: the default of ArduPilot's LAND_SPEED.
 TOUCH_DOWN = 0.5
 
@@ -107,6 +102,7 @@ class PhaseVerdict:
     flip : angle of a plane's normal, or of a line's direction, from its intended direction [deg]
     order : False if the agents of a line are out of order
     waypoint : the miss of a waypoint
+    stay : how far a phase that promises to stay is off its place at its end
     through : the misses of the points to pass on the way, in position
     worst : extremes by name: constraint |c| [m], separation [m], clearance [m], thrust [N],
         speed [m/s], acceleration [m/s^2], constraint_force [N], tension [N] (negative: a push),
@@ -129,6 +125,7 @@ class PhaseVerdict:
     order: bool | None
     waypoint: Waypoint | None
     through: tuple[Waypoint, ...]
+    stay: Waypoint | None
     worst: dict[str, Extreme]
 
 

@@ -55,7 +55,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     """Worst value of each quantity of a judged flight, with its limit if there is one.
 
     Limits are those of the verdict; those of the altitude are the geofence's. Flights by vehicles with rotors have
-    rows of their own at the end.
+    rows of their own at the end, and so has the distance from slots that are tracked.
     """
     measured = Measurements(result)
     found = {check.check: check for check in verdict.checks}
@@ -82,8 +82,6 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             found.get("clearance"), "m", at_least=True,
         ),
     ]  # fmt: skip
-    if "rotor_force" not in found:
-        return rows
     return rows + [
         _row(name.replace("_", " "), text, found.get(name), unit)
         for name, text, unit in (
@@ -92,6 +90,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             ("tilt", "greatest tilt of a vehicle", "deg"),
             ("tracking_error", "greatest distance of a vehicle from its slot", "m"),
         )
+        if name in found or "rotor_force" in found
     ]  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from rigidfleet._common.text import percent
 from rigidfleet.assessment.measure import Measurements, agent
 from rigidfleet.assessment.outcome import CheckResult, Extreme, value
 from rigidfleet.math import attitude as att
-from rigidfleet.result import LABELS, Extremum
+from rigidfleet.result import LABELS
 from rigidfleet.typing import Floats
 
 #: Share of a limit by which rounding may exceed it.
@@ -28,29 +28,23 @@ def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
     rotors = np.array([model.rotor_limit for model in models])
     if rotors.any():
         yield from _rotor_force(measured, rotors)
-        share = _worst(measured, "saturation", lambda x: x.value)
+        share = measured.worst("saturation", None)
         if share is not None:
             yield _saturation(share, limits.saturation)
         tilt = _tilt(measured)
         if tilt is not None:
             yield _checked("tilt", tilt, "deg", limits.tilt_deg, "tilts by")
-    error = _worst(measured, "tracking_error", lambda x: x.value)
-    sampled = measured.extreme(
-        measured.of_left(np.linalg.norm(result.position - result.slot_position, axis=2)),
-        agent,
-    )
-    error = max((e for e in (error, sampled) if e is not None), key=lambda e: e.value, default=None)
+
+
+def tracking_check(measured: Measurements) -> Iterator[CheckResult]:
+    """Check how far agents are off the slots that they track: of vehicles at every tick, of points at samples."""
+    limit = measured.mission.limits.tracking_error
+    error = measured.worst("tracking_error", measured.extreme(measured.off_slot, agent))
     if error is not None:
-        yield _checked("tracking_error", error, "m", limits.tracking_error, "is off its slot by")
-
-
-def _worst(measured: Measurements, name: str, rank: Callable[[Extremum], float]) -> Extreme | None:
-    """The worst of the extremes that the phases have recorded."""
-    every = [(p, p.extremes[name]) for p in measured.result.phases if name in p.extremes]
-    if not every:
-        return None
-    phase, x = max(every, key=lambda pair: rank(pair[1]))
-    return Extreme(x.value, x.time, f"agent {x.who + 1}", phase.name)
+        at = "is, at samples," if measured.mission.vehicle_models is None else "is"
+        yield _checked("tracking_error", error, "m", limit, f"{at} off its slot by")
+    elif limit is not None:
+        yield CheckResult("tracking_error", True, "no slots are tracked", None, limit, "m")
 
 
 def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult]:
@@ -112,7 +106,7 @@ def _tilt(measured: Measurements) -> Extreme | None:
     sampled = measured.extreme(
         measured.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))), agent
     )
-    between = _worst(measured, "tilt", lambda x: x.value)
+    between = measured.worst("tilt", None)
     if between is not None:
         between = Extreme(math.degrees(between.value), between.when, between.who, between.phase)
     found = [e for e in (between, sampled) if e is not None]

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.plain import plain
 from rigidfleet._common.text import all_hold
-from rigidfleet._common.waypoints import WAYPOINT_TOLERANCE
+from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 from rigidfleet.assessment.outcome import (
     FLIPPED,
     SENSE,
-    SHAPE_TOLERANCE,
     CheckResult,
     Extreme,
     PhaseVerdict,

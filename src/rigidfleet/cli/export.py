@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import PASSED
 from rigidfleet.cli.outputs import taken
-from rigidfleet.errors import RigidfleetError
+from rigidfleet.errors import ResultError, RigidfleetError
 
 #: Names of `rigidfleet.interchange.FORMATS`, whose module loads slowly.
 Name = Literal[
@@ -31,6 +31,8 @@ def export(
 ) -> int:
     """Write a flight for another program, and say what is kept and what is lost.
 
+    A flight that is incomplete, or failed its verdict, is written only with --force.
+
     Parameters
     ----------
     result : Path
@@ -49,18 +51,27 @@ def export(
     flown : bool
         Write the motion flown instead of the reference.
     force : bool
-        Overwrite existing files.
+        Overwrite existing files, and write a flight that failed, too.
     """
+    from rigidfleet.assessment import assess
     from rigidfleet.interchange import FORMATS
     from rigidfleet.interchange import export as write
+    from rigidfleet.result import as_result
 
+    flight = as_result(result)
+    verdict = assess(flight)
+    if not verdict.passed:
+        why = f"{result}: this flight must not be flown as it is. {verdict.summary}"
+        if not force:
+            raise ResultError(f"{why}\nUse --force to export it all the same; it overwrites, too.")
+        console.warn(why)
     chosen = FORMATS[format]
     name = f"{result.stem}-{format}" if chosen.each else f"{result.stem}.{chosen.suffix}"
     path = out or result.parent / name  # a path such as "." has no name to change
     if path.exists() and not force:
         raise taken(path)
     try:
-        made = write(result, path, format, rate=rate, tolerance=tolerance, flown=flown)
+        made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)
     except ValueError as error:
         raise RigidfleetError(f"{error}.") from None
     console.out().print(f"{made}\nExport   {path}", soft_wrap=True)

@@ -160,6 +160,7 @@ def export(
 ) -> Export:
     """Write a flight for another program, and measure what was written by reading it back.
 
+    It does not judge the flight: see `assess` before you hand one to vehicles. The command refuses one that failed.
     Existing files of the same names are replaced, all or none.
 
     Parameters

@@ -107,8 +107,15 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats) -> Floats
 
     Of all ways through the points, with velocity, acceleration and jerk ``begin`` and ``end`` (3, ...) at the ends,
     this one has the least integral of |snap|^2. It has six continuous derivatives: at the inner points, velocity,
-    acceleration and jerk follow from the continuity of the next three derivatives.
+    acceleration and jerk follow from the continuity of the next three derivatives. A velocity of NaN at the end is
+    free: the transversality condition x^(6) = 0 there leaves the least snap.
     """
+    if np.isnan(end[0]).any():
+        ends = [np.stack([np.full_like(end[0], v), *end[1:]]) for v in (0.0, 1.0)]
+        slow, fast = (minimum_snap(times, x, begin, one) for one in ends)  # linear in the velocity
+        h = times[-1] - times[-2]
+        least, most = (way[-1, ..., 6] + 7.0 * h * way[-1, ..., 7] for way in (slow, fast))
+        return slow + (least / (least - most))[..., None] * (fast - slow)
     inner, shape = len(times) - 2, x.shape[1:]
     unit = float(np.diff(times).mean())  # a natural unit of time keeps the equations well scaled
     full = np.zeros((4, inner + 2, *shape))

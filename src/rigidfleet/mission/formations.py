@@ -178,6 +178,9 @@ def _formation(collector: FindingCollector, form: Formation, n: int | None, path
             collector.add(
                 (*path, "slots", j), f"is the same point as slot {i + 1}", "move the slots apart"
             )
+    if form.tolerance is not None and "tolerance_share" in form.model_fields_set:
+        problem = "has no effect beside tolerance, which is in metres"
+        collector.add((*path, "tolerance_share"), problem, "remove one of them")
     if isinstance(form.colour, tuple) and len(form.colour) != n:
         problem = f"has {len(form.colour)} colours for {n} agents"
         collector.add((*path, "colour"), problem, "give one colour, or one per slot", None)

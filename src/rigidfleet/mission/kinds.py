@@ -30,7 +30,7 @@ from rigidfleet.mission.values import (
     Tolerance,
     Trajectories,
     Vector,
-    Velocity,
+    VelocityOrFree,
 )
 from rigidfleet.typing import Floats
 
@@ -109,8 +109,13 @@ class AnyPhase(Part):
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """Which of position, velocity, attitude and rates the verdict checks at the arrival."""
+        """Which of position, velocity, attitude and rates are commanded at the arrival."""
         return ()
+
+    @property
+    def free(self) -> bool:
+        """Whether a place is to be reached at any velocity."""
+        return "position" in self.meets and "velocity" not in self.meets
 
     @property
     def turns_away(self) -> bool:
@@ -343,7 +348,9 @@ class Fly(Steering):
 
     kind: Literal["fly"] = Field(description="fly to a waypoint")
     position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
-    velocity: Velocity = Field((0.0, 0.0, 0.0), description="its velocity at arrival [m/s]")
+    velocity: VelocityOrFree = Field(
+        (0.0, 0.0, 0.0), description="its velocity at arrival [m/s]; free: any, not judged"
+    )
     through: tuple[Through, ...] = Field(
         (),
         description="points to pass on the way, with the least snap (smooth missions): "
@@ -352,13 +359,15 @@ class Fly(Steering):
 
     @property
     def meets(self) -> tuple[str, ...]:
-        """Position and velocity, and the attitude if one is commanded."""
-        return ("position", "velocity", *super().meets)
+        """Position and velocity (unless it is free), and the attitude if one is commanded."""
+        velocity = () if self.velocity == "free" else ("velocity",)
+        return ("position", *velocity, *super().meets)
 
     @property
     def leads_to(self) -> str:
         """The waypoint and the attitude."""
-        velocity = [_vector(self.velocity, "m/s")] if any(self.velocity) else []
+        v = self.velocity
+        velocity = ["any velocity" if isinstance(v, str) else _vector(v, "m/s")] if any(v) else []
         rest = super().leads_to
         return ", ".join([_vector(self.position, "m"), *velocity, *([rest] if rest else [])])
 

@@ -15,6 +15,7 @@ from pydantic import (
     model_validator,
 )
 
+from rigidfleet._common.waypoints import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
@@ -469,12 +470,22 @@ class Formation(Part):
         description="where vehicles wait for which there are no slots, in the axes of the slots: a list of points [m]; "
         "'sides': left and right of the formation, along x, mirrored so that its middle stays the same",
     )
+    tolerance: Length | None = Field(
+        None, description="greatest error of a distance [m]; default: by tolerance_share"
+    )
+    tolerance_share: Share = Field(
+        SHAPE_TOLERANCE, description="the same, as a share of the formation's shortest distance [-]"
+    )
     colour: Colour | None = Field(
         None,
         description="light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
         "default: that of the file of slots if it has colours, else the light before. Vehicles that rest are dark. "
         "`export --format skyc` writes it",
     )
+
+    def greatest_error(self, shortest: float) -> float:
+        """Greatest error of a distance [m] of which the shortest intended one is given [m]."""
+        return self.tolerance_share * shortest if self.tolerance is None else self.tolerance
 
     def edge_array(self, n: int) -> Ints:
         """Edges (m, 2), agents from 0, i < j."""
@@ -553,7 +564,7 @@ class Limits(Part):
         description="maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
     )
     tracking_error: Length | None = Field(
-        None, description="maximum distance of a vehicle from its slot [m]; only with [vehicles]"
+        None, description="maximum distance of a vehicle from the slot that it tracks [m]"
     )
 
 

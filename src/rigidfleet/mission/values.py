@@ -77,6 +77,11 @@ Flag = Annotated[bool, Strict()]
 _Three = Field(min_length=3, max_length=3)
 Vector = Annotated[tuple[Coordinate, ...], _Three]
 Velocity = Annotated[tuple[Annotated[float, Strict(), signed(SPEED)], ...], _Three]
+#: A velocity, or "free": any.
+VelocityOrFree = Annotated[
+    Annotated[Velocity, Tag("list")] | Annotated[Literal["free"], Tag("word")],
+    Discriminator(lambda value: "word" if isinstance(value, str) else "list"),
+]
 Force = Annotated[tuple[Annotated[float, Strict(), signed(FORCE)], ...], _Three]
 Rates = Annotated[tuple[Angle, ...], _Three]
 Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]

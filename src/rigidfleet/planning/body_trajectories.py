@@ -13,7 +13,6 @@ from rigidfleet._common.kept import kept
 from rigidfleet.kernel.problem import Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
-from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Orbit, Through, seconds
 from rigidfleet.mission.schema import Lqr, Tracking
 from rigidfleet.planning.reference import Pose, changed
@@ -100,13 +99,6 @@ def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tup
     return knots, quintics.reshape(2, 4, -1)
 
 
-def regulated(
-    mission: Mission, start: Pose, goal: Pose, t0: float, arrival: float, t_end: float
-) -> RegulatedTrajectory:
-    """The regulators' trajectory from one pose at ``t0`` [s] to another, and on to the end of the phase."""
-    return RegulatedTrajectory(mission.lqr, mission.tracking, start, goal, t0, arrival, t_end)
-
-
 @dataclass
 class StoppingTrajectory:
     """From a pose to rest with continuous acceleration and jerk; where it stops follows from the pose."""
@@ -129,8 +121,8 @@ class SmoothTrajectory:
     """From one pose to another with continuous acceleration and jerk, through points if there are any.
 
     Between two states, CM and phi are polynomials of degree 7; through points, the CM has the least snap. It begins
-    with velocity, acceleration and jerk of its start, and arrives with the velocity of its goal, unaccelerated. After
-    the arrival it continues with this velocity.
+    with velocity, acceleration and jerk of its start, and arrives with the velocity of its goal, unaccelerated. A
+    velocity of NaN is free: the one with the least snap. After the arrival it continues with this velocity.
     """
 
     start: Pose

@@ -28,14 +28,15 @@ from rigidfleet.mission.kinds import (
     Vertical,
     seconds,
 )
+from rigidfleet.mission.schema import Lqr
 from rigidfleet.planning.body_trajectories import (
     BodyTrajectory,
     GivenTrajectory,
+    RegulatedTrajectory,
     SmoothTrajectory,
     StoppingTrajectory,
     as_motion,
     orbit,
-    regulated,
     rotation_of,
 )
 from rigidfleet.planning.reference import PhaseState, Pose, changed, pose_at
@@ -83,7 +84,7 @@ def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> 
     named = now.goal.named or angles is not None
     r, v = now.goal.r, np.zeros(3)
     if isinstance(phase, Fly):
-        r, v = np.array(phase.position), np.array(phase.velocity)
+        r, v = np.array(phase.position), v if phase.free else np.array(phase.velocity)
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
     return _led(mission, phase, now, goal, arrival, t_end)
 
@@ -138,9 +139,9 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     """Follow the trajectories of the virtual body, or the mean of the vehicles' own."""
     assert now.goal is not None
     trajectory, _ = _followed(mission, phase, now, t_end)
-    end = pose_at(trajectory.found, t_end)
-    named = now.goal.named and not phase.turns_away
     arrival = float(min(t_end, trajectory.found.knots[-1]))
+    end = pose_at(trajectory.found, arrival)
+    named = now.goal.named and not phase.turns_away
     return Course(changed(end, named=named), arrival, trajectory)
 
 
@@ -302,9 +303,21 @@ def _led(
     if phase.control == "open" or now.pose is None:
         return Course(goal, arrival, None)
     if not mission.smooth:
-        return Course(goal, arrival, regulated(mission, now.pose, goal, now.t, arrival, t_end))
+        laws = regulators(mission, phase)
+        leg = RegulatedTrajectory(laws, mission.tracking, now.pose, goal, now.t, arrival, t_end)
+        return Course(goal, arrival, leg)
     through = phase.through if isinstance(phase, Fly) else ()
-    return Course(goal, arrival, SmoothTrajectory(now.pose, goal, now.t, arrival, through))
+    end = changed(goal, v=np.full(3, np.nan)) if phase.free else goal
+    way = SmoothTrajectory(now.pose, end, now.t, arrival, through)
+    if phase.free:
+        goal = changed(goal, v=pose_at(way.motion(), arrival).v)
+    return Course(goal, arrival, way)
+
+
+def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:
+    """The regulators of the virtual body; those to a free velocity do not weigh it at the arrival."""
+    laws = mission.lqr
+    return laws.model_copy(update={"S": (laws.S[0], 0.0)}) if phase.free else laws
 
 
 #: Function of each kind of phase that moves the virtual body; in all others, it comes to rest at the previous goal.

@@ -49,7 +49,7 @@ from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import passed
 from rigidfleet.planning.certificate import Certificate, certified
-from rigidfleet.planning.courses import course, lifted
+from rigidfleet.planning.courses import course, lifted, regulators
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.reference import (
     PhaseState,
@@ -68,6 +68,8 @@ from rigidfleet.planning.tolerances import (
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
+#: Time from which on a phase's end is another moment than its arrival [s].
+_LATER = 1e-6
 _KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 #: Greatest error of any pair, as a share of the shortest distance, at which a formation counts as held.
 _NEAR = 0.1
@@ -144,6 +146,27 @@ class PhasePlan:
             "rates": goal.omega.tolist() if turns and not lies else None,
             **({"through": through} if through else {}),
         }
+
+    def stay(self, t: float) -> dict[str, Any] | None:
+        """What the phase promises of its end at t [s] beside its target; None for nothing.
+
+        A phase that stays comes to rest, and keeps the attitude commanded before if it tracks slots. Another one goes
+        on from its waypoint.
+        """
+        goal, since, phase = self.goal, t - self.arrival, self.phase
+        if goal is None or phase.control == "open":
+            return None
+        later, stays = since > _LATER, "position" not in phase.meets
+        moved = stays or (later and not phase.free)
+        kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
+        kept = later if "attitude" in phase.meets else kept
+        found: dict[str, Any] = {"time": t}
+        if moved:
+            found |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
+        if kept:
+            T = att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
+            found |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
+        return found if len(found) > 1 else None
 
     def state(self) -> Floats:
         """The kernel's state vector (n,) at the start; `rigidfleet.kernel.dynamics` says what it holds."""
@@ -283,7 +306,7 @@ def plan_phase(
         motion = trajectory.motion()
     elif phase.control == "body":
         assert goal is not None
-        feedback = _feedback(mission, goal, now.t, arrival, moves=phase.moves)
+        feedback = _feedback(mission, phase, goal, now.t, arrival)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
     held = _held(mission, name, now) if method == "dense" else None
     problem = Problem(
@@ -440,16 +463,17 @@ _NO_FEEDBACK = Feedback(
 )  # fmt: skip
 
 
-def _feedback(mission: Mission, goal: Pose, t0: float, arrival: float, *, moves: bool) -> Feedback:
+def _feedback(mission: Mission, phase: Phase, goal: Pose, t0: float, arrival: float) -> Feedback:
     """LQR of the virtual body itself: gain tables on the way to a waypoint, tracking gains at rest."""
     hold = mission.tracking_gains * 2
     to_go, gain, slope = np.zeros(0), np.zeros((0, 4)), np.zeros((0, 4))
-    if moves:
+    if phase.moves:
         # Gains grow like 1/tau near arrival, until S bounds them. Cubics on a geometric grid are
         # exact to 1e-8.
         horizon = arrival - t0
         to_go = np.concatenate([[0.0], np.geomspace(min(1e-6, 1e-3 * horizon), horizon, 1000)])
-        tables = [_gains(law, to_go) for law in (mission.lqr, mission.lqr.attitude)]
+        laws = regulators(mission, phase)
+        tables = [_gains(law, to_go) for law in (laws, laws.attitude)]
         gain, slope = (np.concatenate(columns, axis=1) for columns in zip(*tables, strict=True))
     return Feedback(
         to_go, np.ascontiguousarray(gain), np.ascontiguousarray(slope), arrival, goal.r, goal.v,

@@ -262,7 +262,8 @@ def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             "position": math.dist(pose.r, goal.r),
             "velocity": math.dist(pose.v, goal.v),
         }
-        meets = {what: off for what, off in meets.items() if what in phase.meets}
+        stays = phase.control == "tracking" and "position" not in phase.meets
+        meets = {what: off for what, off in meets.items() if stays or what in phase.meets}
         if "attitude" in phase.meets and mission.n_agents > 1:
             turn = att.rotation_vector_from_dcm(pose.T @ goal.T.T)
             # As flown: agents on a line do not show how it spins.

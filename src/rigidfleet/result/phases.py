@@ -72,9 +72,12 @@ class PhaseRecord:
     target : for phases with a goal of their own (fly, turn, orbit), and for establish phases with a commanded
         attitude: {"time" [s], "position" [m], "velocity" [m/s], "attitude" quaternion, "rates" [rad/s]}. Entries other
         than the time are None if nothing is commanded
+    stay : of phases that stay (such as hold, reshape, brake), and of those that go on after their arrival: {"time" [s],
+        "position" [m], "velocity" [m/s]} of the centre of mass at the end of the phase. None if nothing leads it there,
+        and of a phase that was left early
     abandoned : whether the loss of a vehicle or link ended it, before its own end
     planned : certificate of the planned paths, before the flight: {"separation" [m], "time" [s], "agents" from 0,
-        "how"}. None if agents track no slots, or there is a single agent
+        "how"}. None if agents track no slots, there is a single agent, or a controller of the user's flew
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
@@ -105,6 +108,7 @@ class PhaseRecord:
     )
     abandoned: bool = False
     controller: bool | None = None
+    stay: Annotated[dict[str, Any] | None, Target] = None
 
     def __post_init__(self) -> None:
         self.extremes = {name: Extremum(*x) for name, x in (self.extremes or {}).items()}

@@ -352,10 +352,11 @@ class Flight:
             self.ending = str(stop)
             return False
         self._asked.append(phase)
+        # Nobody asks a controller of the user's to follow the plan.
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
             settled=None if phase.settle is None else False, target=plan.target,
-            planned=None if plan.certificate is None else plan.certificate._asdict(),
+            planned=plan.certificate._asdict() if self.controller is None and plan.certificate else None,
         )  # fmt: skip
         self.phases.append(record)
         return True
@@ -631,6 +632,8 @@ class Flight:
             record.target = {"time": came[-1]["time"], "through": came} if came else None
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
+        if not abandoned and (active.settled or active.over or active.t >= active.plan.arrival):
+            record.stay = active.plan.stay(active.t)
 
     def _check_frame(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.assessment import SHAPE_TOLERANCE
 from rigidfleet.assessment.fits import THIN
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.distance_geometry import dimension, distances
@@ -148,6 +147,7 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
         if formation is None:
             continue
         judged = shaping is not None or index == last
+        allowed = mission.formations[formation].greatest_error
         asked = mission.formation_distances(formation)
         wide = max_edge_error(r, mission.formation_edges(formation), asked)
         blending = (
@@ -156,7 +156,7 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
         if index == last and not blending and len(asked):
             metrics["constraint_end"] = wide
         if judged:
-            wrong["distances"] |= wide > SHAPE_TOLERANCE * asked.min(initial=math.inf)
+            wrong["distances"] |= wide > allowed(asked.min(initial=math.inf))
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
@@ -164,7 +164,7 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
         intended = distances(slots, pairs)
         metrics["shape_end"] = error = max_edge_error(r, pairs, intended)
         metrics["shape"] = np.fmax(metrics["shape"], error)
-        misshapen = error > SHAPE_TOLERANCE * intended.min()
+        misshapen = error > allowed(intended.min())
         mirrored = np.zeros(count, dtype=bool)
         if dimension(slots, THIN) == 3:
             x = r - r.mean(axis=1, keepdims=True)

@@ -48,10 +48,10 @@ METRICS: dict[str, Metric] = {
     ),
     "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored"),
     "flip": Metric("deg", "largest angle of a plane or line from its intended direction"),
-    "waypoint_position": Metric("m", "largest position error at a waypoint"),
-    "waypoint_velocity": Metric("m s-1", "largest velocity error at a waypoint"),
-    "waypoint_attitude": Metric("deg", "largest attitude error at a waypoint"),
-    "waypoint_rates": Metric("deg s-1", "largest error of body rates at a waypoint"),
+    "waypoint_position": Metric("m", "largest position error at a waypoint or stay"),
+    "waypoint_velocity": Metric("m s-1", "largest velocity error at a waypoint or stay"),
+    "waypoint_attitude": Metric("deg", "largest attitude error at a waypoint or stay"),
+    "waypoint_rates": Metric("deg s-1", "largest error of body rates at a waypoint or stay"),
     "separation": Metric("m", "minimum separation of two agents: centre distance minus radii"),
     "separation_below": Metric("m", "minimum height above another agent minus radii"),
     "clearance": Metric("m", "minimum clearance to an obstacle: distance minus radius"),
@@ -98,7 +98,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     }
     found |= _in_flight(result)
     for name in ("position", "velocity", "attitude", "rates"):
-        misses = (getattr(p.waypoint, name) for p in phases if p.waypoint is not None)
+        misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
         found[f"waypoint_{name}"] = _greatest(misses)
     checked = {f.check: f.worst for f in verdict.checks if f.worst is not None}
     worst = {name: extreme.value for name, extreme in verdict.worst.items()}
