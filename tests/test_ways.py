@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from rigidfleet import assess, check, simulate
+from rigidfleet._common.progress import watched_by
 from rigidfleet.errors import MissionError
 from rigidfleet.math import proximity
+from rigidfleet.math.attitude import dcm_from_rotation_vector
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.clearance import closest, greatest_speeds, pace
 from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.lattice import Space, proved
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import spelled_out, timed
 from rigidfleet.simulation.flight import Flight
@@ -331,3 +334,50 @@ def test_what_a_check_has_no_time_to_prove_is_told(monkeypatch):
     (said,) = [x for x in check(mission).remarks if "proved to" in x.text]
     assert said.level == "note"
     assert "'bird' is proved to" in said.text
+
+
+# -- the search itself -------------------------------------------------------------------------------
+
+
+def test_a_fence_is_compared_exactly():
+    """Motions beside a fence keep their room if a dense look at them says so, and take one look at obstacles."""
+    rng = np.random.default_rng(4)
+    fence = np.array([[-3.0, -2.0, 0.0], [3.0, 2.0, 4.0]])
+    looks = []
+
+    class Counting(Space):
+        def apart(self, r, radius, most):
+            looks.append(len(r))
+            return super().apart(r, radius, most)
+
+    space, radius, need = Counting([], fence), np.full(3, 0.1), 0.2
+    share = np.linspace(0.0, 1.0, 2001)
+    for turning in (False, True):
+        offsets, axis = rng.normal(size=(3, 3)), rng.normal(size=3)
+        ways = np.linalg.norm(axis) * np.linalg.norm(offsets, axis=1) * turning
+
+        def path(t, offsets=offsets, axis=axis, turning=turning):
+            return (
+                offsets @ dcm_from_rotation_vector(np.outer(t, axis)) if turning else offsets[None]
+            )
+
+        a = rng.uniform(-2.0, 2.0, (300, 3)) + [0.0, 0.0, 2.0]
+        b = a if turning else rng.uniform(-2.0, 2.0, (300, 3)) + [0.0, 0.0, 2.0]
+        a[:40, 2] = b[:40, 2] = fence[0, 2] + need - offsets[:, 2].min() + 1e-6  # along the floor
+        centres = a[:, None, None] + share[:, None, None] * (b - a)[:, None, None] + path(share)
+        room = np.minimum(centres - fence[0], fence[1] - centres).min(axis=(1, 2, 3))
+        looks.clear()
+        kept = proved(space, a, b, path, ways, radius, need)
+        assert 0 < kept.sum() < len(kept)
+        assert not (kept & (room < need)).any()
+        assert kept[room > need + float(ways.max()) / 4000].all()
+        assert len(looks) <= 1
+    assert kept[:40].any() or not (room[:40] > need).any()
+
+
+def test_a_search_says_what_it_looks_for(monkeypatch):
+    """Whoever watches hears the phase and the search, of a way and of automatic times."""
+    heard: list[str] = []
+    with watched_by(heard.append):
+        timed(load_mission("narrow-passage-found"))
+    assert any("looking for a way of '" in step and "round obstacles" in step for step in heard)

@@ -48,6 +48,7 @@ def check(
         Print the result as JSON.
     """
     from rigidfleet._common.files import write_file
+    from rigidfleet._common.progress import watched_by
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import ending, goal, load_mission
     from rigidfleet.mission.files import digests
@@ -59,7 +60,7 @@ def check(
         )
     watch = console.CheckWatch(mission)
     try:
-        with watch:
+        with watch, watched_by(watch.update):
             found = load_mission(mission)
             if expand is not None:
                 found = spelled_out(found)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,10 +53,26 @@ class Space(NamedTuple):
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
-        found, _ = proximity.obstacle_clearances(r, radius, self.obstacles, most=most)
+        found = self.apart(r, radius, most)
         if np.isfinite(self.fence).any():
             found = np.minimum(found, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
         return found
+
+    def apart(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
+        """The same from obstacles alone."""
+        return proximity.obstacle_clearances(r, radius, self.obstacles, most=most)[0]
+
+    def encloses(self, a: Floats, b: Floats, path: Path, ways: Floats, need: float) -> Bools:
+        """Whether the fence leaves the room ``need`` [m] to motions (E,), which are those of `proved`.
+
+        Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
+        spot is the same wherever it is: it is looked at once, as finely as halvings would.
+        """
+        parts = 2**_HALVINGS
+        offsets, off = path((np.arange(parts) + 0.5) / parts), ways[:, None] / (2.0 * parts)
+        low, high = (offsets.min(axis=0) - off).min(axis=0), (offsets.max(axis=0) + off).max(axis=0)
+        above = np.minimum(a, b) + low >= self.fence[0] + need
+        return (above & (np.maximum(a, b) + high <= self.fence[1] - need)).all(axis=1)
 
 
 class Layer(NamedTuple):
@@ -93,14 +109,15 @@ def proved(
 
     ``ways`` (M,) bounds what each ball flies relative to the centre of mass [m].
     """
-    found = np.ones(len(a), dtype=np.bool_)
+    found = space.encloses(a, b, path, ways, need)
     way = np.linalg.norm(b - a, axis=1)[:, None] + ways
-    who, low, length = np.arange(len(a)), np.zeros(len(a)), 1.0
+    who, length = np.flatnonzero(found), 1.0
+    low = np.zeros(len(who))
     for _ in range(_HALVINGS):
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
         wanted = need + way[who] * length / 2
-        room = space.room(place[:, None] + path(middle), radius, wanted)
+        room = space.apart(place[:, None] + path(middle), radius, wanted)
         found[who[(room < need).any(axis=1)]] = False
         open_ = found[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
@@ -212,15 +229,21 @@ class Network:
 
     def __init__(
         self, space: Space, layers: list[Layer], changes: list[Change], radius: Floats, need: float,
-        frames: list[Floats], common: list[list[Floats]],
+        frames: list[Floats], common: list[list[Floats]], known: dict[Any, Lattice],
     ) -> None:  # fmt: skip
-        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame."""
+        """Build the lattices; the parameters are those of `Lattice`, for each layer and frame.
+
+        ``known`` has the lattices of networks before, in the same space, and gets the new ones.
+        """
         self.space, self.layers, self.changes = space, layers, changes
         self.radius, self.need = radius, need
-        self.lattices = [
-            [Lattice(space, layer, radius, need, frame, even) for layer in layers]
-            for frame, even in zip(frames, common, strict=True)
-        ]
+        self.lattices = []
+        for f, (frame, even) in enumerate(zip(frames, common, strict=True)):
+            keys = [(f, layer.formation, layer.angles) for layer in layers]
+            for key, layer in zip(keys, layers, strict=True):
+                if key not in known:
+                    known[key] = Lattice(space, layer, radius, need, frame, even)
+            self.lattices.append([known[key] for key in keys])
         counts = [[len(x.points) for x in row] for row in self.lattices]
         starts = np.cumsum([0, *np.ravel(counts)])
         self.first = starts[:-1].reshape(len(frames), len(layers))

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from rigidfleet._common.progress import report
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
@@ -76,6 +77,7 @@ def timed(mission: Mission) -> Mission:
     tables = mission.to_dict()["phases"]
     now = at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 1]):
+        report(f"timing '{phase.name}'")
         explicit = with_times(mission, phase, now, k)
         if explicit is not phase:
             changed = explicit.model_dump(mode="json", include={*phase.automatic, "through"})

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.progress import report
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
@@ -62,6 +63,7 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
         parts = [table]
         if isinstance(phase, Reshape) and phase.transition == "ways":
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
+            report(f"looking for ways of the agents in '{phase.name}'")
             room = _room(mission.rewritten(so_far) if tables else mission, len(tables), timed)
             parts = [_bent(mission, k, table, phase, before, room)]
         elif isinstance(phase, Reshape) and phase.transition != "straight":

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.progress import report
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -22,7 +23,7 @@ from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import closest, pace
-from rigidfleet.planning.lattice import Layer, Network, Space, Way, staying
+from rigidfleet.planning.lattice import Lattice, Layer, Network, Space, Way, staying
 from rigidfleet.planning.preview import at_start, ending, leg, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.solids.records import extent
@@ -142,11 +143,15 @@ class _Search:
         best: tuple[Network, Way] | None = None
         straight = float(np.linalg.norm(self.end - self.begin))
         stages = sorted({s.stage for s in self.shapes})
+        known: dict[Any, Lattice] = {}
         for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
             if more and (best is not None or len(self.shapes) > _FEW):
                 break
             shapes = [s for s in self.shapes if s.stage <= stage]
-            network = self._network(shapes, need, more=more)
+            report(
+                f"looking for a way of '{self.phase.name}' round obstacles (shapes: {len(shapes)})"
+            )
+            network = self._network(shapes, need, known, more=more)
             way = network.shortest((self.begin, 0), (self.end, self._last))
             if way is not None and (best is None or way.cost < best[1].cost):
                 best = network, way
@@ -156,7 +161,9 @@ class _Search:
             raise self._none(network)
         return best[0], best[0].shortened(best[1])
 
-    def _network(self, shapes: list[layers.Shape], need: float, *, more: bool) -> Network:
+    def _network(
+        self, shapes: list[layers.Shape], need: float, known: dict[Any, Lattice], *, more: bool
+    ) -> Network:
         frames = layers.frames(self._near())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -195,7 +202,7 @@ class _Search:
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = staying(found[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
-        return Network(space, found, changes, self.radius, need, frames, common)
+        return Network(space, found, changes, self.radius, need, frames, common, known)
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
