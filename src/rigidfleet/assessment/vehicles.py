@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from rigidfleet._common.text import percent
 from rigidfleet.assessment.measure import Measurements, agent
 from rigidfleet.assessment.outcome import CheckResult, Extreme, value
 from rigidfleet.math import attitude as att
-from rigidfleet.result import LABELS, Extremum
+from rigidfleet.result import LABELS
 from rigidfleet.typing import Floats
 
 #: Share of a limit by which rounding may exceed it.
@@ -28,29 +29,16 @@ def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
     rotors = np.array([model.rotor_limit for model in models])
     if rotors.any():
         yield from _rotor_force(measured, rotors)
-        share = _worst(measured, "saturation", lambda x: x.value)
+        share = measured.worst("saturation", None)
         if share is not None:
             yield _saturation(share, limits.saturation)
         tilt = _tilt(measured)
         if tilt is not None:
             yield _checked("tilt", tilt, "deg", limits.tilt_deg, "tilts by")
-    error = _worst(measured, "tracking_error", lambda x: x.value)
-    sampled = measured.extreme(
-        measured.of_left(np.linalg.norm(result.position - result.slot_position, axis=2)),
-        agent,
-    )
-    error = max((e for e in (error, sampled) if e is not None), key=lambda e: e.value, default=None)
+    off = measured.of_left(np.linalg.norm(result.position - result.slot_position, axis=2))
+    error = measured.worst("tracking_error", measured.extreme(off, agent))
     if error is not None:
         yield _checked("tracking_error", error, "m", limits.tracking_error, "is off its slot by")
-
-
-def _worst(measured: Measurements, name: str, rank: Callable[[Extremum], float]) -> Extreme | None:
-    """The worst of the extremes that the phases have recorded."""
-    every = [(p, p.extremes[name]) for p in measured.result.phases if name in p.extremes]
-    if not every:
-        return None
-    phase, x = max(every, key=lambda pair: rank(pair[1]))
-    return Extreme(x.value, x.time, f"agent {x.who + 1}", phase.name)
 
 
 def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult]:
@@ -66,16 +54,8 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
     force = np.where(measured.left[..., None], result.rotor_force, 0.0)
     k, i, j = np.unravel_index(int((force / safe[:, None]).argmax()), force.shape)
     name = result.phases[result.phase[k]].name
-    found.append(
-        (
-            force[k, i, j] / safe[i],
-            float(force[k, i, j]),
-            float(result.time[k]),
-            int(i),
-            int(j),
-            name,
-        )
-    )
+    worst = float(force[k, i, j])
+    found.append((worst / safe[i], worst, float(result.time[k]), int(i), int(j), name))
     share, worst, when, i, j, phase = max(found)
     limit, who = float(limits[i]), f"agent {i + 1}"
     words = (
@@ -84,8 +64,8 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
     )
     passed = share <= 1.0 + _SLACK
     yield CheckResult(
-        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase
-    )
+        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase, at_samples=len(found) == 1
+    )  # fmt: skip
 
 
 def _saturation(e: Extreme, limit: float) -> CheckResult:
@@ -109,21 +89,17 @@ def _tilt(measured: Measurements) -> Extreme | None:
     result = measured.result
     assert result.vehicle_attitude is not None
     up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
-    sampled = measured.extreme(
-        measured.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))), agent
-    )
-    between = _worst(measured, "tilt", lambda x: x.value)
-    if between is not None:
-        between = Extreme(math.degrees(between.value), between.when, between.who, between.phase)
-    found = [e for e in (between, sampled) if e is not None]
-    return max(found, key=lambda e: e.value, default=None)
+    angle = measured.of_left(np.arccos(np.clip(up, -1.0, 1.0)))
+    e = measured.worst("tilt", measured.extreme(angle, agent))
+    return None if e is None else replace(e, value=math.degrees(e.value))
 
 
 def _checked(check: str, e: Extreme, unit: str, limit: float | None, deed: str) -> CheckResult:
     words = f"{e.who} {deed} up to {value(e.value, unit)} at {e.when:.2f} s"
     words += "" if limit is None else f" (limit {limit:g} {unit})"
+    words += ", at samples" * e.at_samples
     passed = limit is None or e.value <= limit * (1.0 + _SLACK)
     return CheckResult(
         check, passed, words, e.value, limit, unit, when=e.when, who=e.who, phase=e.phase,
-        judged=limit is not None,
+        judged=limit is not None, at_samples=e.at_samples,
     )  # fmt: skip

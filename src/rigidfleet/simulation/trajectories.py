@@ -8,7 +8,7 @@ degree: pieces of a higher one are cut so short that they are within a micrometr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -462,20 +462,28 @@ def _parts(c: Floats, h: Floats) -> list[int]:
         parts[wide] *= 2
 
 
+#: Sizes (...) of vectors (..., 3) by the name of the greatest acceleration.
+_SIZES: dict[str, Callable[[Floats], Floats]] = {
+    "acceleration": lambda x: np.linalg.norm(x, axis=-1),
+    "horizontal_acceleration": lambda x: np.hypot(x[..., 0], x[..., 1]),
+    "vertical_acceleration": lambda x: np.abs(x[..., 2]),
+}
+
+
 def _accelerations(
     best: dict[str, Extremum], c: Floats, t: Floats, h: Floats, n: int, *, smooth: bool
 ) -> None:
-    """Take the greatest acceleration of some pieces into account; straight lines have none."""
+    """Take the greatest accelerations of some pieces into account; straight lines have none."""
     if not smooth or c.shape[-1] < 3:
         return
     power = np.arange(2, c.shape[-1])
     a = (c[..., 2:] * (power * (power - 1))).reshape(len(c) * n, 3, -1)
     points = bernstein(a, np.repeat(h, n))
-    found = greatest(points, lambda x: np.linalg.norm(x, axis=-1))
-    known = best.get("acceleration")
-    if known is None or found.value > known.value:
-        k, i = divmod(found.curve, n)
-        best["acceleration"] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)
+    for name, size in _SIZES.items():
+        found, known = greatest(points, size), best.get(name)
+        if known is None or found.value > known.value:
+            k, i = divmod(found.curve, n)
+            best[name] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)
 
 
 def _result(
