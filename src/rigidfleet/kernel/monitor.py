@@ -56,6 +56,7 @@ from rigidfleet.kernel.records import (
     TENSION,
     THRUST,
     THRUST_MARGIN,
+    VERTICAL_ACCELERATION,
     VERTICAL_SPEED,
 )
 from rigidfleet.kernel.rigid_body import inertia_inverse
@@ -506,9 +507,10 @@ def judge_forces(values, t, p, monitor):
             take(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
             take(ACCELERATION, -values[n + i], t, i, -1, monitor)
             take(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
-            for c in range(3 * n + 2 * m + i, values.shape[0], n):
-                kind = HORIZONTAL_ACCELERATION + (c - 3 * n - 2 * m) // n
-                take(kind, -abs(values[c]), t, i, -1, monitor)
+            if values.shape[0] > 3 * n + 2 * m:
+                across, up = values[3 * n + 2 * m + i], values[4 * n + 2 * m + i]
+                take(HORIZONTAL_ACCELERATION, -across, t, i, -1, monitor)
+                take(VERTICAL_ACCELERATION, -abs(up), t, i, -1, monitor)
     for k in range(m):
         pull, c = values[3 * n + k], values[3 * n + m + k]
         if -abs(pull) < monitor.worst[TENSION]:
