@@ -203,8 +203,7 @@ def test_what_is_known_at_samples_alone_is_marked_in_table_json_and_report(tmp_p
     rows = {row.quantity: row.worst for row in safety(old, verdict) if row.worst is not None}
     assert rows["horizontal speed"].at_samples
     assert not rows["speed"].at_samples
-    rf.report(old, tmp_path / "report.html")
-    assert "horizontal acceleration, at samples" in (tmp_path / "report.html").read_text()
+    assert "horizontal acceleration, at samples" in html_page([old])
 
 
 def test_every_limit_that_fails_a_flight_is_a_metric_of_a_sweep():
@@ -267,11 +266,18 @@ def test_the_obstacle_that_is_hit_first_is_named(obstacles, what, when, tmp_path
     first = next(c for c in verdict.to_dict()["checks"] if c["check"] == "clearance")["first"]
     assert (first["who"], first["when"]) == (check.first.who, check.first.when)
     assert f"first agent 1, {what}" in words_of(verdict)
-    assert f"hits &#39;{what}&#39;" in html_page([result])
-    assert f"agent 1 first hits {what}" in rf.replay(result).html
     result.save(tmp_path / "a.nc")
     assert checks(rf.assess(tmp_path / "a.nc"))["clearance"].first == check.first
     json.loads(verdict.json())
+
+
+def test_report_and_replay_name_the_first_contact():
+    """Both pages name the sill, which is hit before the ground."""
+    result = straight([GROUND, SILL])
+    page = html_page([result])
+    assert "agent 1 hits &#39;sill&#39;, first at 1.38 s" in page
+    assert "first agent 1, sill" in page
+    assert "agent 1 first hits sill" in rf.replay(result).html
 
 
 def test_the_pair_that_collides_first_is_named():

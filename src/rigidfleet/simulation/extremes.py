@@ -64,6 +64,8 @@ _NAMES = {
     "constraint": records.CONSTRAINT,
     **dict(zip(DIRECTIONS, range(records.HORIZONTAL_SPEED, records.QUANTITIES), strict=True)),
 }
+#: What a monitor writes beside the worst values.
+_WRITTEN = "when", "who", "standing", "low", "flags"
 #: First contacts of a flight by name, each with the quantity that then falls below zero.
 _CONTACTS = {f"{name}_first": _NAMES[name] for name in ("separation", "lost", "clearance")}
 #: Extremes of a sampled flight by its column, the monitor's quantity, and its sign there.
@@ -118,8 +120,7 @@ class Extremes:
         self.directed = any(getattr(limits, name) is not None for name in DIRECTIONS)
         count = records.QUANTITIES
         self.none = np.full(count, np.inf)
-        if not self.directed:
-            self.none[[_NAMES[name] for name in DIRECTIONS]] = -np.inf
+        self.none[records.HORIZONTAL_SPEED :] = np.inf if self.directed else -np.inf
         self.worst, self.when = self.none.copy(), np.zeros(count)
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
@@ -266,8 +267,7 @@ class Extremes:
         flags, steps = self.monitor.monitor.flags, int(state.count[4])
         new = range(int(flags[3]), steps)
         listed = int(flags[records.LISTED])
-        due = new if listed == records.ANY_STEP else self.monitor.monitor.listed[0, :listed]
-        rows = _rows(state, due)
+        rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
         self._take_solids(problem, state, new, self.monitor)
         flags[:3] = flags[3], steps, 2 if last else 1
         if self.n > _FEW:
@@ -344,27 +344,18 @@ class Extremes:
                 self.touched[name] = found
 
     def _deepest(
-        self,
-        kind: int,
-        problem: Problem,
-        work: Workspace,
-        state: Any,
-        clock: Floats,
-        points: Floats,
+        self, kind: int, problem: Problem, work: Workspace, state: Any, *steps: Floats
     ) -> Extremum | None:
         """The deepest contact of a kind in steps (S, 2), (S, 5, n) of an integrator; None if there is none."""
-        trail = state.trail._replace(clock=clock, points=points)
+        trail = records.Trail(*steps, *state.trail[2:])
         state = state._replace(trail=trail, count=np.zeros_like(state.count))
         found = self.monitor.monitor
-        own = {
-            name: getattr(found, name).copy()
-            for name in ("when", "who", "standing", "low", "flags")
-        }
-        own["flags"][:] = 0, len(clock), 0, 0, records.ANY_STEP, records.ANY_STEP
+        own = {name: getattr(found, name).copy() for name in _WRITTEN}
+        own["flags"][:] = 0, len(steps[0]), 0, 0, records.ANY_STEP, records.ANY_STEP
         worst = np.full_like(self.worst, -np.inf)  # nothing else is searched for
         worst[kind] = -_TOUCH
         watch = native.Watch(found._replace(worst=worst, **own))
-        self._take_solids(problem, state, range(len(clock)), watch)
+        self._take_solids(problem, state, range(len(steps[0])), watch)
         watch(problem, work, state)
         if not worst[kind] < -_TOUCH:
             return None
