@@ -452,7 +452,7 @@ def test_a_lost_vehicle_falls_and_rests():
     np.testing.assert_allclose(state.S[0, 3:6], 0, atol=1e-4)
     np.testing.assert_allclose(state.S[0, 10:], 0, atol=1e-6)
     np.testing.assert_allclose(state.S[1, :3], [3, 0, 5], rtol=0, atol=1e-10)
-    assert (state.worst[0] == [1, 0, 0, 0, 0]).all()
+    assert (state.worst[0] == [1, 0, 0, 0, 0, 0, 0]).all()
 
 
 def test_a_singular_law_ends_the_flight():

@@ -173,7 +173,7 @@ def call(p, y, dy, t):
 def kernel(p: Problem, y: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
     """Derivative and gauge by the compiled kernel of single flights."""
     n, m = len(p.vehicles.m), len(p.graph.edges)
-    w, dy, values = workspace(n, m, solver=p.law.solver), np.empty_like(y), np.empty(3 * n + 2 * m)
+    w, dy, values = workspace(n, m, solver=p.law.solver), np.empty_like(y), np.empty(5 * n + 2 * m)
     native.closed_loop(t, y, dy, p, w)
     read_gauge(p, w, values)
     return dy, values

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from operator import itemgetter
 
 import numpy as np
@@ -23,7 +24,7 @@ from rigidfleet.assessment.outcome import (
 )
 from rigidfleet.assessment.vehicles import tracking_check, vehicle_checks
 from rigidfleet.assessment.verdict import Verdict
-from rigidfleet.result import PAD, Result
+from rigidfleet.result import DIRECTIONS, PAD, Result
 from rigidfleet.typing import Floats
 
 # Excess over a limit that counts as rounding.
@@ -70,10 +71,10 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     acceleration = worst.get("acceleration")
     if acceleration is not None or limits.acceleration is not None:
         yield _moving("acceleration", acceleration, "m/s^2", limits.acceleration)
-    for name, (order, size) in _DIRECTIONS.items():
+    for name in DIRECTIONS:
         if (limit := getattr(limits, name)) is not None:
-            unit = "m/s" if order == 1 else "m/s^2"
-            yield _moving(name, measured.greatest(order, size), unit, limit)
+            unit = "m/s" if name.endswith("speed") else "m/s^2"
+            yield _moving(name, measured.directed(name), unit, limit)
     yield from _corners(measured)
     yield from _thrust(measured, worst.get("thrust"))
     yield from vehicle_checks(measured)
@@ -270,6 +271,7 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         k = measured.samples[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
         who = np.flatnonzero(measured.left[k] & (measured.close.each[k] <= PAD))
+        who = who[measured.standing(np.full(len(who), k), who).any(axis=0)]
         if not len(who):
             yield _at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
@@ -295,8 +297,9 @@ def _bounded(
     *,
     passed: bool | None = None,
     at_least: bool = False,
+    first: Extreme | None = None,
 ) -> CheckResult:
-    """Compare a worst value with its limit, if it has one."""
+    """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
     if e is None:
         words = words or f"the flight has no {check.replace('_', ' ')} to judge"
         return CheckResult(
@@ -308,20 +311,14 @@ def _bounded(
         bound = "" if limit is None else f" (limit {limit:g} {unit})"
         extreme = "smallest" if check == "singular_value" else "greatest"
         words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
+    if e.at_samples:
+        words += ", at samples"
     if passed is None:
         passed = limit is None or e.value <= limit + _SLACK * max(1.0, abs(limit))
     return CheckResult(
-        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None
+        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None,
+        e.at_samples, first,
     )  # fmt: skip
-
-
-#: Limits of a direction: the derivative, and what of it counts.
-_DIRECTIONS: dict[str, tuple[int, Callable[[Floats], Floats]]] = {
-    "horizontal_speed": (1, lambda x: np.hypot(x[..., 0], x[..., 1])),
-    "vertical_speed": (1, lambda x: np.abs(x[..., 2])),
-    "horizontal_acceleration": (2, lambda x: np.hypot(x[..., 0], x[..., 1])),
-    "vertical_acceleration": (2, lambda x: np.abs(x[..., 2])),
-}
 
 
 def _moving(check: str, e: Extreme | None, unit: str, limit: float | None) -> CheckResult:
@@ -360,11 +357,14 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     passed = e.value > 0 and e.value >= limit - _SLACK
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
+    first = None
     if e.value <= 0:
-        since = _since(measured, "separation", measured.close.separation)
+        first = measured.first_contact("separation") or e
         depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
-        words = f"agents collide, first {since}; {e.who} overlap the most, {depth}"
-    return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True)
+        words = (
+            f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most, {depth}"
+        )
+    return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
 
 
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
@@ -387,16 +387,6 @@ def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[
         )  # fmt: skip
 
 
-def _since(measured: Measurements, name: str, sampled: Floats) -> str:
-    """When a quantity first fell to zero, as far as the samples and the worst value of each phase show."""
-    phases = range(len(measured.result.phases))
-    times = [
-        e.when for k in phases if (e := measured.between(name, k)) is not None and e.value <= 0
-    ]
-    first = measured.first(sampled <= 0)
-    return f"by {min(times):.2f} s" if times and min(times) < first else f"at {first:.2f} s"
-
-
 def _clearances(measured: Measurements) -> Iterator[CheckResult]:
     """Check the clearance in flight, and separately that of vehicles that stand on an obstacle at start or end."""
     found = {name: e for name, e in measured.clearances().items() if e is not None}
@@ -407,14 +397,18 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
         e = found.pop("clearance_flight", None)
     if e is not None:
         agent, obstacle = e.who.split(", ", 1)
-        words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
+        words, first = (
+            f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s",
+            None,
+        )
         if hit or e.value <= 0:
-            since = _since(measured, "clearance", measured.close.clearance)
+            first = measured.first_contact("clearance") or e
+            who, what = first.who.split(", ", 1)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
-            words = (
-                f"agents hit obstacles, first {since}; {agent} is deepest in '{obstacle}', {depth}"
-            )
-        yield _bounded("clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+            words = f"{who} hits '{what}', first at {first.when:.2f} s; {agent} is deepest in '{obstacle}', {depth}"
+        yield _bounded(
+            "clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first
+        )
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
         if name in found and not hit:
             e = found[name]
@@ -433,10 +427,12 @@ def _lost(measured: Measurements) -> CheckResult:
     if e is None:
         return _bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
     words = f"lost: {told}; after that, {e.who} come within {value(e.value, 'm')} of each other"
-    if e.value <= 0:
-        words = f"lost: {told}; after that, {e.who} collide"
     words += f" at {e.when:.2f} s"
-    return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True)
+    first = None
+    if e.value <= 0:
+        first = measured.first_contact("lost") or e
+        words = f"lost: {told}; after that, {first.who} collide, first at {first.when:.2f} s"
+    return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first)
 
 
 def abandoned(measured: Measurements) -> Iterator[CheckResult]:
@@ -497,5 +493,5 @@ def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
     if e.value - limit(e.who) < beyond.value:
         yield _bounded("thrust_peak", e, "N", None)
         most = limit(beyond.who)
-        e = Extreme(beyond.value + most, beyond.when, beyond.who, beyond.phase)
+        e = replace(beyond, value=beyond.value + most)
     yield _bounded("thrust", e, "N", limit(e.who))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -15,9 +16,7 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
 from rigidfleet.assessment.outcome import SENSE, Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity, splines
-from rigidfleet.math.bernstein import bernstein
-from rigidfleet.math.bernstein import greatest as extreme_of
+from rigidfleet.math import proximity
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -33,13 +32,8 @@ _OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
 _OF_EDGES = frozenset(("tension", "constraint"))
 
 
-#: About so many curves are compared together.
-_TOGETHER = 100_000
 #: The first sample.
 _START = np.zeros(1, dtype=np.int64)
-#: Times between two samples that are very short [s]: of a flight, of curves that are given; and as a share of the
-#: longest.
-_SHORT, _INSTANT, _SHARE = 1e-3, 1e-6, 0.05
 
 #: Numbers from which on a product is shared out over threads.
 _PRODUCT = 10_000
@@ -104,6 +98,8 @@ class Measurements:
         self.samples = [slice(*pair) for pair in pairwise(ends.tolist())]
         #: Phases that have samples.
         self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
+        #: Quantities of which the record tells what happens between samples.
+        self.told = {name for p in result.phases for name in p.extremes}
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         #: Distances to each other and to obstacles at samples.
         self.close = proximity.closeness(
@@ -171,8 +167,13 @@ class Measurements:
         rank = np.ascontiguousarray(sense(values))
         return self.worst_sample(Quantity(values, who, rank, _START), slice(0, len(values)))
 
-    def worst_sample(self, quantity: Quantity, samples: slice) -> Extreme | None:
-        """The worst value of a quantity among some samples; None if none is finite."""
+    def worst_sample(
+        self, quantity: Quantity, samples: slice, *, alone: bool = False
+    ) -> Extreme | None:
+        """The worst value of a quantity among some samples; None if none is finite.
+
+        ``alone``: nothing is known between them.
+        """
         rank, values, result = quantity.rank[samples], quantity.values, self.result
         if not rank.size:
             return None
@@ -182,7 +183,7 @@ class Measurements:
         k += samples.start
         at = (k,) if values.ndim == 1 else (k, place)
         phase = result.phases[result.phase.item(k)].name
-        return Extreme(values.item(at), result.time.item(k), quantity.who(*at), phase)
+        return Extreme(values.item(at), result.time.item(k), quantity.who(*at), phase, alone)
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -194,7 +195,7 @@ class Measurements:
 
     def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
-        if name in _OF_PAIRS:
+        if name.removesuffix("_first") in _OF_PAIRS:
             who = agent_names(sorted((x.who, x.other)))
         elif name in _OF_EDGES:
             who = f"edge {x.who + 1}-{x.other + 1}"
@@ -214,8 +215,10 @@ class Measurements:
             if name in p.extremes
         }
         between = self.between(name, max(every, key=every.__getitem__)) if every else None
-        if sampled is None or between is None:
-            return sampled or between
+        if between is None:
+            return None if sampled is None else replace(sampled, at_samples=True)
+        if sampled is None:
+            return between
         return between if sense(between.value) > sense(sampled.value) else sampled
 
     @cached_property
@@ -229,44 +232,27 @@ class Measurements:
                 if x is not None and rank < sense(x.value):
                     worst = self.recorded(name, x, phase.name)
                 elif rank != -math.inf:
-                    worst = self.worst_sample(quantity, self.samples[k])
+                    alone = name not in self.told
+                    worst = self.worst_sample(quantity, self.samples[k], alone=alone)
                 if worst is not None:
                     found[k][name] = worst
         return found
 
-    def greatest(self, order: int, size: Callable[[Floats], Floats]) -> Extreme | None:
-        """Greatest convex ``size`` of velocities (order 1) or accelerations (2) between samples; None if unknown.
+    def directed(self, name: str) -> Extreme | None:
+        """Greatest speed or acceleration in a direction, named as in `DIRECTIONS`; None if unknown."""
+        way, what = name.split("_")
+        x = getattr(self.result, what.replace("speed", "velocity"))
+        size = abs(x[..., 2]) if way == "vertical" else np.hypot(x[..., 0], x[..., 1])
+        return self.worst(name, self.extreme(self.of_left(size), agent))
 
-        Of a trajectory that others made, it is that of its curves. Of a flight, it is that of the polynomials of degree
-        7 through position, velocity, acceleration and jerk of its samples.
-        """
-        result = self.result
-        motion = result.motion(flown=result.interpolation is None)
-        time, state = motion.time, np.where(self.left[:, None, :, None], motion.state, np.nan)
-        state = state.swapaxes(0, 1)  # (4, K, N, 3)
-        apart = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
-        # A polynomial over a very short time shows the rounding of its ends, which those beside it have, too.
-        h = time[apart + 1] - time[apart]
-        most = _INSTANT if result.interpolation else _SHORT
-        apart = apart[h > np.minimum(most, _SHARE * h.max(initial=0.0))]
-        n, worst, at = result.n_agents, None, (0.0, 0)
-        for k in np.array_split(apart, 1 + len(apart) * n // _TOGETHER):
-            h = time[k + 1] - time[k]
-            pieces = splines.hermite(h, *(state[:, k + i] for i in (0, 1)))
-            power = np.arange(pieces.shape[-1])
-            factor = power if order == 1 else power * (power - 1)
-            points = bernstein(
-                (pieces * factor)[..., order:].reshape(len(k) * n, 3, -1), np.repeat(h, n)
-            )
-            known = np.flatnonzero(np.isfinite(points).all(axis=(1, 2)))
-            found = extreme_of(points[known], size)
-            if found.curve >= 0 and (worst is None or found.value > worst):
-                i, who = divmod(int(known[found.curve]), n)
-                worst, at = found.value, (float(time[k[i]] + found.place * h[i]), who)
-        if worst is None:
-            return None
-        index = int(result.phase[np.searchsorted(time, at[0], side="right") - 1])
-        return Extreme(worst, at[0], agent(0, at[1]), result.phases[index].name)
+    def first_contact(self, name: str) -> Extreme | None:
+        """The first contact of agents ("separation") or with an obstacle ("clearance"); None if it is unknown."""
+        every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
+        if every:
+            return self.between(f"{name}_first", every[0])
+        quantity = self.measured[name]
+        k = int(np.argmax(quantity.values <= 0.0))
+        return self.worst_sample(quantity, slice(k, k + 1), alone=True)
 
     def below(self) -> Extreme | None:
         """Least height [m] between two agents, one below the other."""
@@ -299,24 +285,27 @@ class Measurements:
     def clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
 
-        A vehicle stands on an obstacle while it has been within `PAD` of it since the start, or stays so to the end.
+        A vehicle stands on an obstacle below it while it has been within `PAD` of it since the start, or stays so to
+        the end.
         """
         time = self.result.time
         clearance, nearest = self.of_left(self.close.each), self.close.nearest
-        told = {name for p in self.result.phases for name in p.extremes}
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
-        if not (stands or told & {"clearance_start", "clearance_end"}):
+        if not (stands or self.told & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst_clearance()}
-        off = clearance > PAD
+        off, beside = clearance > PAD, np.zeros(clearance.shape, dtype=np.bool_)
+        near = np.nonzero(clearance <= PAD)
+        below = self.standing(*near)
+        off[near], beside[near] = ~below.any(axis=0), ~below[nearest[near], np.arange(len(near[0]))]
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
         last = np.where(self.left[-1], last, len(time))  # lost vehicles do not land
         k = np.arange(len(time))[:, None]
         parts = {
-            "clearance_start": k < first,
-            "clearance_flight": (k >= first) & (k <= last),
-            "clearance_end": (k >= first) & (k > last),
+            "clearance_start": (k < first) & ~beside,
+            "clearance_flight": (k >= first) & (k <= last) | beside,
+            "clearance_end": (k >= first) & (k > last) & ~beside,
         }
         found = {}
         for name, part in parts.items():
@@ -326,6 +315,11 @@ class Measurements:
             )
             found[name] = self.worst(name, sampled, lambda x: -x)
         return found
+
+    def standing(self, k: Ints, i: Ints) -> Bools:
+        """On which obstacles (B, M) agents i (M,) stand, or may stand if they stay, at samples k (M,)."""
+        r, things = self.result.position[k, i], self.mission.obstacles
+        return proximity.below(r, self.mission.fleet.radius[i], things, self.result.time[k], PAD)
 
     def worst_clearance(self) -> Extreme | None:
         """Least clearance to an obstacle [m] of all vehicles, standing ones included."""

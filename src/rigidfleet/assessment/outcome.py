@@ -34,12 +34,13 @@ SENSE: dict[str, Callable[..., Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Extreme:
-    """Worst value of a quantity: how much, when [s], who, and in which phase."""
+    """Worst value of a quantity: how much, when [s], who, and in which phase; whether it is known at samples alone."""
 
     value: float
     when: float
     who: str
     phase: str
+    at_samples: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,8 @@ class CheckResult:
     who : agents, edge or obstacle
     phase : name of the phase
     judged : whether the check could fail; False for a value that is only reported
+    at_samples : whether the worst is that of the samples, because nothing is known between them
+    first : of things that touch, the first contact, where it is known
     """
 
     check: str
@@ -70,6 +73,13 @@ class CheckResult:
     who: str = ""
     phase: str = ""
     judged: bool = True
+    at_samples: bool = False
+    first: Extreme | None = None
+
+    @property
+    def name(self) -> str:
+        """What was checked, in words, marked if it is known at samples alone."""
+        return self.check.replace("_", " ") + (", at samples" if self.at_samples else "")
 
     def fill(self, words: str) -> str:
         """Words with {worst}, {limit} and {who} put in."""

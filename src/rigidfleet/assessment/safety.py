@@ -9,7 +9,7 @@ import numpy as np
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import CheckResult, Extreme
 from rigidfleet.assessment.verdict import Verdict
-from rigidfleet.result import Result
+from rigidfleet.result import DIRECTIONS, Result
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +96,10 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
 
 def _directions(found: dict[str, CheckResult]) -> list[Safety]:
     """Rows of the speeds and accelerations over the ground, and up and down, that are limited."""
+    rows = [(name.replace("_", " "), found[name]) for name in DIRECTIONS if name in found]
     return [
-        _row(f"{way} {what}", f"greatest {way} {what} of a vehicle", found[f"{way}_{what}"], unit)
-        for what, unit in (("speed", "m/s"), ("acceleration", "m/s²"))
-        for way in ("horizontal", "vertical")
-        if f"{way}_{what}" in found
+        _row(words, f"greatest {words} of a vehicle", f, f.unit.replace("^2", "²"))
+        for words, f in rows
     ]
 
 
@@ -116,7 +115,7 @@ def _row(
     if finding is None:
         return Safety(quantity, text, unit, at_least, None, worst, True)
     if finding.worst is not None and finding.when is not None:
-        worst = Extreme(finding.worst, finding.when, finding.who, finding.phase)
+        worst = Extreme(finding.worst, finding.when, finding.who, finding.phase, finding.at_samples)
     limit = finding.limit if finding.limit is not None and np.isfinite(finding.limit) else None
     return Safety(quantity, text, unit, at_least, limit, worst, finding.passed)
 

@@ -67,9 +67,10 @@ def _table(
 def check_row(f: CheckResult) -> list[str | Text]:
     """A check as a row: name, worst, limit, when, who or where, and whether it holds."""
     mark = Text("ok", "green") if f.passed else Text("FAILED", "bold red")
-    when = "" if f.when is None else f"{f.when:.2f}"
-    name, who = f.check.replace("_", " "), f.who or f.phase
-    return [name, _number(f.worst, f.unit), _bound(f), when, who, mark if f.judged else ""]
+    first = f.first  # what failed first is what the reader needs
+    at, who = (f.when, f.who or f.phase) if first is None else (first.when, f"first {first.who}")
+    when = "" if at is None else f"{at:.2f}"
+    return [f.name, _number(f.worst, f.unit), _bound(f), when, who, mark if f.judged else ""]
 
 
 def _bound(f: CheckResult) -> str:

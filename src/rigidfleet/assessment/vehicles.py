@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -41,8 +42,7 @@ def tracking_check(measured: Measurements) -> Iterator[CheckResult]:
     limit = measured.mission.limits.tracking_error
     error = measured.worst("tracking_error", measured.extreme(measured.off_slot, agent))
     if error is not None:
-        at = "is, at samples," if measured.mission.vehicle_models is None else "is"
-        yield _checked("tracking_error", error, "m", limit, f"{at} off its slot by")
+        yield _checked("tracking_error", error, "m", limit, "is off its slot by")
     elif limit is not None:
         yield CheckResult("tracking_error", True, "no slots are tracked", None, limit, "m")
 
@@ -60,16 +60,8 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
     force = np.where(measured.left[..., None], result.rotor_force, 0.0)
     k, i, j = np.unravel_index(int((force / safe[:, None]).argmax()), force.shape)
     name = result.phases[result.phase[k]].name
-    found.append(
-        (
-            force[k, i, j] / safe[i],
-            float(force[k, i, j]),
-            float(result.time[k]),
-            int(i),
-            int(j),
-            name,
-        )
-    )
+    worst = float(force[k, i, j])
+    found.append((worst / safe[i], worst, float(result.time[k]), int(i), int(j), name))
     share, worst, when, i, j, phase = max(found)
     limit, who = float(limits[i]), f"agent {i + 1}"
     words = (
@@ -78,8 +70,8 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
     )
     passed = share <= 1.0 + _SLACK
     yield CheckResult(
-        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase
-    )
+        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase, at_samples=len(found) == 1
+    )  # fmt: skip
 
 
 def _saturation(e: Extreme, limit: float) -> CheckResult:
@@ -103,21 +95,17 @@ def _tilt(measured: Measurements) -> Extreme | None:
     result = measured.result
     assert result.vehicle_attitude is not None
     up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
-    sampled = measured.extreme(
-        measured.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))), agent
-    )
-    between = measured.worst("tilt", None)
-    if between is not None:
-        between = Extreme(math.degrees(between.value), between.when, between.who, between.phase)
-    found = [e for e in (between, sampled) if e is not None]
-    return max(found, key=lambda e: e.value, default=None)
+    angle = measured.of_left(np.arccos(np.clip(up, -1.0, 1.0)))
+    e = measured.worst("tilt", measured.extreme(angle, agent))
+    return None if e is None else replace(e, value=math.degrees(e.value))
 
 
 def _checked(check: str, e: Extreme, unit: str, limit: float | None, deed: str) -> CheckResult:
     words = f"{e.who} {deed} up to {value(e.value, unit)} at {e.when:.2f} s"
     words += "" if limit is None else f" (limit {limit:g} {unit})"
+    words += ", at samples" * e.at_samples
     passed = limit is None or e.value <= limit * (1.0 + _SLACK)
     return CheckResult(
         check, passed, words, e.value, limit, unit, when=e.when, who=e.who, phase=e.phase,
-        judged=limit is not None,
+        judged=limit is not None, at_samples=e.at_samples,
     )  # fmt: skip

@@ -118,6 +118,18 @@ def length_at(points, x):
 
 
 @compiled
+def point_at(curve, x):
+    """Point of a curve with control points (5, 3) at x."""
+    y = 1.0 - x
+    a, b, c, d, e = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
+    return (
+        a * curve[0, 0] + b * curve[1, 0] + c * curve[2, 0] + d * curve[3, 0] + e * curve[4, 0],
+        a * curve[0, 1] + b * curve[1, 1] + c * curve[2, 1] + d * curve[3, 1] + e * curve[4, 1],
+        a * curve[0, 2] + b * curve[1, 2] + c * curve[2, 2] + d * curve[3, 2] + e * curve[4, 2],
+    )
+
+
+@compiled
 def shortest(curve, floor, work, pieces):
     """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
 

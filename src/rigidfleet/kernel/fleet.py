@@ -24,8 +24,8 @@ FORCE, ATTITUDE, ROTORS = range(3)
 #: written, steps in the trail.
 STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
-#: [N] and constraint force [N].
-UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE = range(5)
+#: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
+UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
 #: A tick that no flight reaches (`Tables.last`).
 ENDLESS = 1 << 62
 
@@ -253,8 +253,8 @@ class SampledState(NamedTuple):
     heard: Floats  # (N, N, 6) what i knows of j, if linked; else without rows
     peak: Floats  # (N, 4) greatest thrust of each rotor [N]
     peak_time: Floats  # (N, 4) [s]
-    worst: Floats  # (N, 5) see `UPRIGHT`
-    worst_time: Floats  # (N, 5) [s]
+    worst: Floats  # (N, 7) see `UPRIGHT`
+    worst_time: Floats  # (N, 7) [s]
     saturations: Ints  # (N,) number of ticks saturated
     trail: Trail  # of r and v, (S, 5, 6 N)
     work: "SampledWork"
@@ -427,9 +427,9 @@ def begin(
     attitude = _frame(frame)
     curves = given.vehicles.thrust.T[:, :, None]
     peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
-    worst = np.zeros((n, 5))
+    worst = np.zeros((n, VERTICAL + 1))
     worst[:, UPRIGHT] = 1.0 - 2.0 * (S[:, 7:9] ** 2).sum(axis=1)
-    times = np.full((n, 5), given.start)
+    times = np.full(worst.shape, given.start)
     trail = NO_TRAIL
     if rows:
         none = np.zeros(0)

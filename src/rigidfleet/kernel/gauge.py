@@ -8,10 +8,14 @@ from rigidfleet.kernel.constraint import find_multipliers
 
 @compiled
 def read_gauge(p, w, values):
-    """Thrust, acceleration and constraint force of each agent; tension and constraint of each edge; into (3N + 2m,)."""
+    """Thrust, acceleration and constraint force of each agent; tension and constraint of each edge; into (3N + 2m,).
+
+    If there is room for (5N + 2m,), also the horizontal and the vertical acceleration of each agent.
+    """
     vehicles, edges = p.vehicles, p.graph.edges
     n, m = vehicles.m.shape[0], edges.shape[0]
     noisy = p.disturbance.noise_r.shape[0] > 0
+    directed = 3 * n + 2 * m
     find_multipliers(p.graph)
     for i in range(n):
         thrust, a, f = 0.0, 0.0, 0.0
@@ -24,6 +28,9 @@ def read_gauge(p, w, values):
         if vehicles.saturate:
             thrust = min(thrust, vehicles.thrust_limit[i])
         values[i], values[n + i], values[2 * n + i] = thrust, math.sqrt(a), math.sqrt(f)
+        if values.shape[0] > directed:
+            x, y = w.a[i, 0], w.a[i, 1]
+            values[directed + i], values[directed + n + i] = math.sqrt(x * x + y * y), w.a[i, 2]
     for k in range(m):
         values[3 * n + k] = -w.multiplier[k]
         c = w.c[k]

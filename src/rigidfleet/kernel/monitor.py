@@ -25,6 +25,7 @@ from rigidfleet.kernel.bernstein import (
     lowest,
     lowest_overlap,
     nearest_box,
+    point_at,
     shortest,
     square,
     weights,
@@ -42,6 +43,8 @@ from rigidfleet.kernel.records import (
     FROM_KNOTS,
     GEOFENCE,
     HIGHEST,
+    HORIZONTAL_ACCELERATION,
+    HORIZONTAL_SPEED,
     KNOTS,
     LISTED,
     LOST,
@@ -53,8 +56,11 @@ from rigidfleet.kernel.records import (
     TENSION,
     THRUST,
     THRUST_MARGIN,
+    VERTICAL_ACCELERATION,
+    VERTICAL_SPEED,
 )
 from rigidfleet.kernel.rigid_body import inertia_inverse
+from rigidfleet.solids.distance import STEEP
 
 #: Relative accuracy of a greatest force, direct and iterated.
 _CLOSE_FORCE, _CLOSE_ITERATED = 1e-7, 1e-6
@@ -321,20 +327,43 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
 
 
 @compiled
+def watch_speed(kind, curve, low, high, t, h, i, monitor):
+    """Greatest length of the coordinates from ``low`` to before ``high`` of a velocity over a curve (5, 3)."""
+    fastest, piece = 0.0, monitor.pieces[0]
+    for k in range(5):
+        size = 0.0
+        for q in range(low, high):
+            size += curve[k, q] * curve[k, q]
+        fastest = max(fastest, size)
+    greatest = -monitor.worst[kind]  # -inf at first
+    if fastest <= greatest * abs(greatest):
+        return
+    for k in range(5):
+        for q in range(3):
+            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
+    square(piece, -1.0, monitor.work[0])
+    _, at = lowest(monitor.work, 8, -greatest * abs(greatest))
+    if at >= 0.0:
+        take(kind, -length_at(piece, at), t + at * h, i, -1, monitor)
+
+
+@compiled
 def clearance_of_interest(i, monitor):
     """Clearance of agent i from which on it is worse than what is stored."""
-    own = min(monitor.low[i, 0], monitor.worst[FLYING])
+    own = monitor.worst[FLYING]
     if monitor.standing[i] != 0:
-        own = monitor.worst[STANDING]
+        own = max(own, monitor.worst[STANDING])
     return max(own, monitor.worst[CLEARANCE])
 
 
 @compiled
-def take_clearance(value, t, i, b, monitor):
-    """Store the clearance of agent i to obstacle b; of one that may be landing, until it leaves."""
+def take_clearance(value, t, i, b, above, monitor):
+    """Store the clearance of agent i to obstacle b; of one ``above`` it, which may be landing, until it leaves."""
     low = monitor.low
     take(CLEARANCE, value, t, i, b, monitor)
-    if monitor.standing[i] != 0:
+    if not above:
+        take(FLYING, value, t, i, b, monitor)
+    elif monitor.standing[i] != 0:
         take(STANDING, value, t, i, b, monitor)
     elif value < low[i, 0]:
         low[i, 0], low[i, 1], low[i, 2] = value, t, float(b)
@@ -342,7 +371,7 @@ def take_clearance(value, t, i, b, monitor):
 
 @compiled
 def leave(i, monitor):
-    """Agent i is away from all obstacles: it no longer stands on one, and was not landing."""
+    """Agent i is away from all obstacles below it: it no longer stands on one, and was not landing."""
     low = monitor.low
     if monitor.standing[i] != 0:
         monitor.standing[i] = 0
@@ -355,8 +384,9 @@ def leave(i, monitor):
 def watch_obstacles(i, curve, t, h, last, monitor):
     """Clearance of agent i's surface to obstacles over a piece of a step; ``last`` is the clearance at its end.
 
-    An agent that has been within ``pad`` of an obstacle since the start stands on it. A flying agent that comes this
-    near may be landing; its clearance is stored separately until it moves away again.
+    An agent that has been within ``pad`` of an obstacle below it since the start stands on it. A flying agent that
+    comes this near may be landing; its clearance is stored separately until it moves away again. An obstacle is below
+    where its outward normal points up by `STEEP` or more: nobody stands on the wall beside.
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
     low, normal = monitor.low, monitor.scratch[2]
@@ -370,12 +400,14 @@ def watch_obstacles(i, curve, t, h, last, monitor):
             continue
         value, at = nearest_box(curve, box, floor, monitor.pieces, normal)
         if at >= 0.0:
-            take_clearance(value - radius, t + at * h, i, b, monitor)
+            u, v, w = point_at(curve, at)
+            from_box(u, v, w, box, normal)
+            take_clearance(value - radius, t + at * h, i, b, normal[2] >= STEEP, monitor)
     if not last or not (standing or low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
         end = from_box(curve[4, 0], curve[4, 1], curve[4, 2], monitor.boxes[b], normal)
-        if end - radius <= monitor.pad:
+        if end - radius <= monitor.pad and normal[2] >= STEEP:
             return
     leave(i, monitor)
 
@@ -401,7 +433,8 @@ def unremarkable(points, i, angle, p, monitor):
         least, most = min(least, points[k, q + 2]), max(most, points[k, q + 2])
         x, y, z = points[k, q + 3], points[k, q + 4], points[k, q + 5]
         carried = max(carried, x * x + y * y + z * z)
-    room = -worst[SPEED] - math.sqrt(carried) - CLOSE
+    slowest = max(worst[SPEED], worst[HORIZONTAL_SPEED], worst[VERTICAL_SPEED])
+    room = -slowest - math.sqrt(carried) - CLOSE
     off = angle * math.sqrt(far) + CLOSE
     return (
         room > 0.0 and fast <= room * room
@@ -439,23 +472,10 @@ def watch_distances(row, p, state, monitor):
                 continue
             curve = monitor.curve
             in_world(points, i, 1, p, monitor, curve)
-            fastest = 0.0
-            for k in range(5):
-                size = 0.0
-                for q in range(3):
-                    size += curve[k, q] * curve[k, q]
-                fastest = max(fastest, size)
-            greatest = -monitor.worst[SPEED]  # -inf at first
-            if not fastest <= greatest * abs(greatest):
-                piece = monitor.pieces[0]
-                for k in range(5):
-                    for q in range(3):
-                        piece[3 * k + q] = curve[k, q]
-                square(piece, -1.0, monitor.work[0])
-                floor = -greatest * abs(greatest)
-                _, at = lowest(monitor.work, 8, floor)
-                if at >= 0.0:
-                    take(SPEED, -length_at(piece, at), start + at * h, i, -1, monitor)
+            watch_speed(SPEED, curve, 0, 3, start, h, i, monitor)
+            if monitor.worst[HORIZONTAL_SPEED] > -math.inf:
+                watch_speed(HORIZONTAL_SPEED, curve, 0, 2, start, h, i, monitor)
+                watch_speed(VERTICAL_SPEED, curve, 2, 3, start, h, i, monitor)
             curve = monitor.places[i]
             in_world(points, i, 0, p, monitor, curve)
             put(curve, monitor.balls[i])
@@ -477,7 +497,7 @@ def watch_distances(row, p, state, monitor):
 
 @compiled
 def judge_forces(values, t, p, monitor):
-    """Take the forces of a gauge (3N + 2m,) at time t [s] into account."""
+    """Take the forces of a gauge (3N + 2m or 5N + 2m,) at time t [s] into account."""
     n, edges = p.vehicles.m.shape[0], p.graph.edges
     m = edges.shape[0]
     for i in range(n):
@@ -487,6 +507,10 @@ def judge_forces(values, t, p, monitor):
             take(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
             take(ACCELERATION, -values[n + i], t, i, -1, monitor)
             take(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
+            if values.shape[0] > 3 * n + 2 * m:
+                across, up = values[3 * n + 2 * m + i], values[4 * n + 2 * m + i]
+                take(HORIZONTAL_ACCELERATION, -across, t, i, -1, monitor)
+                take(VERTICAL_ACCELERATION, -abs(up), t, i, -1, monitor)
     for k in range(m):
         pull, c = values[3 * n + k], values[3 * n + m + k]
         if -abs(pull) < monitor.worst[TENSION]:
@@ -499,7 +523,8 @@ def judge_forces(values, t, p, monitor):
 def worst_of(c, p, monitor):
     """The greatest value so far of the quantity of entry c of a gauge."""
     n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
-    if c < 3 * n and not monitor.left[c % n]:
+    of_agent = c if c < 3 * n else c - 3 * n - 2 * m  # negative of an edge
+    if of_agent >= 0 and not monitor.left[of_agent % n]:
         return math.inf
     if c < n:
         limit = p.vehicles.thrust_limit[c]
@@ -509,6 +534,8 @@ def worst_of(c, p, monitor):
         return -monitor.worst[ACCELERATION]
     if c < 3 * n:
         return -monitor.worst[CONSTRAINT_FORCE]
+    if of_agent >= 0:
+        return -monitor.worst[HORIZONTAL_ACCELERATION + of_agent // n]
     return -monitor.worst[TENSION if c < 3 * n + m else CONSTRAINT]
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.bernstein import CLOSE, refine
+from rigidfleet.kernel.bernstein import CLOSE, point_at, refine
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.monitor import (
@@ -29,6 +29,7 @@ from rigidfleet.kernel.records import Monitor
 from rigidfleet.solids.distance import (
     displacement,
     from_box,
+    is_below,
     is_there,
     off_triangle,
     outward_normal,
@@ -166,18 +167,6 @@ def nearest_heights(curve, b, floor, pieces, s):
 
 
 @compiled
-def point_at(curve, x):
-    """Point of a curve with control points (5, 3) at x."""
-    y = 1.0 - x
-    a, b, c, d, e = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
-    return (
-        a * curve[0, 0] + b * curve[1, 0] + c * curve[2, 0] + d * curve[3, 0] + e * curve[4, 0],
-        a * curve[0, 1] + b * curve[1, 1] + c * curve[2, 1] + d * curve[3, 1] + e * curve[4, 1],
-        a * curve[0, 2] + b * curve[1, 2] + c * curve[2, 2] + d * curve[3, 2] + e * curve[4, 2],
-    )
-
-
-@compiled
 def cut(curve, start, end, work, out):
     """Control points (5, 3) of the part of a curve between two places, by its blossom."""
     for k in range(5):
@@ -242,8 +231,10 @@ def watch_solid(i, b, curve, t, h, s, monitor):
             else:
                 value, at = nearest_along(own, b, -1, floor, monitor.pieces, s)
             if at >= 0.0:
-                when = t + (start + at * (end - start)) * h
-                take_clearance(value - radius, when, i, b, monitor)
+                share = start + at * (end - start)
+                x, y, z = point_at(curve, share)
+                above = is_below(x, y, z, b, s)
+                take_clearance(value - radius, t + share * h, i, b, above, monitor)
         start = end
 
 
@@ -257,15 +248,18 @@ def far_from(x, y, z, b, s):
 
 @compiled
 def watch_landing(i, curve, t, s, monitor):
-    """At the end (time t) of a step, tell whether agent i has left all obstacles."""
+    """At the end (time t) of a step, tell whether agent i has left all obstacles below it."""
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
     for b in range(s.kind.shape[0]):
         if not is_there(t, b, s):
             continue
-        x, y, z = into_own_axes(curve[4, 0], curve[4, 1], curve[4, 2], t, b, s)
+        u, v, w = curve[4, 0], curve[4, 1], curve[4, 2]
+        x, y, z = into_own_axes(u, v, w, t, b, s)
         near = monitor.radius[i] + monitor.pad
-        if far_from(x, y, z, b, s) <= near and signed_distance(x, y, z, b, s) <= near:
+        if far_from(x, y, z, b, s) > near or signed_distance(x, y, z, b, s) > near:
+            continue
+        if is_below(u, v, w, b, s):
             return
     leave(i, monitor)
 

@@ -27,10 +27,13 @@ STATE, TRIAL, ATOL = 7, 8, 9
 #: Logarithm of the least value of the last error; also used if there is no last error.
 LEAST_ERROR = math.log(1e-4)
 #: Quantities of a `Monitor`. A smaller value of `worst` is worse; greatest values are stored with the opposite sign.
+#: One whose value is -infinity is not searched for.
 (
     SEPARATION, LOST, SEPARATION_BELOW, CLEARANCE, STANDING, FLYING, GEOFENCE, LOWEST, HIGHEST, SPEED, THRUST,
-    THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT,
-) = range(16)  # fmt: skip
+    THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT, HORIZONTAL_SPEED, VERTICAL_SPEED,
+    HORIZONTAL_ACCELERATION, VERTICAL_ACCELERATION,
+) = range(20)  # fmt: skip
+QUANTITIES = VERTICAL_ACCELERATION + 1
 #: Place among a monitor's flags of the numbers of steps to search, and the number that stands for all of them.
 LISTED, ANY_STEP = 4, -1
 #: Approximate size of a trail in bytes; the integrator pauses when it is full.
@@ -60,15 +63,14 @@ class Trail(NamedTuple):
 
     clock: Annotated[Floats, Extents((None, 2))]  # start [s], length [s]
     points: Annotated[Floats, Extents((None, 5, None))]  # (S, 5, n)
-    gauge: Floats  # (S, 3N + 2m) at the end, see `gauge.read_gauge`
-    start: Floats  # (3N + 2m,) at the start of the first step, after a jump
+    gauge: Floats  # (S, 3N + 2m or 5N + 2m) at the end, see `gauge.read_gauge`
+    start: Floats  # (3N + 2m or 5N + 2m,) at the start of the first step, after a jump
 
 
-def trail(states: int, agents: int, edges: int) -> Trail:
-    """Allocate a trail of a megabyte, or of three steps."""
-    row = 5 * states + 3 * agents + 2 * edges
-    rows = max(3, _TRAIL // (8 * row))
-    gauge = 3 * agents + 2 * edges
+def trail(states: int, agents: int, edges: int, directed: bool) -> Trail:
+    """Allocate a trail of a megabyte, or of three steps; ``directed``: with accelerations by direction."""
+    gauge = (5 if directed else 3) * agents + 2 * edges
+    rows = max(3, _TRAIL // (8 * (5 * states + gauge)))
     shapes = (rows, 2), (rows, 5, states), (rows, gauge), (gauge,)
     return Trail(*(np.empty(shape) for shape in shapes))
 
@@ -80,9 +82,9 @@ NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zer
 class Monitor(NamedTuple):
     """Worst values of a phase in continuous time, with the data and work arrays of the search; see `kernel.monitor`."""
 
-    worst: Floats  # (16,) by quantity; infinity if there is none yet
-    when: Floats  # (16,) [s]
-    who: Ints  # (16, 2) agents; agent and obstacle; agents of an edge; -1: none
+    worst: Floats  # (20,) by quantity; infinity if there is none yet
+    when: Floats  # (20,) [s]
+    who: Ints  # (20, 2) agents; agent and obstacle; agents of an edge; -1: none
     sign: Floats  # (1,) of the greatest tension
     radius: PerAgent  # [m]
     left: Annotated[Bools, Extents(("N",))]  # whether an agent is monitored: not lost
@@ -104,8 +106,8 @@ class Monitor(NamedTuple):
     record: int
     time: Floats  # (1,) [s]
     states: Floats  # (1, n)
-    gauge: Floats  # (2, 3N + 2m) forces before the first step, and in the middle of one
-    nodes: Floats  # (27, 3N + 2m) forces at points of two steps
+    gauge: Floats  # (2, 3N + 2m or more) forces before the first step, and in the middle of one
+    nodes: Floats  # (27, 3N + 2m or more) forces at points of two steps
     instants: Floats  # (27,) times of these points [s]
     rank: Ints  # (27,) their order in time
     # control points of the agents' positions over a step, world axes, if pairs or obstacles need them [m]
@@ -126,7 +128,7 @@ def monitor(
 ) -> Monitor:
     """A new monitor without values; pairs are listed only if ``given`` among the fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
-    count = CONSTRAINT + 1
+    count = QUANTITIES
     fields: dict[str, Any] = {
         "worst": np.full(count, np.inf), "when": np.zeros(count), "sign": np.zeros(1),
         "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,

@@ -17,6 +17,7 @@ from rigidfleet.kernel.fleet import (
     CONSTRAINT_FORCE,
     ERROR,
     FORCE,
+    HORIZONTAL,
     LAWS,
     LOAD,
     SAMPLES,
@@ -24,6 +25,7 @@ from rigidfleet.kernel.fleet import (
     TICKS,
     TRAILED,
     UPRIGHT,
+    VERTICAL,
     speed_of,
     thrust_of,
 )
@@ -374,8 +376,10 @@ def take_extremes(i, t, h, vehicles, state):
     """
     own = slice(17 * i, 17 * i + 17)
     rate, end = state.work.y[2, own], state.work.y[6, own]
-    a = math.sqrt(rate[3] ** 2 + rate[4] ** 2 + rate[5] ** 2)
-    worse(i, ACCELERATION, a, t, state)
+    across = rate[3] ** 2 + rate[4] ** 2
+    worse(i, ACCELERATION, math.sqrt(across + rate[5] ** 2), t, state)
+    worse(i, HORIZONTAL, math.sqrt(across), t, state)
+    worse(i, VERTICAL, abs(rate[5]), t, state)
     command, load = state.command[i], 0.0
     if vehicles.point[i]:
         load = math.sqrt(command[0] ** 2 + command[1] ** 2 + command[2] ** 2)

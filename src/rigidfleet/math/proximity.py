@@ -339,6 +339,22 @@ def obstacle_clearances(
     return least.T, nearest.T
 
 
+def below(
+    r: Floats, radius: Floats, obstacles: Sequence[Obstacle], time: Floats, reach: float
+) -> Bools:
+    """Which obstacles (B, M) are below spheres at r (M, 3), with radius (M,), and within ``reach`` [m] of them.
+
+    At times (M,) [s]. On these a vehicle may stand: on ground, roof or terrain, not on a wall beside or on what moves.
+    """
+    found = np.zeros((len(obstacles), len(r)), dtype=np.bool_)
+    for b, thing in enumerate(obstacles):
+        near = np.flatnonzero(distances(*r.T, thing.solid, time) <= radius + reach)
+        for first in range(0, len(near), _TOGETHER):
+            some = near[first : first + _TOGETHER]
+            found[b, some] = distance.is_below(*r[some].T, 0, thing.solid)
+    return found
+
+
 def _approach(
     least: Floats,
     nearest: Ints,

@@ -18,6 +18,7 @@ from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.assessment.outcome import value
+from rigidfleet.assessment.table import check_row
 from rigidfleet.mission import ending, goal
 from rigidfleet.plotting.quadrotors import (
     has_rotors,
@@ -168,15 +169,9 @@ def _models(mission: Mission) -> str:
 
 
 def _check(finding: Any) -> dict[str, Any]:
-    sign = "≤" if not finding.at_least else "≥" if finding.limit else ">"
-    return {
-        "name": finding.check.replace("_", " "),
-        "worst": "" if finding.worst is None else value(finding.worst, finding.unit),
-        "limit": "" if finding.limit is None else f"{sign} {value(finding.limit, finding.unit)}",
-        "when": "" if finding.when is None else f"{finding.when:.2f}",
-        "who": finding.who or finding.phase,
-        "state": "failed" if not finding.passed else "ok" if finding.judged else "",
-    }
+    row = [str(x).replace("<=", "≤").replace(">=", "≥") for x in check_row(finding)]
+    state = "failed" if not finding.passed else "ok" if finding.judged else ""
+    return dict(zip(("name", "worst", "limit", "when", "who"), row, strict=False), state=state)
 
 
 def _phases(result: Result, verdict: Verdict) -> list[dict[str, str]]:
@@ -303,7 +298,9 @@ def _safety_cell(row: Safety | None) -> dict[str, Any]:
         "nothing": nothing.get(row.quantity, "nothing to measure") if row.worst is None else "",
         "left": left,
         "used": None if used is None else min(max(used, 0.0), 1.0),
-        "when": "" if row.worst is None else f"{row.worst.when:.2f} s",
+        "when": ""
+        if row.worst is None
+        else f"{row.worst.when:.2f} s" + ", at samples" * row.worst.at_samples,
         "who": "" if row.worst is None else row.worst.who,
         "phase": "" if row.worst is None else row.worst.phase,
     }

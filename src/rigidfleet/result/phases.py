@@ -42,8 +42,12 @@ class Planned(_Moment):
     how: str
 
 
-#: A vehicle that stays within this distance of an obstacle from the start, or until the end, stands on it [m].
+#: A vehicle that stays within this distance of an obstacle below it from the start, or until the end, stands on it [m].
 PAD = 0.1
+#: Quantities of a direction, named as their limits.
+DIRECTIONS = tuple(
+    f"{way}_{what}" for what in ("speed", "acceleration") for way in ("horizontal", "vertical")
+)
 
 
 class Extremum(NamedTuple):
@@ -80,8 +84,9 @@ class PhaseRecord:
         "how"}. None if agents track no slots, there is a single agent, or a controller of the user's flew
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
         (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
-        speed [m/s]; acceleration [m/s^2]; thrust, thrust_margin (thrust minus its limit), constraint_force, tension
-        [N]; constraint [m]; of vehicles also rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
+        speed [m/s]; acceleration [m/s^2]; where there is a limit by direction, `DIRECTIONS`; thrust, thrust_margin
+        (thrust minus its limit), constraint_force, tension [N]; constraint [m]; of vehicles also rotor_force [N] (of
+        the rotor nearest to its limit), tilt [rad],
         tracking_error [m] and saturation (share of the phase). With [avoidance] also barrier and guard (greatest share
         of the phase in which they acted on a vehicle, and since when), clock (by how much the phase ended later because
         the formation waited [s], and since when) and body (share of the phase in which the formation deviated from its
@@ -89,8 +94,8 @@ class PhaseRecord:
         of stop segments [m]) and, where it was negative, the first such: guarantee_lost, clearance_guarantee_lost. If
         vehicles stand on obstacles, clearance is also given for those that have stood on one since the start
         (clearance_start), for those in flight (clearance_flight), and for those that stand on one until the end
-        (clearance_end). Empty if only samples are
-        known
+        (clearance_end). The first contacts of the flight, in the phase in which they are: separation_first, lost_first,
+        clearance_first. Empty if only samples are known
     controller : whether a user's controller was called; None if the flight had none
     """
 

@@ -13,6 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidfleet._common.kept import kept
 from rigidfleet.kernel import avoidance, fleet, records
@@ -21,7 +22,7 @@ from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, Obstacle
-from rigidfleet.result import PAD, Extremum, PhaseRecord
+from rigidfleet.result import DIRECTIONS, PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -34,8 +35,8 @@ _FEW = 40
 _SPARE = 0.5
 #: Least such distance, as a share of the fleet's size over the root of its number; agents may be at the same place.
 _LEAST = 0.1
-#: Overlap with an obstacle from which on it is a contact [m].
-_TOUCH = 1e-6
+#: Overlap from which on it is a contact [m], and the time within which the first one is found [s].
+_TOUCH, _INSTANT = 1e-6, 1e-6
 #: Shortest piece of a step, as a share of the step.
 _SHORTEST = 2.0**-20
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
@@ -43,7 +44,7 @@ _ASKED = 2000
 #: Quantities that the monitor stores with the opposite sign.
 _GREATEST = frozenset(
     ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
-     "constraint")
+     "constraint", *DIRECTIONS)
 )  # fmt: skip
 #: Quantities by name; the clearances at the start and the end belong to the whole flight.
 _NAMES = {
@@ -61,12 +62,19 @@ _NAMES = {
     "constraint_force": records.CONSTRAINT_FORCE,
     "tension": records.TENSION,
     "constraint": records.CONSTRAINT,
+    **dict(zip(DIRECTIONS, range(records.HORIZONTAL_SPEED, records.QUANTITIES), strict=True)),
 }
+#: What a monitor writes beside the worst values.
+_WRITTEN = "when", "who", "standing", "low", "flags"
+#: First contacts of a flight by name, each with the quantity that then falls below zero.
+_CONTACTS = {f"{name}_first": _NAMES[name] for name in ("separation", "lost", "clearance")}
 #: Extremes of a sampled flight by its column, the monitor's quantity, and its sign there.
 _SAMPLED = (
     (fleet.ACCELERATION, records.ACCELERATION, -1.0),
     (fleet.LOAD, records.THRUST, -1.0),
     (fleet.CONSTRAINT_FORCE, records.CONSTRAINT_FORCE, -1.0),
+    (fleet.HORIZONTAL, records.HORIZONTAL_ACCELERATION, -1.0),
+    (fleet.VERTICAL, records.VERTICAL_ACCELERATION, -1.0),
 )
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 #: The quantities of a phase, each with its name, its index, and the sign with which it is stored.
@@ -74,8 +82,8 @@ _STORED = [(name, k, -1.0 if name in _GREATEST else 1.0) for name, k in _NAMES.i
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
-#: Size of an integrator: states, states in its trail, agents, edges.
-_Size = tuple[int, int, int, int]
+#: Size of an integrator: states, states in its trail, agents, edges, whether accelerations by direction are kept.
+_Size = tuple[int, int, int, int, bool]
 #: Integrators that no flight uses, by size, because their trails are large; how many of each.
 _idle: dict[_Size, list[records.IntegratorState]] = {}
 _KEPT = 8
@@ -90,8 +98,8 @@ def _idle_integrator(size: _Size) -> records.IntegratorState | None:
 
 def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...]) -> Ints:
     """Whether agents stand on obstacles at the start (N,)."""
-    start, _ = proximity.obstacle_clearances(position, radius, obstacles)
-    return (start <= PAD).astype(np.int64)
+    below = proximity.below(position, radius, obstacles, np.zeros(len(radius)), PAD)
+    return np.any(below, axis=0).astype(np.int64)
 
 
 _standing_kept = kept(_standing)
@@ -108,8 +116,12 @@ class Extremes:
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
-        count = records.CONSTRAINT + 1
-        self.worst, self.when = np.full(count, np.inf), np.zeros(count)
+        #: Whether there are limits by direction: only then is what they limit searched for.
+        self.directed = any(getattr(limits, name) is not None for name in DIRECTIONS)
+        count = records.QUANTITIES
+        self.none = np.full(count, np.inf)
+        self.none[records.HORIZONTAL_SPEED :] = np.inf if self.directed else -np.inf
+        self.worst, self.when = self.none.copy(), np.zeros(count)
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
@@ -127,6 +139,7 @@ class Extremes:
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
+        self.touched: dict[str, Extremum] = {}  # first contacts of the flight
         self._list_all()
 
     def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
@@ -157,12 +170,12 @@ class Extremes:
 
     def restart(self) -> None:
         """Forget the flight that was monitored."""
-        self.worst.fill(np.inf)
+        self.worst[:] = self.none
         self.low.fill(np.inf)
         self.when.fill(0.0)
         self.who.fill(-1)
         self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance, self.led = {}, None, {}
+        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
         if self.size is not None:
             flags = self.monitor.monitor.flags
             flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
@@ -183,7 +196,7 @@ class Extremes:
         ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
         thread.
         """
-        size = len(y), states or len(y), self.n, edges
+        size = len(y), states or len(y), self.n, edges, self.directed
         known = size == self.size
         if not known:
             self.let_go()
@@ -253,7 +266,9 @@ class Extremes:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         flags, steps = self.monitor.monitor.flags, int(state.count[4])
         new = range(int(flags[3]), steps)
-        self._take_solids(problem, state, new)
+        listed = int(flags[records.LISTED])
+        rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
+        self._take_solids(problem, state, new, self.monitor)
         flags[:3] = flags[3], steps, 2 if last else 1
         if self.n > _FEW:
             for step in new:
@@ -261,6 +276,7 @@ class Extremes:
             flags = self.monitor.monitor.flags
             flags[:3] = steps, steps, 2 if last else 1
         self.monitor(problem, work, state)
+        self._find_contacts(problem, work, state, rows)
 
     def room(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
@@ -297,25 +313,67 @@ class Extremes:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
         steps, flags = int(state.count[4]), self.monitor.monitor.flags
-        self._take_solids(problem, state, range(steps))
+        self._take_solids(problem, state, range(steps), self.monitor)
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
             return
         flags[:3] = 0, steps, 0
         self.monitor(problem, work, state)
+        self._find_contacts(problem, work, state, _rows(state, range(steps)))
 
-    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: range) -> None:
+    def _find_contacts(
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, rows: Ints
+    ) -> None:
+        """Find the first contact of each kind in some rows (S,) of the trail, if there has been none before.
+
+        Of steps, and then of one step's halves, the first half is searched, until what is left is very short.
+        """
+        for name, kind in _CONTACTS.items():
+            if name in self.touched or not self.worst[kind] < -_TOUCH:
+                continue
+            clock, points = state.trail.clock[rows], state.trail.points[rows]
+            while clock[-1].sum() - clock[0, 0] > _INSTANT:
+                if len(clock) == 1:
+                    clock, points = _halves(*clock[0], points[0])
+                half = len(clock) // 2
+                first = self._deepest(kind, problem, work, state, clock[:half], points[:half])
+                part = slice(half) if first is not None else slice(half, None)
+                clock, points = clock[part], points[part]
+            if (found := self._deepest(kind, problem, work, state, clock, points)) is not None:
+                self.touched[name] = found
+
+    def _deepest(
+        self, kind: int, problem: Problem, work: Workspace, state: Any, *steps: Floats
+    ) -> Extremum | None:
+        """The deepest contact of a kind in steps (S, 2), (S, 5, n) of an integrator; None if there is none."""
+        trail = records.Trail(*steps, *state.trail[2:])
+        state = state._replace(trail=trail, count=np.zeros_like(state.count))
+        found = self.monitor.monitor
+        own = {name: getattr(found, name).copy() for name in _WRITTEN}
+        own["flags"][:] = 0, len(steps[0]), 0, 0, records.ANY_STEP, records.ANY_STEP
+        worst = np.full_like(self.worst, -np.inf)  # nothing else is searched for
+        worst[kind] = -_TOUCH
+        watch = native.Watch(found._replace(worst=worst, **own))
+        self._take_solids(problem, state, range(len(steps[0])), watch)
+        watch(problem, work, state)
+        if not worst[kind] < -_TOUCH:
+            return None
+        return Extremum(float(worst[kind]), float(own["when"][kind]), *map(int, own["who"][kind]))
+
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, steps: range, watch: native.Watch
+    ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is None:
             return
         from rigidfleet.kernel import obstacles  # loads the compiler
 
         trail, body = state.trail, bool(problem.body_formulation)
+        rows = _rows(state, steps).tolist()
         laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
-        watched = obstacles.monitor_of(self.monitor.monitor)
-        for step in steps:
-            row = _row(state, step)
+        watched = obstacles.monitor_of(watch.monitor)
+        for row in rows:
             obstacles.watch(trail.points[row], trail.clock[row], laid, self.solids, watched)
 
     def take_vehicles(
@@ -404,17 +462,17 @@ class Extremes:
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         found = self.so_far()
-        self.worst[_OF_PHASE] = np.inf
+        self.worst[_OF_PHASE] = self.none[_OF_PHASE]
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
-        """Give the phases of a finished flight its clearance in flight, and that of vehicles on an obstacle."""
-        if self.solids is None and not len(self.boxes):
-            return
-        found = {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
-        found["clearance_end"] = self._landing()
+        """Give the phases of a finished flight its first contacts, and its clearances in flight and on an obstacle."""
+        found: dict[str, Extremum | None] = dict(self.touched)
+        if self.solids is not None or len(self.boxes):
+            found |= {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
+            found["clearance_end"] = self._landing()
         for name, x in found.items():
             if x is not None:
                 last = [p for p in phases if p.t_start <= x.time] or phases
@@ -449,7 +507,7 @@ class Extremes:
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
     ) -> None:
         """Monitor the distances of one step, in pieces so short that only the listed pairs matter."""
-        row = _row(state, step)
+        (row,) = _rows(state, (step,))
         (start, length), whole = state.trail.clock[row], state.trail.points[row]
         gauge, none = state.trail.gauge[:0], state.trail.start
         pieces: list[tuple[float, float, Floats]] = [(start, length, whole)]
@@ -467,17 +525,14 @@ class Extremes:
                 self._list(problem, points[0], 0.0)
             if moved.max() > self.spare:
                 if h > _SHORTEST * length:
-                    halves = (
-                        records.FROM_KNOTS @ (records.bernstein((records.KNOTS + k) / 2.0) @ points)
-                        for k in (0, 1)
-                    )
-                    first, second = map(np.ascontiguousarray, halves)
-                    pieces += [(t + 0.5 * h, 0.5 * h, second), (t, 0.5 * h, first)]
+                    clock, halves = _halves(t, h, points)
+                    pieces += [(*clock[k], halves[k]) for k in (1, 0)]
                     continue
                 self._list(problem, points[0], float(moved.max()))
             self.moved += moved
             self.monitor.monitor.flags[:3] = 0, 1, 0
             self.monitor(problem, work, piece)
+            self._find_contacts(problem, work, piece, np.zeros(1, dtype=np.int64))
 
     def _list(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).
@@ -531,6 +586,13 @@ def _all_pairs(n: int) -> Ints:
     return np.stack(np.triu_indices(n, 1), axis=1)
 
 
-def _row(state: records.IntegratorState, step: int) -> int:
-    """Row of the trail that holds one of the steps in it, which are numbered from 0."""
-    return int(state.count[5] + step) % len(state.trail.clock)
+def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
+    """Starts and lengths (2, 2) [s], and control points (2, 5, n), of both halves of a step with points (5, n)."""
+    knots = (records.KNOTS + [[0.0], [1.0]]) / 2.0
+    clock = np.array([[t, 0.5 * h], [t + 0.5 * h, 0.5 * h]])
+    return clock, records.FROM_KNOTS @ (records.bernstein(knots) @ points)
+
+
+def _rows(state: records.IntegratorState, steps: ArrayLike) -> Ints:
+    """Rows (S,) of the trail that hold some of the steps in it (S,), which are numbered from 0."""
+    return (state.count[5] + np.asarray(steps)) % len(state.trail.clock)

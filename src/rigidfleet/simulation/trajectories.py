@@ -8,7 +8,7 @@ degree: pieces of a higher one are cut so short that they are within a micrometr
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -311,7 +311,7 @@ def of_pieces(
     time, state, yaw = _samples(pieces, first, last)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     smooth = pieces.position.shape[-1] > 2  # lines turn at once at samples
-    _put_extremes(record, mission, pieces, smooth=smooth)
+    _put_extremes(record, mission, pieces)
     if not smooth:
         state[2:] = np.nan
     return _result(mission, record, time, state, yaw, interpolation, names)
@@ -403,7 +403,7 @@ def _samples(pieces: Pieces, first: Floats, last: Floats) -> tuple[Floats, Float
     return time, state, pieces.yaw[k]
 
 
-def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces, *, smooth: bool) -> None:
+def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces) -> None:
     """Give the phase the extremes of the curves, in continuous time."""
     n = mission.n_agents
     extremes = Extremes(mission)
@@ -434,7 +434,7 @@ def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces, *, smoo
                 if row == len(trail.clock):
                     _take(extremes, problem, work, state, row)
                     row = 0
-        _accelerations(best, c, t, h, n, smooth=smooth)
+        _accelerations(best, c, t, h, directed=extremes.directed)
     _take(extremes, problem, work, state, row)
     record.extremes.update(extremes.phase())
     extremes.flight([record])
@@ -462,20 +462,29 @@ def _parts(c: Floats, h: Floats) -> list[int]:
         parts[wide] *= 2
 
 
+#: Sizes (...) of vectors (..., 3) by the name of the greatest acceleration.
+_SIZES: dict[str, Callable[[Floats], Floats]] = {
+    "acceleration": lambda x: np.linalg.norm(x, axis=-1),
+    "horizontal_acceleration": lambda x: np.hypot(x[..., 0], x[..., 1]),
+    "vertical_acceleration": lambda x: np.abs(x[..., 2]),
+}
+
+
 def _accelerations(
-    best: dict[str, Extremum], c: Floats, t: Floats, h: Floats, n: int, *, smooth: bool
+    best: dict[str, Extremum], c: Floats, t: Floats, h: Floats, *, directed: bool
 ) -> None:
-    """Take the greatest acceleration of some pieces into account; straight lines have none."""
-    if not smooth or c.shape[-1] < 3:
+    """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
+    if c.shape[-1] < 3:
         return
+    n = c.shape[1]
     power = np.arange(2, c.shape[-1])
     a = (c[..., 2:] * (power * (power - 1))).reshape(len(c) * n, 3, -1)
     points = bernstein(a, np.repeat(h, n))
-    found = greatest(points, lambda x: np.linalg.norm(x, axis=-1))
-    known = best.get("acceleration")
-    if known is None or found.value > known.value:
-        k, i = divmod(found.curve, n)
-        best["acceleration"] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)
+    for name, size in list(_SIZES.items())[: None if directed else 1]:
+        found, known = greatest(points, size), best.get(name)
+        if known is None or found.value > known.value:
+            k, i = divmod(found.curve, n)
+            best[name] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)
 
 
 def _result(

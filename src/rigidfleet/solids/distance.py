@@ -311,6 +311,23 @@ def own_axes(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     )
 
 
+#: Distance by which a point is lowered to see whether a solid is below [m], and the share of it by which the point then
+#: has to be nearer: slopes of up to 60 degrees.
+_LOWERED, STEEP = 1e-3, 0.5
+
+
+def is_below(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+    """Whether the nearest part of solid b is below a point of the world, so that a vehicle may stand on it.
+
+    Nobody stands on what moves.
+    """
+    u, v, w = own_axes(x, y, z, b, s)
+    i, j, k = own_axes(x, y, z - _LOWERED, b, s)
+    still = s.last[b, 3] == s.first[b, 3]
+    nearer = signed_distance(u, v, w, b, s) - signed_distance(i, j, k, b, s)
+    return (nearer >= STEEP * _LOWERED) & still
+
+
 # -- many boxes ----------------------------------------------------------------------------------------
 
 #: Least distances to boxes, and these boxes (N, K), of agents (K, N, 3) with radii (N,), to boxes (B, 6).
@@ -331,5 +348,5 @@ def nearest_boxes() -> Nearest | None:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     from_box, box_normal, from_cylinder, cylinder_normal, off_segment, side, off_triangle, below, off_surface, within,
-    signed_distance, outward_normal, displacement, is_there, own_axes,
+    signed_distance, outward_normal, displacement, is_there, own_axes, is_below,
 )  # fmt: skip

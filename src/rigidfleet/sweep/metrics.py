@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rigidfleet.math import proximity
+from rigidfleet.result import DIRECTIONS
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -34,13 +35,14 @@ METRICS: dict[str, Metric] = {
     "shape": Metric("m", "largest shape error at the end of a phase"),
     "shape_flight": Metric(
         "m",
-        "largest shape error in flight: of all pairs of tracked slots, else of the edges against their references",
+        "largest shape error in flight, at samples: of all pairs of tracked slots, else of the edges against their"
+        " references",
     ),
     "shape_rms": Metric("m", "root mean square over time of the largest of these errors"),
-    "shape_tracked": Metric("m", "largest shape error in flight while slots are tracked"),
-    "shape_tracked_rms": Metric("m", "root mean square of these errors while slots are tracked"),
-    "shape_forces": Metric("m", "largest shape error in flight where constraint forces alone act"),
-    "tracking_error": Metric("m", "largest distance of a vehicle from its slot"),
+    "shape_tracked": Metric("m", "largest shape error with slots in flight, at samples"),
+    "shape_tracked_rms": Metric("m", "root mean square of these errors over time"),
+    "shape_forces": Metric("m", "largest shape error by constraint forces alone, at samples"),
+    "tracking_error": Metric("m", "largest distance of a vehicle from its slot, at samples"),
     "tracking_rms": Metric("m", "root mean square over time of the largest of these distances"),
     "constraint_end": Metric("m", "largest constraint error |c| = |L - d| at the end"),
     "constraint": Metric(
@@ -66,6 +68,10 @@ METRICS: dict[str, Metric] = {
     "tilt": Metric("deg", "maximum tilt of a vehicle with rotors"),
     "speed": Metric("m s-1", "maximum speed"),
     "acceleration": Metric("m s-2", "maximum acceleration"),
+    "horizontal_speed": Metric("m s-1", "maximum speed over the ground, if it has a limit"),
+    "vertical_speed": Metric("m s-1", "maximum speed up and down, if it has a limit"),
+    "horizontal_acceleration": Metric("m s-2", "maximum horizontal acceleration, if limited"),
+    "vertical_acceleration": Metric("m s-2", "maximum acceleration up and down, if limited"),
     "constraint_force": Metric("N", "maximum constraint force on an agent"),
     "tension": Metric("N", "tension of largest magnitude in an edge; negative: compression"),
     "singular_value": Metric("1", "smallest singular value of the constraint Jacobian"),
@@ -104,7 +110,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     worst = {name: extreme.value for name, extreme in verdict.worst.items()}
     worst |= {
         name: checked[name]
-        for name in ("separation_below", "geofence", "thrust")
+        for name in ("separation_below", "geofence", "thrust", *DIRECTIONS)
         if name in checked
     }
     worst |= _of_rotors(verdict)

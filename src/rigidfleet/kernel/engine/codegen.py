@@ -54,7 +54,7 @@ class UnrolledProblem(NamedTuple):
     before: LaneArray  # (m,) distances from which references are blended [m]
     time: Floats  # (13,) numbers of the moment, see `tracer`, and the moment itself [s]
     known: LaneArray  # (T,) values that depend on the moment, but not on the state
-    gauge: LaneArray  # (3N + 2m,) forces to watch, or (0,)
+    gauge: LaneArray  # (5N + 2m,) forces to watch, or (0,)
     stage: Ints  # (1,) of the step, which is being evaluated
     t0: float  # [s]
     T_b: float  # [s]

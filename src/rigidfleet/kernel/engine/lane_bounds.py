@@ -33,6 +33,7 @@ from rigidfleet.kernel.records import (
     CONSTRAINT,
     CONSTRAINT_FORCE,
     HIGHEST,
+    HORIZONTAL_SPEED,
     LISTED,
     LOWEST,
     SEPARATION,
@@ -68,7 +69,7 @@ class Search(NamedTuple):
 
     clock: Floats  # (rows, 2) start and length [s]
     points: LaneArray  # (rows, 5, n) control points
-    gauge: LaneArray  # (rows, 3N + 2m) forces at the end
+    gauge: LaneArray  # (rows, 3N + 2m or 5N + 2m) forces at the end
     bounds: LaneArray  # (rows, columns)
     least: LaneArray  # (5,) least distances so far, at the ends of steps
     greatest: LaneArray  # (6,) greatest forces so far, at the ends of steps
@@ -77,7 +78,9 @@ class Search(NamedTuple):
     pairs: Ints  # (P, 2) of agents
     boxes: LaneArray  # (B, 6) obstacles [m]
     limit: LaneArray  # (N,) of thrust [N]
-    forces: LaneArray  # (2, 3N + 2m) sizes of the forces at the ends of the last two steps
+    forces: (
+        LaneArray  # (2, 3N + 2m or 5N + 2m) sizes of the forces at the ends of the last two steps
+    )
     moments: Floats  # (2,) when these were [s]
     # (4, 8) addresses of each flight's control points, forces, forces at the start, and times of steps
     trails: Ints
@@ -206,8 +209,8 @@ def bound_step(s, row):
 
 @compiled
 def begin_forces(t, gauge, s):
-    """Begin with the forces ``gauge`` (3N + 2m,) at a start or after a jump, at t [s]."""
-    for c in range(gauge.shape[0]):
+    """Begin with the forces ``gauge`` (5N + 2m,) at a start or after a jump, at t [s]."""
+    for c in range(s.forces.shape[1]):
         s.forces[1, c] = abs(gauge[c])
     s.moments[0], s.moments[1] = -math.inf, t
 
@@ -217,6 +220,7 @@ def bound_forces(t, s, row, before):
     """Write the bounds of forces at the end t [s] of the step in row ``row``, and around that of the row ``before``.
 
     As `monitor.promise` says: the top of the parabola through three values, with twice the rise that counts there.
+    Where accelerations by direction are watched, too, every step is searched, and bounds do not matter.
     """
     n, gauge, forces = s.radius.shape[0], s.gauge[row], s.forces
     m = (gauge.shape[0] - 3 * n) // 2
@@ -262,12 +266,14 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
     count = np.zeros((WIDTH, 2), dtype=np.int64)
     nearest = unpack(s.nearest)[0].tolist()
     unpack(s.nearest)[:] = _FAR
-    # Where an agent stands, lands or takes off, what is stored depends on every step.
-    landed = np.array(
-        [near <= x.pad + _MARGIN or _landing(x) for near, x in zip(nearest, monitors, strict=True)]
-    )
+    # Where an agent stands, lands or takes off, what is stored depends on every step; there are no bounds by direction.
+    directed = [x.worst[HORIZONTAL_SPEED] > -math.inf for x in monitors]
+    landed = [
+        near <= x.pad + _MARGIN or _landing(x) for near, x in zip(nearest, monitors, strict=True)
+    ]
+    every = np.array([np.logical_or(landed, directed), directed]).T
     _list(
-        s, first, steps.start, steps.stop, landed, limits, margins, unpack(margins), found, count,
+        s, first, steps.start, steps.stop, every, limits, margins, unpack(margins), found, count,
         unpack(s.points), unpack(s.gauge),
     )  # fmt: skip
     for lane, monitor in enumerate(monitors):
@@ -310,13 +316,15 @@ def _hand_over(s, points, gauge, first, stop, found, count):
 def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count, points, gauge):
     """Write the steps to search, for distances and for forces, into ``found`` (8, 2, S), their number into ``count``.
 
-    Of flights with ``every`` (8,), distances of all steps. ``limits`` (11,) and ``margins`` (2,) are lanes to work
-    with; ``of_lanes`` (2, 8) is a view of the latter, ``points`` (rows, 5, n, 8) and ``gauge`` (rows, 3N + 2m, 8) are
-    views of those of the search.
+    Of flights with ``every`` (8, 2), all steps, for distances and for forces. ``limits`` (11,) and ``margins`` (2,) are
+    lanes to work with; ``of_lanes`` (2, 8) is a view of the latter, ``points`` (rows, 5, n, 8) and ``gauge`` (rows,
+    3N + 2m or more, 8) are views of those of the search.
     """
     rows = s.bounds.shape[0]
     for c in range(DISTANCES):
         limits[c] = s.least[c] + (_MARGIN + _SHARE * abs(s.least[c]))
+        if c in (SEPARATIONS, CLEARANCES):  # a first contact counts, too
+            limits[c] = max(limits[c], filled(_MARGIN))
     for c in range(FORCES):  # thrust beyond a limit that is none is never greatest
         greatest = s.greatest[c]
         limits[DISTANCES + c] = where_positive(-0.5 * _FAR - greatest, filled(0.0), greatest)
@@ -335,10 +343,10 @@ def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count,
             margin = min(margin, limits[DISTANCES + c] - bounds[FIRST_FORCE + c])
         margins[1] = margin
         for lane in range(found.shape[0]):
-            if every[lane] or not of_lanes[0, lane] > 0.0:
+            if every[lane, 0] or not of_lanes[0, lane] > 0.0:
                 found[lane, 0, count[lane, 0]] = step
                 count[lane, 0] += 1
-            if not of_lanes[1, lane] > 0.0 or step == 0 or step == stop - 1:
+            if every[lane, 1] or not of_lanes[1, lane] > 0.0 or step in (0, stop - 1):
                 found[lane, 1, count[lane, 1]] = step
                 count[lane, 1] += 1
         row = row + 1 if row + 1 < rows else 0

@@ -237,14 +237,14 @@ def keep_step(t, h, p, w, state):
     coordinates = _coordinates(k, p)
     row = (state.count[5] + state.count[4]) % rows
     before, after = (row + rows - 1) % rows, (row + 1) % rows
-    for g in range(p.gauge.shape[0]):
+    for g in range(found.gauge.shape[1]):
         found.gauge[after, g] = p.gauge[g]
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
     _to_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
     state.count[0] += 1
-    for g in range(p.gauge.shape[0]):
+    for g in range(found.gauge.shape[1]):
         found.gauge[row, g] = p.gauge[g]
     found.clock[row, 0], found.clock[row, 1] = t, 0.5 * h
     found.clock[after, 0], found.clock[after, 1] = t + 0.5 * h, 0.5 * h
@@ -264,7 +264,7 @@ def keep_step(t, h, p, w, state):
 @compiled
 def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
-    for g in range(p.gauge.shape[0]):
+    for g in range(p.search.gauge.shape[1]):
         spread(p.gauge[g], p.search.trails[2], g)
     begin_forces(state.clock[0], p.gauge, p.search)
 

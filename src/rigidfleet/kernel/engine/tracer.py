@@ -109,7 +109,7 @@ class Trace:
     ----------
     made : symbols by their operation and arguments
     outputs : (n,) the derivative of the state, symbols or numbers
-    gauge : (3N + 2m,) forces to watch, or none
+    gauge : (5N + 2m,) forces to watch, or none
     coordinates : number of coordinates of positions; their derivatives are velocities
     positive : symbols assumed positive; if one is not, the state has no derivative
 
@@ -369,10 +369,10 @@ class FlightTrace(Trace):
 
     def _gauge(self, p: Problem, w: Any, order: Ints) -> list[Any]:
         n, m = len(p.vehicles.m), len(order)
-        values = np.full(3 * n + 2 * m, 0.0, dtype=object)
+        values = np.full(5 * n + 2 * m, 0.0, dtype=object)
         self._plain(gauge.read_gauge)(p, w, values)
         places = np.arange(len(values))
-        places[3 * n :] = np.concatenate([3 * n + order, 3 * n + m + order])
+        places[3 * n : 3 * n + 2 * m] = np.concatenate([3 * n + order, 3 * n + m + order])
         return values[np.argsort(places)].tolist()
 
 
@@ -429,7 +429,7 @@ class Code:
     Attributes
     ----------
     outputs : (n,) symbols or numbers
-    gauge : (3N + 2m,) symbols or numbers, or none
+    gauge : (5N + 2m,) symbols or numbers, or none
     coordinates : number of coordinates of positions, whose derivatives, the first outputs, are velocities
     positive : symbols that have to be positive
     before : symbols that depend on the problem's numbers alone

@@ -184,6 +184,11 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
 
 def _note(result: Result, shown: Ints, tension: float, most: float) -> str:
     words = []
+    for name in ("separation_first", "lost_first", "clearance_first"):
+        if (x := result.extreme(name)) is not None:
+            thing = name == "clearance_first" and result.mission.obstacles[x.other].name
+            other = thing or f"agent {x.other + 1}"
+            words.append(f"At {x.time:.2f} s, agent {x.who + 1} first hits {other}.")
     if result.n_agents > _SWARM:
         words.append("Vehicles are dots, without trails and slots.")
     if len(shown) < len(result.edges):
