@@ -3,14 +3,14 @@
 Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law
 gives each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick.
 Between ticks the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts
-are evaluated at each stage, downwash once per step.
+are evaluated at each stage, a user's force in the middle of each step, downwash once per step.
 """
 
 import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
-from rigidfleet.kernel.compiler.calls import call_recorder
+from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
@@ -166,9 +166,6 @@ def take_force(k, i, dt, p, w, flight, state):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
         state.force[i, q] = w.f_u[i, q] + w.f_C[i, q]
         pull += w.f_C[i, q] * w.f_C[i, q]
-        state.push[i, q] = 0.0
-        if p.external != 0:
-            state.push[i, q] = w.f_E[i, q] + (m * p.vehicles.g if q == 2 else 0.0)
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
@@ -289,18 +286,27 @@ def advance(S, h, flight, state):
 
 
 @compiled
-def breathe(t, h, flight, state):
-    """Velocity of the air [m/s] over a step, into ``work.air``."""
+def breathe(t, h, S, p, flight, state):
+    """Velocity of the air [m/s] over a step from states S (N, 17), into ``work.air``; a user's force in its middle.
+
+    The force is asked before: position and velocity in the middle of the step stand in rows of the air's until then.
+    """
     work = state.work
+    if p.external.address != 0:
+        for i in range(S.shape[0]):
+            for q in range(3):
+                work.air[0, i, q], work.air[1, i, q] = S[i, q] + 0.5 * h * S[i, 3 + q], S[i, 3 + q]
+                state.push[i, q] = 0.0
+        call_external(p.external.address, t + 0.5 * h, work.air[0], work.air[1], state.push)
     air_velocity(t, h, flight.air, work.air)
     if flight.air.downwash:
         add_downwash(state.S, flight.vehicles, flight.air.density, work.T, work.air)
 
 
 @compiled
-def write_derivatives(c, t, flight, state, call):
+def write_derivatives(c, t, p, flight, state, call):
     """Derivatives of the states of sample c: those at the start of a step without length."""
-    breathe(t, 0.0, flight, state)
+    breathe(t, 0.0, call.S[c], p, flight, state)
     advance(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
@@ -308,7 +314,7 @@ def write_derivatives(c, t, flight, state, call):
 
 
 @compiled
-def write_samples(t, h, flight, state, call):
+def write_samples(t, h, p, flight, state, call):
     """Write the samples up to t + h [s]: each is a step of its own from t."""
     work, count, times = state.work, state.count, call.times
     while count[SAMPLES] < times.shape[0]:
@@ -317,7 +323,7 @@ def write_samples(t, h, flight, state, call):
         if x > h * (1.0 + _SAME):
             return
         x = h if x > h * (1.0 - _SAME) else x
-        breathe(t, x, flight, state)
+        breathe(t, x, state.S, p, flight, state)
         advance(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
             for q in range(17):
@@ -333,7 +339,7 @@ def write_samples(t, h, flight, state, call):
                 )
             call.saturated[c, i] = state.saturated[i]
             call.layers[c, i] = state.layers[i]
-        write_derivatives(c, t + x, flight, state, call)
+        write_derivatives(c, t + x, p, flight, state, call)
         for k in range(state.integral.shape[1]):
             call.integral[c, k] = state.integral[0, k]
         for q in range(4):
@@ -390,9 +396,9 @@ def take_extremes(i, t, h, vehicles, state):
 
 
 @compiled
-def advance_fleet(t, h, flight, state):
+def advance_fleet(t, h, p, flight, state):
     """Advance all vehicles from t by h [s], and record the step in the trail, if there is one."""
-    breathe(t, h, flight, state)
+    breathe(t, h, state.S, p, flight, state)
     row, trail = state.count[TRAILED], state.trail
     kept = trail.clock.shape[0] > 0
     if kept:
@@ -435,8 +441,8 @@ def fly_ticks(p, w, flight, state, call):
         whole = grid <= call.t_end + _SAME * flight.h
         end = grid if whole else call.t_end
         h = flight.h if whole and t == until else end - t
-        write_samples(t, h, flight, state, call)
-        advance_fleet(t, h, flight, state)
+        write_samples(t, h, p, flight, state, call)
+        advance_fleet(t, h, p, flight, state)
         clock[0] = end
         if whole:
             count[STEPS] = step + 1

@@ -30,6 +30,7 @@ from rigidfleet.kernel.problem import (
     ConstraintLaw,
     Control,
     Disturbance,
+    External,
     Feedback,
     Graph,
     Motion,
@@ -227,14 +228,14 @@ def plan_phase(
     now: PhaseState,
     *,
     disturbance: Disturbance | None = None,
-    external: int = 0,
+    external: External | None = None,
 ) -> PhasePlan:
     """Prepare a phase that starts at ``now.t``.
 
     Parameters
     ----------
     disturbance : disturbances of the flight, which no law knows; none by default
-    external : address of a force callback; 0 for none
+    external : a user's force; none by default
 
     Raises
     ------
@@ -302,8 +303,8 @@ def plan_phase(
         motion=motion,
         feedback=feedback,
         control=_control(mission, phase, masses),
-        external=external,
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
+        external=_bounded(external or External(), motion, reference),
     )  # fmt: skip
     slots = after
     if phase.control == "open" and kind != SHAPE:
@@ -324,6 +325,21 @@ def plan_phase(
         if lost.any() or parted.any():
             plan.release(lost, parted)
     return plan
+
+
+def _bounded(external: External, motion: Motion, reference: Reference) -> External:
+    """A user's force, if any, with steps of at most half the time for which any coordinate moves after a rest.
+
+    From exact rest, steps grow without bound: they could miss a motion that begins later.
+    """
+    longest = 2.0 * external.max_step
+    for knots, pieces in ((motion.knots, motion.coefficients), (reference.knots, reference.ways)):
+        span, powers = np.diff(knots), range(1, pieces.shape[-1])
+        rests = np.array(sum(np.abs(pieces[..., p].T) * span**p for p in powers)) < _ROUNDED
+        for *c, k in np.argwhere(rests[..., :-1] & ~rests[..., 1:]):
+            again = np.append(rests[(*c, slice(k + 1, None))], True).argmax()
+            longest = min(longest, float(knots[k + 1 + again] - knots[k + 1]))
+    return external._replace(max_step=0.5 * longest)
 
 
 def _end(phase: Phase, start: float) -> float:
