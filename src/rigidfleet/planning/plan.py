@@ -328,16 +328,16 @@ def plan_phase(
 
 
 def _bounded(external: External, motion: Motion, reference: Reference) -> External:
-    """A user's force, if any, with steps of at most half the time for which any coordinate moves after a rest.
+    """A user's force, if any, with steps of at most half the time for which any coordinate of a reference accelerates.
 
-    From exact rest, steps grow without bound: they could miss a motion that begins later.
+    Only after a rest or a uniform motion, where steps grow without bound: they could miss what comes between two.
     """
     longest = 2.0 * external.max_step
     for knots, pieces in ((motion.knots, motion.coefficients), (reference.knots, reference.ways)):
-        span, powers = np.diff(knots), range(1, pieces.shape[-1])
-        rests = np.array(sum(np.abs(pieces[..., p].T) * span**p for p in powers)) < _ROUNDED
-        for *c, k in np.argwhere(rests[..., :-1] & ~rests[..., 1:]):
-            again = np.append(rests[(*c, slice(k + 1, None))], True).argmax()
+        span, powers = np.diff(knots), range(2, pieces.shape[-1])
+        steady = np.array(sum(np.abs(pieces[..., p].T) * span**p for p in powers)) < _ROUNDED
+        for *c, k in np.argwhere(steady[..., :-1] & ~steady[..., 1:]):
+            again = np.append(steady[(*c, slice(k + 1, None))], True).argmax()
             longest = min(longest, float(knots[k + 1 + again] - knots[k + 1]))
     return external._replace(max_step=0.5 * longest)
 

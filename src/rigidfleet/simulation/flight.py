@@ -109,6 +109,8 @@ def simulate(
     force : an external force f(t, r, v) -> (N, 3) [N] in addition to gravity, world axes, continuous in
         time. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n) is called
         without Python.
+    max_step : longest step [s] while there is a force. A force that lasts at least two steps is felt to 1 %, or to
+        the integrator's tolerances if these are wider. Give half of the shortest time for which yours acts
     times : times [s] to record, instead of multiples of the mission's ``output_step``
     progress : a function that is called a few times a second
 
@@ -131,7 +133,8 @@ def simulate(
     TypeError
         ``mission`` is no mission.
     ValueError
-        A time to record lies outside the mission, or the control rate is not positive.
+        A time to record lies outside the mission, the control rate is not positive, or ``max_step`` is not from 0.001 s
+        to the duration of the mission.
     """
     flight = Flight(
         mission, controller=controller, rate=rate, force=force, max_step=max_step, times=times, progress=progress
