@@ -334,8 +334,8 @@ def _bounded(external: External, motion: Motion, reference: Reference) -> Extern
     """
     longest = 2.0 * external.max_step
     for knots, pieces in ((motion.knots, motion.coefficients), (reference.knots, reference.ways)):
-        span, powers = np.diff(knots), range(2, pieces.shape[-1])
-        steady = np.array(sum(np.abs(pieces[..., p].T) * span**p for p in powers)) < _ROUNDED
+        span = np.diff(knots)[:, None] ** np.arange(2, pieces.shape[-1])
+        steady = np.einsum("k...p,kp->...k", np.abs(pieces[..., 2:]), span) < _ROUNDED
         for *c, k in np.argwhere(steady[..., :-1] & ~steady[..., 1:]):
             again = np.append(steady[(*c, slice(k + 1, None))], True).argmax()
             longest = min(longest, float(knots[k + 1 + again] - knots[k + 1]))
