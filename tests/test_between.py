@@ -25,8 +25,8 @@ FREE = {
     "vertical_acceleration": 99.0,
 }
 #: Quantities of which nothing is known between samples: of points, and what is more of vehicles with rotors.
-AT_SAMPLES = {"singular_value"}
-OF_ROTORS = AT_SAMPLES | {"constraint", "tension"}
+AT_SAMPLES = {"singular_value", "tracking_error"}
+OF_ROTORS = {"singular_value", "constraint", "tension"}
 
 
 def checks(verdict: Verdict) -> dict[str, CheckResult]:

@@ -90,7 +90,7 @@ def until_knot(t, step):
 @inlined
 def step_size(t, h, t_end, p):
     """Length of the next step [s], see `step_to_knot`."""
-    return step_to_knot(t, h, t_end, p.disturbance)
+    return step_to_knot(t, min(h, p.external.max_step), t_end, p.disturbance)
 
 
 @inlined

@@ -45,10 +45,10 @@ def closed_loop(t, y, dy, p, w):
                 r[i, s], v[i, s] = y[3 * i + s], y[3 * n + 3 * i + s]
     for i in range(n):
         w.f_E[i, 0], w.f_E[i, 1], w.f_E[i, 2] = 0.0, 0.0, -m[i] * g
-    if p.external != 0:
+    if p.external.address != 0:
         for i in range(n):
             w.a[i, 0], w.a[i, 1], w.a[i, 2] = 0.0, 0.0, 0.0
-        call_external(p.external, t, r, v, w.a)
+        call_external(p.external.address, t, r, v, w.a)
         for i in range(n):
             for s in range(3):
                 w.f_E[i, s] += w.a[i, s]

@@ -165,6 +165,13 @@ class Disturbance(NamedTuple):
     floor: PerAgent  # height at which a lost vehicle comes to rest [m]
 
 
+class External(NamedTuple):
+    """A user's force, and how long a step may be so that none of it is missed."""
+
+    address: int = 0  # of the callback; 0 for none
+    max_step: float = math.inf  # longest step of the integrator [s]
+
+
 class Problem(NamedTuple):
     """One phase of a flight."""
 
@@ -177,8 +184,8 @@ class Problem(NamedTuple):
     motion: Motion
     feedback: Feedback
     control: Control
-    external: int  # address of a force callback, 0 for none
     disturbance: Disturbance
+    external: External = External()
 
 
 class Workspace(NamedTuple):

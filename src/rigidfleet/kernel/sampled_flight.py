@@ -3,7 +3,7 @@
 Tick k is at ``start + k steps h``. At each tick, states are measured; at every ``every``-th tick the formation law
 gives each vehicle a desired force; then attitude control gives it rotor speeds, which are held to the next tick.
 Between ticks the true states follow the equations of motion by the classical Runge-Kutta method with the step h. Gusts
-are evaluated at each stage, downwash and a user's force once per step, at its start.
+are evaluated at each stage, a user's force in the middle of each step, downwash once per step.
 """
 
 import math
@@ -284,29 +284,29 @@ def advance(S, h, flight, state):
 
 
 @compiled
-def push(t, p, w, state):
-    """A user's force on the vehicles at t [s], into ``state.push``; returns whether it is finite."""
-    for i in range(state.S.shape[0]):
-        for q in range(3):
-            w.r[i, q], w.v[i, q], state.push[i, q] = state.S[i, q], state.S[i, 3 + q], 0.0
-    if p.external != 0:
-        call_external(p.external, t, w.r, w.v, state.push)
+def breathe(t, h, S, p, flight, state):
+    """Velocity of the air [m/s] over a step from states S (N, 17), into ``work.air``; a user's force in its middle.
+
+    The force is asked before: position and velocity in the middle of the step stand in rows of the air's until then.
+    Returns whether it is finite.
+    """
+    work = state.work
+    state.push[:] = 0.0
+    if p.external.address != 0:
+        for i in range(S.shape[0]):
+            for q in range(3):
+                work.air[0, i, q], work.air[1, i, q] = S[i, q] + 0.5 * h * S[i, 3 + q], S[i, 3 + q]
+        call_external(p.external.address, t + 0.5 * h, work.air[0], work.air[1], state.push)
+    air_velocity(t, h, flight.air, work.air)
+    if flight.air.downwash:
+        add_downwash(state.S, flight.vehicles, flight.air.density, work.T, work.air)
     return abs(state.push.sum()) < math.inf
 
 
 @compiled
-def breathe(t, h, flight, state):
-    """Velocity of the air [m/s] over a step, into ``work.air``."""
-    work = state.work
-    air_velocity(t, h, flight.air, work.air)
-    if flight.air.downwash:
-        add_downwash(state.S, flight.vehicles, flight.air.density, work.T, work.air)
-
-
-@compiled
-def write_derivatives(c, t, flight, state, call):
+def write_derivatives(c, t, p, flight, state, call):
     """Derivatives of the states of sample c: those at the start of a step without length."""
-    breathe(t, 0.0, flight, state)
+    breathe(t, 0.0, call.S[c], p, flight, state)
     advance(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
@@ -314,7 +314,7 @@ def write_derivatives(c, t, flight, state, call):
 
 
 @compiled
-def write_samples(t, h, flight, state, call):
+def write_samples(t, h, p, flight, state, call):
     """Write the samples up to t + h [s]: each is a step of its own from t."""
     work, count, times = state.work, state.count, call.times
     while count[SAMPLES] < times.shape[0]:
@@ -323,7 +323,7 @@ def write_samples(t, h, flight, state, call):
         if x > h * (1.0 + _SAME):
             return
         x = h if x > h * (1.0 - _SAME) else x
-        breathe(t, x, flight, state)
+        breathe(t, x, state.S, p, flight, state)
         advance(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
             for q in range(17):
@@ -339,7 +339,7 @@ def write_samples(t, h, flight, state, call):
                 )
             call.saturated[c, i] = state.saturated[i]
             call.layers[c, i] = state.layers[i]
-        write_derivatives(c, t + x, flight, state, call)
+        write_derivatives(c, t + x, p, flight, state, call)
         for k in range(state.integral.shape[1]):
             call.integral[c, k] = state.integral[0, k]
         for q in range(4):
@@ -398,9 +398,13 @@ def take_extremes(i, t, h, vehicles, state):
 
 
 @compiled
-def advance_fleet(t, h, flight, state):
-    """Advance all vehicles from t by h [s], and record the step in the trail, if there is one."""
-    breathe(t, h, flight, state)
+def advance_fleet(t, h, p, flight, state):
+    """Advance all vehicles from t by h [s], and record the step in the trail, if there is one.
+
+    Returns False, and advances none, if a user's force is not finite.
+    """
+    if not breathe(t, h, state.S, p, flight, state):
+        return False
     row, trail = state.count[TRAILED], state.trail
     kept = trail.clock.shape[0] > 0
     if kept:
@@ -414,6 +418,7 @@ def advance_fleet(t, h, flight, state):
             keep_path(i, h, state.work, trail.points[row])
         for q in range(17):
             state.S[i, q] = state.work.y[6, 17 * i + q]
+    return True
 
 
 @compiled
@@ -442,14 +447,13 @@ def fly_ticks(p, w, flight, state, call):
             if not tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1
-        if not push(t, p, w, state):
-            return COLLAPSED
         grid, until = flight.start + (step + 1) * flight.h, flight.start + step * flight.h
         whole = grid <= call.t_end + _SAME * flight.h
         end = grid if whole else call.t_end
         h = flight.h if whole and t == until else end - t
-        write_samples(t, h, flight, state, call)
-        advance_fleet(t, h, flight, state)
+        write_samples(t, h, p, flight, state, call)
+        if not advance_fleet(t, h, p, flight, state):
+            return COLLAPSED
         clock[0] = end
         if whole:
             count[STEPS] = step + 1

@@ -30,6 +30,7 @@ from rigidfleet.kernel.problem import (
     ConstraintLaw,
     Control,
     Disturbance,
+    External,
     Feedback,
     Graph,
     Motion,
@@ -250,14 +251,14 @@ def plan_phase(
     now: PhaseState,
     *,
     disturbance: Disturbance | None = None,
-    external: int = 0,
+    external: External | None = None,
 ) -> PhasePlan:
     """Prepare a phase that starts at ``now.t``.
 
     Parameters
     ----------
     disturbance : disturbances of the flight, which no law knows; none by default
-    external : address of a force callback; 0 for none
+    external : a user's force; none by default
 
     Raises
     ------
@@ -325,8 +326,8 @@ def plan_phase(
         motion=motion,
         feedback=feedback,
         control=_control(mission, phase, masses),
-        external=external,
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
+        external=_bounded(external or External(), motion, reference),
     )  # fmt: skip
     slots = after
     if phase.control == "open" and kind != SHAPE:
@@ -347,6 +348,21 @@ def plan_phase(
         if lost.any() or parted.any():
             plan.release(lost, parted)
     return plan
+
+
+def _bounded(external: External, motion: Motion, reference: Reference) -> External:
+    """A user's force, if any, with steps of at most half the time for which any coordinate of a reference accelerates.
+
+    Only after a rest or a uniform motion, where steps grow without bound: they could miss what comes between two.
+    """
+    longest = 2.0 * external.max_step
+    for knots, pieces in ((motion.knots, motion.coefficients), (reference.knots, reference.ways)):
+        span = np.diff(knots)[:, None] ** np.arange(2, pieces.shape[-1])
+        steady = np.einsum("k...p,kp->...k", np.abs(pieces[..., 2:]), span) < _ROUNDED
+        for *c, k in np.argwhere(steady[..., :-1] & ~steady[..., 1:]):
+            again = np.append(steady[(*c, slice(k + 1, None))], True).argmax()
+            longest = min(longest, float(knots[k + 1 + again] - knots[k + 1]))
+    return external._replace(max_step=0.5 * longest)
 
 
 def _end(phase: Phase, start: float) -> float:

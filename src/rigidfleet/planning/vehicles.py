@@ -46,13 +46,14 @@ _LEFT = 0.2
 _TURN_TIME = 3.0
 
 
-def sampled_flight(mission: Mission) -> fleet.Flight:
-    """Vehicles, air, sensing and rates of a mission with vehicles."""
+def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Flight:
+    """Vehicles, air, sensing and rates of a mission with vehicles, where a user's force lasts two ``max_step`` [s]."""
     models = mission.vehicle_models
     assert models is not None
     n, autopilot, d = len(models), mission.autopilot, mission.disturbances
     made = [kernel_vehicle(model, m) for model, m in zip(models, mission.true_mass, strict=True)]
-    steps = max(1, math.ceil(1.0 / autopilot.rate / autopilot.step - 1e-9))
+    # A force is held over each step: twenty of them meet a smooth pulse to 1 %
+    steps = max(1, math.ceil(1.0 / autopilot.rate / min(autopilot.step, max_step / 10.0) - 1e-9))
     found = fleet.flight(
         fleet.quadrotors(made, mission.gravity),
         start=0.0,

@@ -6,6 +6,7 @@ import ctypes
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -159,9 +160,7 @@ class ExternalForce:
     rejected, and `check` raises it once the kernel has returned.
     """
 
-    _SIGNATURE = ctypes.CFUNCTYPE(
-        None, ctypes.c_double, *(ctypes.POINTER(ctypes.c_double),) * 3, ctypes.c_ssize_t
-    )
+    _SIGNATURE = ctypes.CFUNCTYPE(None, ctypes.c_double, *(ctypes.c_void_p,) * 3, ctypes.c_ssize_t)
 
     def __init__(self, force: Force, n: int) -> None:
         self.error: BaseException | None = None
@@ -171,17 +170,20 @@ class ExternalForce:
             self.address = int(address)
             return
 
-        def call(t: float, r: Any, v: Any, f: Any, count: int) -> None:
-            arrays = [np.ctypeslib.as_array(a, (count, 3)) for a in (r, v, f)]
+        @cache
+        def places(address: int) -> Floats:
+            """The array (N, 3) at an address; the kernel has few of them, and calls often."""
+            return np.ctypeslib.as_array((ctypes.c_double * 3 * n).from_address(address))
+
+        def call(t: float, r: int, v: int, f: int, _: int) -> None:
+            x = places(r).copy(), places(v).copy()
             try:
                 if self.error is None:
-                    arrays[2][:] = asked(
-                        "the force", t, n, force, t, arrays[0].copy(), arrays[1].copy()
-                    )
+                    places(f)[:] = asked("the force", t, n, force, t, *x)
                     return
             except BaseException as error:
                 self.error = error
-            arrays[2][:] = math.nan
+            places(f)[:] = math.nan
 
         self._keep = self._SIGNATURE(call)
         self.address = int(ctypes.cast(self._keep, ctypes.c_void_p).value or 0)

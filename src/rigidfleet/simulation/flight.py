@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import among
-from rigidfleet.kernel.problem import TRACKING, Motion
+from rigidfleet.kernel.problem import TRACKING, External, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
@@ -51,6 +51,8 @@ __all__ = [
 
 #: Interval between progress reports [s of wall time].
 _REPORT = 0.1
+#: Longest step of a flight with a user's force, unless another one is asked for, and the least that may be [s].
+MAX_STEP, _LEAST_STEP = 0.05, 0.001
 #: Angle beyond which the frame no longer agrees with the slots it is attached to [rad].
 _FLIPPED = math.pi / 2
 _FINISHED = "the flight is finished: make another Flight to fly on"
@@ -90,6 +92,7 @@ def simulate(
     controller: Controller | None = None,
     rate: float = 50.0,
     force: Force | None = None,
+    max_step: float = MAX_STEP,
     times: ArrayLike | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> Result:
@@ -106,6 +109,8 @@ def simulate(
     force : an external force f(t, r, v) -> (N, 3) [N] in addition to gravity, world axes, continuous in
         time. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n) is called
         without Python.
+    max_step : longest step [s] while there is a force. A force that lasts at least two steps is felt to 1 %, or to
+        the integrator's tolerances if these are wider. Give half of the shortest time for which yours acts
     times : times [s] to record, instead of multiples of the mission's ``output_step``
     progress : a function that is called a few times a second
 
@@ -129,11 +134,12 @@ def simulate(
     TypeError
         ``mission`` is no mission.
     ValueError
-        A time to record lies outside the mission, or the control rate is not positive.
+        A time to record lies outside the mission, the control rate is not positive, or ``max_step`` is not from 0.001 s
+        to the duration of the mission.
     """
     flight = Flight(
-        mission, controller=controller, rate=rate, force=force, times=times, progress=progress
-    )
+        mission, controller=controller, rate=rate, force=force, max_step=max_step, times=times, progress=progress
+    )  # fmt: skip
     controls = {phase.name: phase.control for phase in flight.mission.phases}
     if controller is not None and "tracking" not in controls.values():
         raise FlightError(
@@ -188,6 +194,7 @@ class Flight:
         controller: Controller | None = None,
         rate: float = 50.0,
         force: Force | None = None,
+        max_step: float = MAX_STEP,
         times: ArrayLike | None = None,
         progress: Callable[[Progress], None] | None = None,
         sampler: Sampler | None = None,
@@ -207,8 +214,14 @@ class Flight:
                 raise wrong_type(f"a function for {name}", function)
         if not (force is None or callable(force) or hasattr(force, "address")):
             raise wrong_type("a function for force", force)
+        most = max(MAX_STEP, mission.latest_end)
+        if not (isinstance(max_step, int | float | np.number) and _LEAST_STEP <= max_step <= most):
+            raise ValueError(
+                f"max_step must be from 0.001 to {most:g} s, not {max_step!r}: give half the time that a force lasts"
+            )
         self.controller, self.rate, self.progress = controller, rate, progress
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
+        self._push = External(self.external.address, float(max_step)) if self.external else External()  # fmt: skip
         asked_for = None if times is None else times_asked(times, mission.latest_end)
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
@@ -219,7 +232,7 @@ class Flight:
         self._begins = self._reached = PhaseState(
             0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
         )
-        self._vehicles = None if mission.vehicle_models is None else Vehicles(mission)
+        self._vehicles = Vehicles(mission, self._push.max_step) if mission.vehicle_models else None
         # Vehicles meet their disturbances in their own equations of motion.
         self._disturbance = self._prepared.disturbance if self._vehicles is None else None
         self._extremes = self._prepared.extremes()
@@ -333,13 +346,12 @@ class Flight:
         if self._asked:
             self._report(phase, planning=True)
         try:
-            external = 0 if self.external is None else self.external.address
             if self._now is self._begins and self._now.lost is None:
-                plan = self._prepared.first_plan(phase, self._now, self._disturbance, external)
+                plan = self._prepared.first_plan(phase, self._now, self._disturbance, self._push)
             else:
                 plan = plan_phase(
-                    self.mission, phase, self._now, disturbance=self._disturbance, external=external
-                )
+                    self.mission, phase, self._now, disturbance=self._disturbance, external=self._push
+                )  # fmt: skip
             self._check_frame(plan)
             make = ActivePhase
             if self._vehicles is not None:
@@ -442,7 +454,7 @@ class Flight:
         """
         active = self.under_way()
         t, problem = active.t, active.plan.problem
-        external = self.external.address if force and self.external is not None else 0
+        external = self._push if force else External()
         if active.plan.phase.control == "body":
             feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega

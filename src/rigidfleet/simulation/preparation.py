@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from functools import cached_property
 
-from rigidfleet.kernel.problem import Disturbance
+from rigidfleet.kernel.problem import Disturbance, External
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.plan import PhasePlan, plan_phase
@@ -22,7 +22,7 @@ class Preparation:
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
-        self._plans: dict[tuple[int, int], PhasePlan] = {}
+        self._plans: dict[tuple[int, External], PhasePlan] = {}
         self._idle: list[Extremes] = []
 
     @cached_property
@@ -51,7 +51,7 @@ class Preparation:
             self._idle.append(extremes)
 
     def first_plan(
-        self, phase: Phase, now: PhaseState, given: Disturbance | None, external: int
+        self, phase: Phase, now: PhaseState, given: Disturbance | None, external: External
     ) -> PhasePlan:
         """The plan of a flight's first phase, which starts from the mission's start, ``now``.
 

@@ -46,8 +46,8 @@ _FAR = 1e9
 class Vehicles:
     """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
 
-    def __init__(self, mission: Mission) -> None:
-        self.flight = sampled_flight(mission)
+    def __init__(self, mission: Mission, max_step: float) -> None:
+        self.flight = sampled_flight(mission, max_step)
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
@@ -381,7 +381,7 @@ def _as_flown(
     thrust = np.where(vehicles.point[:, None], call.command[:done, :, :3], thrust)
     rest = vehicles.m[:, None] * a - thrust
     air = rest + (vehicles.m * vehicles.g)[:, None] * np.array([0.0, 0.0, 1.0])
-    if problem.external:
+    if problem.external.address:
         air = air - (planned.f_E + (problem.vehicles.m * vehicles.g)[:, None] * [0.0, 0.0, 1.0])
     seen = call.seen[:done]
     out = planned._replace(

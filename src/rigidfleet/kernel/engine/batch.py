@@ -111,7 +111,7 @@ def fits(problem: Problem) -> bool:
         and problem.law.solver in (ITERATED, EXACT)
         and problem.reference.kind != SHAPE
         and not (problem.has_frame or problem.body_formulation or problem.disturbance.active)
-        and problem.external == 0
+        and problem.external.address == 0
         and _equations(problem) <= _MOST_EQUATIONS
     )
 
@@ -124,7 +124,7 @@ def _equations(problem: Problem) -> int:
 def fit_together(problems: Sequence[Problem]) -> bool:
     """Return whether problems differ in nothing but numbers and tables over time, and suit straight-line code.
 
-    They must have the same graph, laws, blend and knots, and no branch that depends on the state.
+    They must have the same graph, laws, blend and knots, no branch that depends on the state, and no longest step.
     """
     first = problems[0]
     if not (
@@ -136,7 +136,8 @@ def fit_together(problems: Sequence[Problem]) -> bool:
     ):
         return False
     return all(
-        not (x.has_frame or x.body_formulation or x.external or any(x.disturbance.lost.tolist()))
+        not (x.has_frame or x.body_formulation or any(x.disturbance.lost.tolist()))
+        and x.external.max_step == np.inf  # also of any force
         and len(x.reference.knots) == 0
         and x.vehicles.saturate == first.vehicles.saturate
         and x.law.solver == first.law.solver

@@ -262,7 +262,6 @@ def examples() -> tuple[
             none, np.zeros((0, 4)), np.zeros((0, 4)), 0.0, *np.zeros((2, 3)), frame, np.zeros(3), np.zeros(4)
         ),
         control=Control(OPEN, places, 0.0, 0.0, RIGID),
-        external=0,
         disturbance=no_disturbance(one),
     )  # fmt: skip
     state = integrator(np.zeros(6), 0.0, rtol=0.0, atol=np.ones(6))
