@@ -65,6 +65,7 @@ class FormationCheck:
     method : how the constraint force is solved
     spectrum : of a large formation, instead of its rigidity
     skipped : whether the formation was not checked because there are too many
+    space : dimension of the space in which other shapes were searched and the spectrum computed
     """
 
     name: str
@@ -74,6 +75,7 @@ class FormationCheck:
     method: solvers.Method = "dense"
     spectrum: Spectrum | None = None
     skipped: bool = False
+    space: int = 3
 
 
 @dataclass(frozen=True)
@@ -450,6 +452,7 @@ def _formation_words(f: FormationCheck) -> str:
         text = f"{held}; solved by {solvers.WORDS[f.method]}"
         if f.spectrum.free:
             return f"{text}; flexible to first order, at least {f.spectrum.free} free motions"
+        text += "" if f.space == 3 else "; in its plane"
         return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
     if f.skipped:
         return f"{held}; solved by {solvers.WORDS[f.method]}; skipped, rigidity not checked"
@@ -477,6 +480,7 @@ def _formation_words(f: FormationCheck) -> str:
         )
     if f.realisations is not None:
         parts.append(_realisation_words(f.realisations))
+        parts[-1] += {3: "", 2: " (in its plane)", 1: " (on its line)"}[f.space]
     return "; ".join(parts)
 
 
@@ -493,7 +497,7 @@ def _realisation_words(r: Realisations) -> str:
     """How many random starts reach which shape: 36 of 40 random starts reach this shape, 4 its mirror image."""
     if not r.found:
         return f"none of {r.starts} random starts converges"
-    first, *others = [(x.found, _GOALS[x.kind]) for x in r.found]
+    first, *others = [(x.found, _GOALS[x.kind] + " that bends" * x.bends) for x in r.found]
     verb = "reaches" if first[0] == 1 else "reach"
     text = f"{first[0]} of {r.starts} random starts {verb} {first[1]}"
     text += "".join(f", {count} {goal}" for count, goal in others[:3])

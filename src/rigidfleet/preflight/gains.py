@@ -55,7 +55,11 @@ def _drift(mission: Mission) -> Iterator[Remark]:
     """Remark that without feedback an error of a distance grows at its initial rate."""
     text = "there is no feedback (stabilisation = 'none'): errors of distances remain and grow at their initial rate"
     first = mission.phases[0].establishing
-    if first is None:
+    if (
+        first is None
+        or first.control == "tracking"
+        or not len(mission.formation_edges(first.formation))
+    ):
         yield Remark("note", "gains", text)
         return
     r, v = mission.fleet.position, mission.fleet.velocity
