@@ -19,6 +19,7 @@ from rigidfleet.rigidity import (
     Rigidity,
     Spectrum,
 )
+from rigidfleet.rigidity.analysis import WHERE
 
 #: Maximum number of names in one remark.
 _TOLD = 6
@@ -65,7 +66,6 @@ class FormationCheck:
     method : how the constraint force is solved
     spectrum : of a large formation, instead of its rigidity
     skipped : whether the formation was not checked because there are too many
-    space : dimension of the space in which other shapes were searched and the spectrum computed
     """
 
     name: str
@@ -75,7 +75,6 @@ class FormationCheck:
     method: solvers.Method = "dense"
     spectrum: Spectrum | None = None
     skipped: bool = False
-    space: int = 3
 
 
 @dataclass(frozen=True)
@@ -452,7 +451,6 @@ def _formation_words(f: FormationCheck) -> str:
         text = f"{held}; solved by {solvers.WORDS[f.method]}"
         if f.spectrum.free:
             return f"{text}; flexible to first order, at least {f.spectrum.free} free motions"
-        text += "" if f.space == 3 else "; in its plane"
         return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
     if f.skipped:
         return f"{held}; solved by {solvers.WORDS[f.method]}; skipped, rigidity not checked"
@@ -464,8 +462,7 @@ def _formation_words(f: FormationCheck) -> str:
         held += f", solved by {solvers.WORDS[f.method]}"
     parts = [f"{r.rigidity_class}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
     if r.reachable < r.needed:
-        where = "line" if r.dimension == 1 else "plane"
-        parts[0] += f" ({r.reachable} reachable on a {where})"
+        parts[0] += f" ({r.reachable} reachable on a {WHERE[r.dimension]})"
     if len(r.redundant):
         names = ", ".join(f"{i}-{j}" for i, j in (r.edges[r.redundant][:6] + 1).tolist())
         more = ", ..." if len(r.redundant) > 6 else ""
@@ -480,7 +477,7 @@ def _formation_words(f: FormationCheck) -> str:
         )
     if f.realisations is not None:
         parts.append(_realisation_words(f.realisations))
-        parts[-1] += {3: "", 2: " (in its plane)", 1: " (on its line)"}[f.space]
+        parts[-1] += f" (in its {WHERE[r.own.space]})" * (r.own.space < 3)
     return "; ".join(parts)
 
 

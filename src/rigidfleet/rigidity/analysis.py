@@ -28,7 +28,7 @@ class RigidityClass(StrEnum):
 #: Index below which a formation is rigid in name only: 1 mm of length error allows 1 m of displacement.
 _BARELY = 1e-3
 
-_WHERE = {0: "point", 1: "line", 2: "plane", 3: "space"}
+WHERE = ("point", "line", "plane", "space")
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,12 @@ class Rigidity:
             RigidityClass.INFINITESIMALLY_RIGID,
             RigidityClass.PRESTRESS_STABLE,
         )
+
+    @property
+    def own(self) -> Rigidity:
+        """Where a flat or straight shape is flexible, its rigidity in its own plane or line."""
+        flexible = self.rigidity_class is RigidityClass.FLEXIBLE
+        return self.within if flexible and self.within is not None else self
 
     def force(self, b: float, mass: float = 1.0) -> float:
         """Greatest norm of f_C (all agents) [N] under the exact law for a right side of norm `b` [m/s^2].
@@ -226,7 +232,7 @@ def flattened(p: Floats, space: int) -> tuple[Floats, Floats]:
     """
     d = distance_geometry.dimension(p)
     if d > space:
-        raise ValueError(f"a shape of dimension {d} does not fit into a {_WHERE[space]}")
+        raise ValueError(f"a shape of dimension {d} does not fit into a {WHERE[space]}")
     x = p - p.mean(axis=0)
     axes = np.eye(3) if d == 3 else np.linalg.svd(x, full_matrices=True)[2]
     return np.pad(x @ axes[:d].T, [(0, 0), (0, space - d)]), axes
@@ -256,7 +262,7 @@ def judge(
             reason += f", but one motion hardly does (index {frame.s[-1]:.1e}): expect large forces"
         return RigidityClass.INFINITESIMALLY_RIGID, reason, None, None
     if within is not None and within.rigidity_class is RigidityClass.FLEXIBLE:
-        where = _WHERE[within.dimension]
+        where = WHERE[within.dimension]
         return (
             RigidityClass.FLEXIBLE,
             f"flexible already within its own {where}: {within.reason}",

@@ -244,10 +244,9 @@ def joined(frame: Framework, goal: Floats, strides: int) -> bool:
         ahead = flexes.T @ gap
         ahead = flexes.T @ way if ahead @ flexes.T @ way < 0 else ahead
         way = flexes @ ahead / max(np.linalg.norm(ahead), 1e-12)
-        there = restore(
-            here + step * way.reshape(here.shape), frame.edges, frame.lengths, 1e-9 * size
-        )
-        if there is None or not 0.5 * step < np.linalg.norm(aligned(there, here) - here) < 2 * step:
+        ahead = here + step * way.reshape(here.shape)
+        there = restore(ahead, frame.edges, frame.lengths, 1e-9 * size)
+        if there is None or not 0.5 < np.linalg.norm(aligned(there, here) - here) / step < 2:
             return False
         here = there
     return False

@@ -85,18 +85,7 @@ class Realisations:
     @property
     def unique(self) -> bool:
         """Whether the search found only the intended shape and its mirror image."""
-        return not self.others
-
-    @property
-    def others(self) -> tuple[Realisation, ...]:
-        """The other shapes, each without its mirror image; one of each family."""
-        out: list[Realisation] = []
-        for r in self.found:
-            new = r.bends or r.kind not in (Kind.SAME, Kind.MIRRORED)
-            size = np.linalg.norm(r.slots, axis=1).max()
-            apart = [np.abs(_pairs(r.slots) - _pairs(q.slots)).max() for q in out]
-            out += [r] if new and min(apart, default=np.inf) > _ALIKE * size else []
-        return tuple(out)
+        return all(r.kind in (Kind.SAME, Kind.MIRRORED) for r in self.found)
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -122,9 +111,9 @@ def realisations(
     """Search for all shapes whose edges are as long as those of the slots.
 
     Levenberg-Marquardt runs on (L^2 - d^2)/(2 d) from random positions of the size of the shape, all starts at
-    once. Equal shapes are recognised by all-pairs distances and handedness. Shapes that bend into each other count as
-    one, the first found, or the intended one. The search is no proof of completeness: the share of starts that led to
-    each shape shows how thorough it was.
+    once. Equal shapes are recognised by all-pairs distances. A mirror image counts as another shape only if it is that
+    of the intended one. Shapes that bend into each other count as one, the first found, or the intended one. The search
+    is no proof of completeness: the share of starts that led to each shape shows how thorough it was.
 
     Parameters
     ----------
@@ -142,10 +131,8 @@ def realisations(
         As `analyse`; or the start is not (N, 3).
     """
     p, e = checked(slots, edges)
-    p, axes = p - p.mean(axis=0), np.eye(3)
-    drawn = p
-    if dimension < 3:
-        p, axes = flattened(p, dimension)
+    drawn = p - p.mean(axis=0)
+    p, axes = flattened(p, dimension) if dimension < 3 else (drawn, np.eye(3))
     n, length = len(p), np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
     size = float(np.linalg.norm(p, axis=1).max(initial=0.0))
     if n < 2 or not len(e):
@@ -165,8 +152,7 @@ def realisations(
             groups.add(end, 1)
     end = None
     if start is not None:
-        begin = _positions(start, n)
-        begin = begin if dimension == 3 else aligned(begin, drawn) @ axes[:dimension].T
+        begin = aligned(_positions(start, n), drawn) @ axes[:dimension].T
         end = lead(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
     first = groups.families(e)
@@ -185,7 +171,7 @@ def realisations(
 
 
 class _Groups:
-    """Shapes distinguished by all-pairs distances and handedness."""
+    """Shapes distinguished by all-pairs distances, and the intended one, which comes first, by handedness."""
 
     def __init__(self, intended: Floats, tol: float) -> None:
         self._intended, self._tol = intended, tol
@@ -197,7 +183,9 @@ class _Groups:
         pairs = _pairs(p)
         for k in range(len(self.shapes)):
             q, seen = self.shapes[k]
-            if np.abs(self._pairs[k] - pairs).max() <= self._tol and self._fits(p, q):
+            if np.abs(self._pairs[k] - pairs).max() <= self._tol and (
+                np.abs(self._pairs[0] - pairs).max() > self._tol or self._fits(p, q)
+            ):
                 self.shapes[k] = (q, seen + count)
                 return k
         self._pairs.append(pairs)
