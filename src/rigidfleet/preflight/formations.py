@@ -196,10 +196,13 @@ def _confined(mission: Mission) -> Iterator[Remark]:
         return  # no forces; or equal ones, which accelerate unequal masses differently
     start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
     if start < _spanned(slots):
-        calm = mission.disturbances is None and mission.vehicle_models is None
+        # Where they share coordinates, not even rounding moves them off.
+        shared = np.ptp(np.hstack([mission.fleet.position, mission.fleet.velocity]), axis=0) == 0
+        sure = (shared[:3] & shared[3:]).sum() >= 3 - start
+        sure &= mission.disturbances is None and mission.vehicle_models is None
         text = f"all agents start on one {WHERE[start]}; forces between them cannot move them off it to '{name}'"
         text += f". Move one agent off the {WHERE[start]}, or use control = 'tracking' in '{first.name}'"
-        yield Remark("fails" if calm else "note", "formation", text)
+        yield Remark("fails" if sure else "note", "formation", text)
 
 
 def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
