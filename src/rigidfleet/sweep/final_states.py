@@ -21,9 +21,9 @@ from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
+from rigidfleet.mission.bounds import LENGTH, SPEED
 from rigidfleet.mission.formations import coincident
 from rigidfleet.mission.kinds import seconds
-from rigidfleet.mission.values import HUGE
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import RunRecord, refusal
@@ -105,7 +105,7 @@ def _prepare(sweep: Sweep) -> None:
 
 def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
-    bounded = np.all(np.abs(np.concatenate([r, v], axis=1)) <= HUGE, axis=(1, 2))
+    bounded = np.all((np.abs(r) <= LENGTH.most) & (np.abs(v) <= SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident(points)) for points in r.tolist()]
     found = {}
