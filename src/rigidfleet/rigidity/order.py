@@ -235,7 +235,7 @@ def joined(frame: Framework, goal: Floats, strides: int) -> bool:
     """
     here, way = frame.p, np.zeros(frame.p.size)
     size = np.linalg.norm(here - here.mean(axis=0), axis=1).max()
-    step = _STRIDE * size * np.sqrt(len(here))
+    step = most = _STRIDE * size * np.sqrt(len(here))
     for _ in range(strides):
         gap = (aligned(goal, here) - here).ravel()
         if np.linalg.norm(gap) <= step:
@@ -243,12 +243,15 @@ def joined(frame: Framework, goal: Floats, strides: int) -> bool:
         flexes = Framework(here, frame.edges).flexes
         ahead = flexes.T @ gap
         ahead = flexes.T @ way if ahead @ flexes.T @ way < 0 else ahead
-        way = flexes @ ahead / max(np.linalg.norm(ahead), 1e-12)
-        ahead = here + step * way.reshape(here.shape)
-        there = restore(ahead, frame.edges, frame.lengths, 1e-9 * size)
+        ahead = flexes @ ahead / max(np.linalg.norm(ahead), 1e-12)
+        there = here + step * ahead.reshape(here.shape)
+        there = restore(there, frame.edges, frame.lengths, 1e-9 * size)
         if there is None or not 0.5 < np.linalg.norm(aligned(there, here) - here) / step < 2:
-            return False
-        here = there
+            step /= 3  # round a sharp bend
+            if step < 1e-3 * most:
+                return False
+            continue
+        here, way, step = there, ahead, min(1.5 * step, most)
     return False
 
 
