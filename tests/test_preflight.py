@@ -638,6 +638,7 @@ def test_dimension_two_is_judged_in_the_plane(where, off):
     assert not any("flexible" in text for text in found)
 
 
+@pytest.mark.long
 def test_unequal_weights_shared_equally_fail_planar_formations():
     """A wrench shared by the paper's matrix tears a planar square of unequal masses, and moves one of equal masses."""
     for masses, passes in (([1.0, 2.0, 1.5, 0.7], False), (1.0, True)):
