@@ -580,7 +580,7 @@ def planar(seed):
 def test_planar_formations_fail_the_check_if_their_flights_fail(seeds):
     """Random planar formations, starts in their plane, tilted or off it: no flight that passes is said to fail.
 
-    What fails is said to fail, except shapes that are missed by a tenth more than the tolerance.
+    What fails is said to fail, except shapes that are missed by little, or by less than 4 tolerances after a step.
     """
     passed = 0
     for seed in seeds:
@@ -597,7 +597,7 @@ def test_planar_formations_fail_the_check_if_their_flights_fail(seeds):
         if assess(result).passed:
             assert check(flown).passed, seed
             passed += 1
-        elif error > 0.0125:
+        elif error > (0.04 if phases[0].get("reference") == "step" else 0.0125):
             assert failures(check(flown)) == {"formation"}, seed
     assert len(seeds) / 3 < passed < len(seeds)
 

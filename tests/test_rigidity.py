@@ -534,6 +534,7 @@ def test_in_a_plane_no_shape_is_turned_over():
     for side in (1, -1):
         start = p * [1, side, 1] + 0.05 * shape(3, 5, 2)
         led = realisations(p, edges, starts=20, dimension=2, start=start)
+        assert led.leads_to is not None
         assert (
             led.found[led.leads_to].kind is Kind.SAME
         )  # from either side: agents in space are turned over

@@ -36,8 +36,9 @@ SEARCHED = 12
 STARTS = 40
 
 
-#: A shape is said to be missed if its forecast is off by more tolerances: near it, forecasts are right to a tenth.
-_SURELY = 1.1
+#: A shape is said to be missed if its forecast is off by more tolerances. Near it, forecasts are right to a tenth;
+#: after a step of the reference, which throws the agents, to a factor of 3.
+_SURELY = {"shape": 1.1, "distances": 1.1, "squares": 1.1, "step": 3.0}
 
 #: Maximum work on formations, as an estimated time [s]. The estimate makes a check the same on every machine.
 _FORMING = 4.0
@@ -205,13 +206,13 @@ def _confined(mission: Mission) -> Iterator[Remark]:
         yield Remark("fails" if sure else "note", "formation", text)
 
 
-def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
+def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, float]]:
     """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
 
-    By name: the greatest dimension of the space that the agents keep to, and the greatest error of a pair at the end
-    of a phase, in tolerances.
+    By name: the greatest dimension of the space that the agents keep to, the greatest error of a pair at the end of a
+    phase, in tolerances, and the one above which it is sure to be missed.
     """
-    out: dict[str, tuple[int, float]] = {}
+    out: dict[str, tuple[int, float, float]] = {}
     name, unequal = None, len(set(mission.agents.mass)) > 1
     r, v = mission.fleet.position, centred(mission.fleet.velocity)
     for phase in mission.phases:
@@ -227,25 +228,29 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
             led = None if torn else lead(r, edges, lengths, 1e-6 * apart.min(), slots)
-            off, before = np.inf, out.get(name, (0, 0.0))
+            sure = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
+            off, before = np.inf, out.get(name, (0, 0.0, 0.0))
             if led is not None:
                 slots = led
                 off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / apart.min()
-            out[name] = max(before[0], space), max(before[1], off / TOLERANCE)
+            worst = max(before[1], off / TOLERANCE)
+            out[name] = max(before[0], space), worst, max(before[2], sure)
         r, v = slots, 0 * v
     return out
 
 
-def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Iterator[Remark]:
+def _flexible(
+    name: str, r: Rigidity, forecast: tuple[int, float, float] | None
+) -> Iterator[Remark]:
     """Remark on a formation that is flexible or in a plane; the forecast is None where slots hold it."""
     who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
     more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
     text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
     if not r.flexes:
         text = f"'{name}' has dimension = 2, but its agents leave their plane"
-    space, off = forecast or (3, 0.0)
+    space, off, sure = forecast or (3, 0.0, 0.0)
     kept = r.own.rigid and space <= r.own.space < 3
-    where = f"to within {off:.2g} tolerances of" if off <= _SURELY else "past"
+    where = f"to within {off:.2g} tolerances of" if off <= sure else "past"
     if kept:
         text += (
             f". It is rigid in its {WHERE[r.own.space]}, which forces between agents do not leave"
@@ -254,7 +259,7 @@ def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Ite
         text += f". Distances lead it {where} its shape"
     if forecast is None:
         yield Remark("note", "formation", f"{text}; slots hold it")
-    elif not kept and off > _SURELY:
+    elif not kept and off > sure:
         yield Remark("fails", "formation", f"{text}. Add edges (rigidfleet design), or track slots")
     elif not kept or r.space == 3:  # else it is as the mission says
         text += (
