@@ -293,10 +293,10 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
         n = sum(r.kind not in (Kind.SAME, Kind.MIRRORED) for r in others.found)
         share = sum(r.found for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED))
         bent = sum(r.bends for r in others.found)
-        families = f" ({bent} of them a family that bends)" * (bent > 0)
-        what = f"1 other shape{families} has" if n == 1 else f"{n} other shapes{families} have"
+        families = f", {bent} as a family that bends" * (bent > 0)
+        what = "1 other shape has" if n == 1 else f"{n} other shapes have"
         text = (
-            f"{what} the distances of '{f.name}'; {share} of {others.starts} random starts reach"
+            f"{what} the distances of '{f.name}'{families}; {share} of {others.starts} random starts reach"
             f" {'it' if n == 1 else 'them'}. Redundant edges or tracked slots prevent this"
         )
         yield Remark("note", "formation", text)
