@@ -487,7 +487,7 @@ def assembly_modes(p):
             x = np.array([A[1, 1] * b[0] - A[0, 1] * b[1], A[0, 0] * b[1] - A[1, 0] * b[0]])
             return x @ x - (legs[0] * det) ** 2, x / det + p[0] + turned
 
-        angles = np.linspace(0, 2 * np.pi, 9001)
+        angles = 0.1 + np.linspace(0, 2 * np.pi, 9001)  # off the root at 0, which is p
         values = np.array([placed(angle)[0] for angle in angles])
         for k in np.flatnonzero(values[:-1] * values[1:] < 0):
             root = brentq(lambda angle: placed(angle)[0], angles[k], angles[k + 1], xtol=1e-14)
