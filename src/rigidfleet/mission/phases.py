@@ -66,12 +66,10 @@ def _depends_on(
 ) -> tuple[Any, ...]:
     """All that the findings of phases depend on."""
     agents: Agents | None = parts.get("agents")
-    starts = () if agents is None else (
-        agents.position, agents.velocity, agents.thrust_limit, len(set(agents.mass)) > 1,
-    )  # fmt: skip
+    limits = None if agents is None else agents.thrust_limit
     keys = ("phases", "formations", "architecture", "assignment")
     read = ("lqr", "limits", "smoothness", "output_step")
-    return n, *starts, *map(collector.data.get, keys), *map(parts.get, read)
+    return n, limits, *map(collector.data.get, keys), *map(parts.get, read)
 
 
 def _check(
