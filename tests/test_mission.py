@@ -732,11 +732,11 @@ def test_drag_defaults_where_air_moves():
             "phases[1].blend",
             "no effect with reference 'step'",
         ),
-        # Forces along edges stay within the line through all agents.
         (
-            [("agents/position", [[0, 0, 0], [1, 1, 1], [3, 3, 3]]), ("phases/0/control", "open")],
-            "phases[1].control",
-            "start on one line",
+            [("dimension", 2), ("agents/position", [[0, 0, 0], [1, 1, 1], [3, 3, 4], [0, 1, 2]]),
+             ("formations", {"triangle": {"shape": "pyramid", "size": 4.0}}), ("phases", PLAIN["phases"][:1])],
+            "formations.triangle.dimension",
+            "do not lie in a plane",
         ),
         (
             [("formations/line", {"slots": [[0, 0, 0], [1, 0, 0], [0, 0, 0]]})],
@@ -797,17 +797,14 @@ def test_no_stabilisation_needs_no_stable_gains():
     assert Mission.from_dict(changed(edits)).constraint.alpha == 0
 
 
-def test_planar_start_cannot_leave_its_plane():
-    """Eight agents in a plane become no cube by forces along their edges, but by tracking slots."""
+def test_planar_start_is_a_mission():
+    """Eight agents in a plane are read, whatever moves them: a mission does not know the forces of its flight."""
     base = load_mission("establish-cube").to_dict()
     for p in base["agents"]["position"]:
         p[2] = p[0] + p[1] * 0.5
-    (finding,) = findings(base=base)
-    assert "start on one plane" in finding.problem
-    data = changed(
-        ("phases/0/control", "tracking"), ("phases/0/input_force", [0.0, 0.0, 0.0]), base=base
-    )
-    assert Mission.from_dict(data)
+    assert Mission.from_dict(base)
+    base["formations"]["cube"]["edges"] = []
+    assert Mission.from_dict(base)
 
 
 def test_all_errors_at_once():

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
@@ -459,6 +460,144 @@ def test_few_agents_have_one_shape(n):
     """Up to three agents, all distances leave one shape."""
     found = realisations(SPREAD[:n], graphs.complete_graph(n), starts=10)
     assert [r.kind for r in found.found] == [Kind.SAME]
+
+
+#: Two triangles joined by three edges.
+PRISM = [[0, 1], [0, 2], [1, 2], [3, 4], [3, 5], [4, 5], [0, 3], [1, 4], [2, 5]]
+
+
+def assembly_modes(p):
+    """All shapes (., 6, 2) of a three-prism up to reflection: the assembly modes of a planar platform on three legs.
+
+    The upper triangle is turned by an angle; two differences of the legs' equations are linear in its place, and the
+    third equation is left, a sextic for either hand of the triangle (Gosselin and Merlet, 1994).
+    """
+    legs = np.linalg.norm(p[:3] - p[3:], axis=1)
+    found = []
+    for hand in (1, -1):
+        q = (p[3:] - p[3]) * [1, hand]
+
+        def placed(angle, q=q):
+            c, s = np.cos(angle), np.sin(angle)
+            turned = q @ np.array([[c, s], [-s, c]])
+            w = turned - p[:3] + p[0]
+            A = 2 * w[1:]
+            b = legs[1:] ** 2 - legs[0] ** 2 - (w[1:] ** 2).sum(axis=1)
+            det = np.linalg.det(A)
+            x = np.array([A[1, 1] * b[0] - A[0, 1] * b[1], A[0, 0] * b[1] - A[1, 0] * b[0]])
+            return x @ x - (legs[0] * det) ** 2, x / det + p[0] + turned
+
+        angles = 0.1 + np.linspace(0, 2 * np.pi, 9001)  # off the root at 0, which is p
+        values = np.array([placed(angle)[0] for angle in angles])
+        for k in np.flatnonzero(values[:-1] * values[1:] < 0):
+            root = brentq(lambda angle: placed(angle)[0], angles[k], angles[k + 1], xtol=1e-14)
+            found.append(np.vstack([p[:3], placed(root)[1]]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    ("p", "count"),
+    [
+        # Twelve is the greatest number that these edges have in the plane (Borcea and Streinu, 2004).
+        ([[1.7, 0.6], [1.3, -2.5], [0.8, 2.9], [-0.5, -2.3], [2.7, 1.1], [-1.8, 1.0]], 12),
+        ([[2.0, -0.8], [1.2, 2.2], [0.8, 0.3], [1.6, 1.3], [-0.2, 0.4], [1.5, -2.6]], 10),
+        ([[0.8, -1.4], [-2.8, -2.9], [1.9, 2.5], [0.6, 1.4], [0.3, 2.6], [1.9, -3.0]], 8),
+    ],
+)
+def test_three_prism_has_up_to_twelve_shapes_in_its_plane(p, count):
+    """Searched in its plane, a flat three-prism has the shapes that its sextics have, up to reflection."""
+    tilt = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
+    slots = np.pad(p, [(0, 0), (0, 1)]) @ tilt.T
+    found = realisations(slots, PRISM, starts=400, dimension=2)
+    kinds = [r.kind for r in found.found]
+    assert kinds[:2] == [Kind.SAME, Kind.MIRRORED]
+    shapes_found = [
+        r.slots for r, kind in zip(found.found, kinds, strict=True) if kind is not Kind.MIRRORED
+    ]
+    wanted = assembly_modes(np.array(p))
+    assert len(shapes_found) == len(wanted) == count
+    pairs = graphs.complete_graph(6)
+    got = np.array([distance_geometry.distances(q, pairs) for q in shapes_found])
+    for q in wanted:
+        apart = np.abs(got - distance_geometry.distances(np.pad(q, [(0, 0), (0, 1)]), pairs))
+        assert apart.max(axis=1).min() < 1e-5
+    assert all(r.rigid and not r.bends for r in found.found)
+
+
+def test_in_a_plane_no_shape_is_turned_over():
+    """A flat shape by all distances is one shape in space, and itself and its mirror image in its plane."""
+    p = shape(4, 5, 2)
+    edges = graphs.complete_graph(5)
+    assert [r.kind for r in realisations(p, edges, starts=40).found] == [Kind.SAME]
+    found = realisations(p, edges, starts=40, dimension=2)
+    assert [r.kind for r in found.found] == [Kind.SAME, Kind.MIRRORED]
+    for side in (1, -1):
+        start = p * [1, side, 1] + 0.05 * shape(3, 5, 2)
+        led = realisations(p, edges, starts=20, dimension=2, start=start)
+        assert led.leads_to is not None
+        assert (
+            led.found[led.leads_to].kind is Kind.SAME
+        )  # from either side: agents in space are turned over
+
+
+@given(SEEDS, st.integers(3, 8), st.floats(0.4, 1))
+@settings(max_examples=15)
+def test_dimension_two_is_the_rigidity_within_the_plane(seed, n, share):
+    """Analysed in its plane, a flat shape has the rank, class and flexes that it has within it in space."""
+    p, edges = shape(seed, n, 2), graph(seed, n, share)
+    flat, within = analyse(p, edges, dimension=2), analyse(p, edges).within
+    assert within is not None
+    assert (flat.space, flat.rank, flat.needed) == (2, within.rank, 2 * n - 3)
+    assert flat.rigidity_class is within.rigidity_class
+    assert len(flat.flexes) == 2 * n - 3 - np.linalg.matrix_rank(jacobian(p, edges), tol=1e-6)
+
+
+def test_spatial_shapes_have_no_plane():
+    """Shapes in space are refused where they are searched in a plane."""
+    with pytest.raises(ValueError, match="dimension 3 does not fit into a plane"):
+        realisations(SPREAD, graphs.complete_graph(5), dimension=2)
+
+
+def chair(bond=4.0, angle=110.0):
+    """A ring of six with equal sides and angles, up and down in turn, as cyclohexane's, with sides and next sides."""
+    across = 2 * bond * np.sin(np.deg2rad(angle) / 2)  # of next neighbours
+    radius = across / np.sqrt(3)
+    height = np.sqrt(bond**2 - radius**2)
+    k = np.arange(6)
+    p = np.column_stack(
+        [radius * np.cos(k * np.pi / 3), radius * np.sin(k * np.pi / 3), height / 2 * (-1.0) ** k]
+    )
+    return p, np.array([[i, (i + step) % 6] for i in range(6) for step in (1, 2)])
+
+
+@pytest.mark.parametrize(
+    ("bond", "angle", "starts"), [(5.0, 109.47, 40), (3.0, 112.0, 60), (4.0, 105.0, 40)]
+)
+def test_chair_is_rigid_and_its_boats_are_one_family(bond, angle, starts):
+    """Rings of six like cyclohexane's have a rigid chair, with its mirror image, and one family of boats that bends.
+
+    Known since Sachse (1890): the octahedron of the ring's twelve distances is flexible as Bricard's in the boat.
+    """
+    p, edges = chair(bond, angle)
+    found = realisations(p, np.sort(edges, axis=1), starts=starts, seed=1)
+    family = found.found[-1]
+    assert {r.kind for r in found.found[:-1]} <= {Kind.SAME, Kind.MIRRORED}
+    assert not any(r.bends for r in found.found[:-1])
+    assert (family.kind, family.rigid, family.bends) == (Kind.FOLDED, False, True)
+    assert family.found > 0.5 * starts
+    assert not found.unique
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_linkages_of_four_have_the_families_of_grashof(seed):
+    """In the plane, four bars in a ring have two families if s + l < p + q, and else one (Grashof, 1883)."""
+    p = np.random.default_rng(seed).uniform(-2, 2, (4, 2))
+    ring = [[0, 1], [1, 2], [2, 3], [0, 3]]
+    s, a, b, length = np.sort(np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1))
+    found = realisations(p, ring, starts=16, dimension=2)
+    assert len(found.found) == (2 if s + length < a + b else 1)
+    assert all(r.bends for r in found.found)
+    assert len(realisations(p, ring, starts=16).found) == 1  # in space, it folds over
 
 
 def test_start_must_fit():

@@ -188,6 +188,11 @@ def _formation(collector: FindingCollector, form: Formation, n: int | None, path
         _edges(collector, form, n, (*path, "edges"))
     if form.distances is not None and collector.right(path, "edges", "distances"):
         _distances(collector, form, form.distances, n, (*path, "distances"))
+    if (form.dimension or collector.data.get("dimension")) == 2 and collector.right(path):
+        slots = form.slot_array(n)
+        if slots is not None and distance_geometry.dimension(slots) > 2:
+            problem = "the slots do not lie in a plane, but the dimension is 2"
+            collector.add((*path, "dimension"), problem, "use 3, or move the slots into a plane")
 
 
 def _shape(

@@ -13,7 +13,6 @@ from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import toml_key
 from rigidfleet.foreign.pieces import CHANNELS, jump, rows_to_curve
 from rigidfleet.formation import distance_geometry
-from rigidfleet.math import rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, near
@@ -67,12 +66,10 @@ def _depends_on(
 ) -> tuple[Any, ...]:
     """All that the findings of phases depend on."""
     agents: Agents | None = parts.get("agents")
-    starts = () if agents is None else (
-        agents.position, agents.velocity, agents.thrust_limit, len(set(agents.mass)) > 1,
-    )  # fmt: skip
+    limits = None if agents is None else agents.thrust_limit
     keys = ("phases", "formations", "architecture", "assignment")
     read = ("lqr", "limits", "smoothness", "output_step")
-    return n, *starts, *map(collector.data.get, keys), *map(parts.get, read)
+    return n, limits, *map(collector.data.get, keys), *map(parts.get, read)
 
 
 def _check(
@@ -547,8 +544,6 @@ def _formations(
                 collector.add((*path, "attitude"), problem, remedy)
             if n is not None and form is not None and sound(collector, shaping.formation):
                 _blendable(collector, shaping, form, n, path)
-                if held == "" and "agents" in parts:
-                    _reachable(collector, shaping, form, parts["agents"], path)
             held = shaping.formation
         form = forms.get(held) if held else None
         tracked = p.control == "tracking" and collector.right(path, "control")
@@ -589,24 +584,6 @@ def _blendable(
             problem = f"the slots of {agent_names(edges[k])} are {between[k]:.7g} m apart"
             remedy = f"correct it, or use reference = 'distances' in phase {p.name}"
             collector.add(("formations", p.formation, "distances", int(k)), problem, remedy)
-
-
-def _reachable(
-    collector: FindingCollector, p: Shaping, form: Formation, agents: Agents, path: Keys
-) -> None:
-    """Find starts on a line or plane: forces along the edges cannot move the agents out of it."""
-    if p.control != "open" or not collector.right(path, "control", "input_force"):
-        return
-    if any(p.input_force) and len(set(agents.mass)) > 1:
-        return  # equal forces accelerate unequal masses differently
-    target = form.slot_array(len(agents.position))
-    motion = [rigid_body.centred(agents.position), rigid_body.centred(agents.velocity)]
-    start = distance_geometry.dimension(np.vstack([*motion, *(-m for m in motion)]))
-    if target is not None and start < distance_geometry.dimension(target):
-        where = ("point", "line", "plane")[start]
-        problem = f"all agents start on one {where}; forces between them cannot move them off it"
-        remedy = f"move one agent off the {where} or use control = 'tracking'"
-        collector.add((*path, "control"), problem, remedy, p.control)
 
 
 def _smooth(parts: Mapping[str, Any]) -> bool:

@@ -462,6 +462,10 @@ class Formation(Part):
     distances: tuple[Length, ...] | None = Field(
         None, description="length of each edge [m]; default: those between the slots"
     )
+    dimension: Literal[2, 3] | None = Field(
+        None,
+        description="dimension of the space in which the agents keep this formation; default: that of the mission",
+    )
     agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = Field(
         None, description="number of vehicles in the shape, if the others rest; default: all"
     )
@@ -749,6 +753,11 @@ class MissionHeader(Part):
         9.81, description="gravity [m/s^2], >= 0"
     )
     output_step: Time = Field(0.05, description="time between samples of the result [s]")
+    dimension: Literal[2, 3] = Field(
+        3,
+        description="dimension of the space in which the agents keep their formations, for `check`: 2: in a plane, "
+        "where it judges rigidity and searches other shapes; no flight changes by it",
+    )
 
 
 class GeodeticOrigin(Part):

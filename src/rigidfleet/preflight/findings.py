@@ -19,6 +19,7 @@ from rigidfleet.rigidity import (
     Rigidity,
     Spectrum,
 )
+from rigidfleet.rigidity.analysis import WHERE
 
 #: Maximum number of names in one remark.
 _TOLD = 6
@@ -468,8 +469,7 @@ def _formation_words(f: FormationCheck) -> str:
         held += f", solved by {solvers.WORDS[f.method]}"
     parts = [f"{r.rigidity_class}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
     if r.reachable < r.needed:
-        where = "line" if r.dimension == 1 else "plane"
-        parts[0] += f" ({r.reachable} reachable on a {where})"
+        parts[0] += f" ({r.reachable} reachable on a {WHERE[r.dimension]})"
     if len(r.redundant):
         names = ", ".join(f"{i}-{j}" for i, j in (r.edges[r.redundant][:6] + 1).tolist())
         more = ", ..." if len(r.redundant) > 6 else ""
@@ -484,6 +484,7 @@ def _formation_words(f: FormationCheck) -> str:
         )
     if f.realisations is not None:
         parts.append(_realisation_words(f.realisations))
+        parts[-1] += f" (in its {WHERE[r.own.space]})" * (r.own.space < 3)
     return "; ".join(parts)
 
 
@@ -500,7 +501,7 @@ def _realisation_words(r: Realisations) -> str:
     """How many random starts reach which shape: 36 of 40 random starts reach this shape, 4 its mirror image."""
     if not r.found:
         return f"none of {r.starts} random starts converges"
-    first, *others = [(x.found, _GOALS[x.kind]) for x in r.found]
+    first, *others = [(x.found, _GOALS[x.kind] + " that bends" * x.bends) for x in r.found]
     verb = "reaches" if first[0] == 1 else "reach"
     text = f"{first[0]} of {r.starts} random starts {verb} {first[1]}"
     text += "".join(f", {count} {goal}" for count, goal in others[:3])

@@ -9,17 +9,22 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry
+from rigidfleet.formation.graphs import complete_graph
+from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
 from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, some
 from rigidfleet.rigidity import (
     Kind,
+    Rigidity,
     RigidityClass,
     analyse,
     realisations,
     spectrum,
 )
+from rigidfleet.rigidity.analysis import WHERE, flattened
+from rigidfleet.rigidity.realisations import lead
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
@@ -30,6 +35,10 @@ SEARCHED = 12
 #: Number of random starts of this search: enough to find common shapes in a tenth of a second.
 STARTS = 40
 
+
+#: A shape is said to be missed if its forecast is off by more tolerances. Near it, forecasts are right to a tenth;
+#: after a step of the reference, which throws the agents, to a factor of 3.
+_SURELY = {"shape": 1.1, "distances": 1.1, "squares": 1.1, "step": 3.0}
 
 #: Maximum work on formations, as an estimated time [s]. The estimate makes a check the same on every machine.
 _FORMING = 4.0
@@ -69,15 +78,20 @@ def _formation(
     method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
     if slots is None or not len(edges):
         return FormationCheck(name, None, held, method=method)
+    masses, space = mission.agents.mass, mission.formations[name].dimension or mission.dimension
     if min(len(edges), 3 * mission.n_agents) > DENSE:
-        ends = spectrum(slots, edges, mission.agents.mass) if len(slots) <= LANCZOS else None
+        start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
+        if held == "distances" and max(start, _spanned(slots)) == 2:
+            space = 2  # which they do not leave
+        points = slots if space == 3 else flattened(slots, space)[0]
+        ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
-    rigidity = analyse(slots, edges, masses=mission.agents.mass)
-    endless = rigidity.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
+    rigidity = analyse(slots, edges, masses=masses, dimension=space)
+    endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
     if not search or endless or contradiction(mission, name) is not None:
         return FormationCheck(name, rigidity, held, method=method)
-    start = mission.agents.position
-    others = realisations(slots, edges, starts=STARTS, start=start)
+    start, space = mission.agents.position, rigidity.own.space
+    others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
     return FormationCheck(name, rigidity, held, others, method)
 
 
@@ -111,6 +125,14 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         yield Remark("note", "formation", text)
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
         yield Remark("note", "formation", f"{some(idle)} not used in any phase")
+    yield from _confined(mission)
+    soft = {
+        f.name
+        for f in formations
+        if f.rigidity is not None and f.held_by == "distances"
+        and (f.rigidity.rigidity_class is RigidityClass.FLEXIBLE or f.rigidity.space < 3)
+    }  # fmt: skip
+    forecasts = _forecasts(mission, soft) if soft else {}
     for f in formations:
         if f.held_by == "nothing":
             continue
@@ -130,6 +152,9 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 held = ". Add edges, or track slots" if alone else "; slots hold it"
                 yield Remark("fails" if alone else "note", "formation", text + held)
             continue
+        if r is None and alone and not len(mission.formation_edges(f.name)):
+            text = f"'{f.name}' has no edges: where no slots are tracked, only a force of your own (simulate) forms it"
+            yield Remark("note", "formation", text)
         if r is None and mission.formation_slots(f.name) is not None:
             continue  # too large to check
         if r is None:
@@ -137,12 +162,8 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 text = f"the distances of '{f.name}' do not determine positions: its rigidity is not checked"
                 yield Remark("note", "formation", text)
             continue
-        if r.rigidity_class is RigidityClass.FLEXIBLE:
-            who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
-            more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
-            text = f"'{f.name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
-            held = ". Add edges (rigidfleet design), or track slots" if alone else "; slots hold it"
-            yield Remark("fails" if alone else "note", "formation", text + held)
+        if r.rigidity_class is RigidityClass.FLEXIBLE or f.name in soft:
+            yield from _flexible(f.name, r, forecasts.get(f.name))
         elif r.rigidity_class is RigidityClass.UNDECIDED and alone:
             yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
         elif r.rigidity_class is RigidityClass.PRESTRESS_STABLE and alone:
@@ -157,6 +178,94 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
             )
             yield Remark("fails", "formation", text)
         yield from _other_shapes(mission, f, alone=alone)
+
+
+def _spanned(points: Floats, *moves: Floats) -> int:
+    """Dimension of the space that points and movements (N, 3) about their means keep to."""
+    x = np.vstack([centred(points), *moves, *(-move for move in moves)])
+    return distance_geometry.dimension(x)
+
+
+def _confined(mission: Mission) -> Iterator[Remark]:
+    """Remark on agents that start on a line or in a plane, which forces along their edges cannot move them off."""
+    first = next((phase for phase in mission.phases if phase.shaping is not None), None)
+    name = first.shaping.formation if first is not None and first.shaping is not None else None
+    slots, unequal = mission.slots_about_cm(name), len(set(mission.agents.mass)) > 1
+    if first is None or name is None or slots is None or first.control != "open":
+        return
+    if not len(mission.formation_edges(name)) or (unequal and any(first.input_force)):
+        return  # no forces; or equal ones, which accelerate unequal masses differently
+    start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
+    if start < _spanned(slots):
+        # Where they share coordinates, not even rounding moves them off.
+        shared = np.ptp(np.hstack([mission.fleet.position, mission.fleet.velocity]), axis=0) == 0
+        sure = (shared[:3] & shared[3:]).sum() >= 3 - start
+        sure &= mission.disturbances is None and mission.vehicle_models is None
+        text = f"all agents start on one {WHERE[start]}; forces between them cannot move them off it to '{name}'"
+        text += f". Move one agent off the {WHERE[start]}, or use control = 'tracking' in '{first.name}'"
+        yield Remark("fails" if sure else "note", "formation", text)
+
+
+def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, float]]:
+    """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
+
+    By name: the greatest dimension of the space that the agents keep to, the greatest error of a pair at the end of a
+    phase, in tolerances, and the one above which it is sure to be missed.
+    """
+    out: dict[str, tuple[int, float, float]] = {}
+    name, unequal = None, len(set(mission.agents.mass)) > 1
+    r, v = mission.fleet.position, centred(mission.fleet.velocity)
+    for phase in mission.phases:
+        name = phase.shaping.formation if phase.shaping is not None else name
+        slots = mission.slots_about_cm(name)
+        if name is None or slots is None:
+            continue
+        if phase.control != "tracking" and name in soft:
+            # The paper's matrix H shares weights equally among unequal masses, and tears the shape.
+            torn = phase.control == "body" and unequal and mission.allocation.method == "pinv"
+            space = 3 if torn else _spanned(r, v, unequal * np.array([phase.input_force]))
+            pairs = complete_graph(len(r))
+            apart = distance_geometry.distances(slots, pairs)
+            edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
+            led = None if torn else lead(r, edges, lengths, 1e-6 * apart.min(), slots)
+            sure = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
+            off, before = np.inf, out.get(name, (0, 0.0, 0.0))
+            if led is not None:
+                slots = led
+                off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / apart.min()
+            worst = max(before[1], off / TOLERANCE)
+            out[name] = max(before[0], space), worst, max(before[2], sure)
+        r, v = slots, 0 * v
+    return out
+
+
+def _flexible(
+    name: str, r: Rigidity, forecast: tuple[int, float, float] | None
+) -> Iterator[Remark]:
+    """Remark on a formation that is flexible or in a plane; the forecast is None where slots hold it."""
+    who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
+    more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
+    text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
+    if not r.flexes:
+        text = f"'{name}' has dimension = 2, but its agents leave their plane"
+    space, off, sure = forecast or (3, 0.0, 0.0)
+    kept = r.own.rigid and space <= r.own.space < 3
+    where = f"to within {off:.2g} tolerances of" if off <= sure else "past"
+    if kept:
+        text += (
+            f". It is rigid in its {WHERE[r.own.space]}, which forces between agents do not leave"
+        )
+    elif forecast is not None:
+        text += f". Distances lead it {where} its shape"
+    if forecast is None:
+        yield Remark("note", "formation", f"{text}; slots hold it")
+    elif not kept and off > sure:
+        yield Remark("fails", "formation", f"{text}. Add edges (rigidfleet design), or track slots")
+    elif not kept or r.space == 3:  # else it is as the mission says
+        text += (
+            "; nothing resists what else moves it (gusts, unequal weights, lags). Tracked slots do"
+        )
+        yield Remark("note", "formation", text)
 
 
 def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
@@ -183,9 +292,11 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     elif not others.unique:
         n = sum(r.kind not in (Kind.SAME, Kind.MIRRORED) for r in others.found)
         share = sum(r.found for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED))
+        bent = sum(r.bends for r in others.found)
+        families = f", {bent} as a family that bends" * (bent > 0)
         what = "1 other shape has" if n == 1 else f"{n} other shapes have"
         text = (
-            f"{what} the distances of '{f.name}'; {share} of {others.starts} random starts reach"
+            f"{what} the distances of '{f.name}'{families}; {share} of {others.starts} random starts reach"
             f" {'it' if n == 1 else 'them'}. Redundant edges or tracked slots prevent this"
         )
         yield Remark("note", "formation", text)

@@ -55,7 +55,7 @@ def _drift(mission: Mission) -> Iterator[Remark]:
     """Remark that without feedback an error of a distance grows at its initial rate."""
     text = "there is no feedback (stabilisation = 'none'): errors of distances remain and grow at their initial rate"
     first = mission.phases[0].establishing
-    if first is None:
+    if first is None or first.control == "tracking":
         yield Remark("note", "gains", text)
         return
     r, v = mission.fleet.position, mission.fleet.velocity
@@ -70,6 +70,7 @@ def _drift(mission: Mission) -> Iterator[Remark]:
     end = phase_spans(mission)[0][1]
     error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.least_time / 2
     error = np.abs(np.where(first.reference == "step", L - d + c_dot * end, error))
-    fails = error.max() > TOLERANCE * d.min()
-    text += f"; by {end:g} s they reach {error.max():.2g} m"
+    worst = error.max(initial=0.0)
+    fails = worst > TOLERANCE * d.min(initial=np.inf)
+    text += f"; by {end:g} s they reach {worst:.2g} m"
     yield Remark("fails" if fails else "note", "gains", text)

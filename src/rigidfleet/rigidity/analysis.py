@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.formation.distance_geometry import dimension
+from rigidfleet.formation import distance_geometry
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.rigidity.framework import Flex, Framework, localised
 from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
@@ -28,7 +28,7 @@ class RigidityClass(StrEnum):
 #: Index below which a formation is rigid in name only: 1 mm of length error allows 1 m of displacement.
 _BARELY = 1e-3
 
-_WHERE = {0: "point", 1: "line", 2: "plane", 3: "space"}
+WHERE = ("point", "line", "plane", "space")
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,12 @@ class Rigidity:
             RigidityClass.PRESTRESS_STABLE,
         )
 
+    @property
+    def own(self) -> Rigidity:
+        """Where a flat or straight shape is flexible, its rigidity in its own plane or line."""
+        flexible = self.rigidity_class is RigidityClass.FLEXIBLE
+        return self.within if flexible and self.within is not None else self
+
     def force(self, b: float, mass: float = 1.0) -> float:
         """Greatest norm of f_C (all agents) [N] under the exact law for a right side of norm `b` [m/s^2].
 
@@ -121,7 +127,12 @@ class Rigidity:
 
 
 def analyse(
-    slots: ArrayLike, edges: ArrayLike, *, space: int = 3, masses: ArrayLike | None = None
+    slots: ArrayLike,
+    edges: ArrayLike,
+    *,
+    dimension: int = 3,
+    masses: ArrayLike | None = None,
+    space: int | None = None,
 ) -> Rigidity:
     """Analyse a formation: rank, redundant edges, free motions, rigidity index and class.
 
@@ -139,8 +150,9 @@ def analyse(
     ----------
     slots : (N, 3) [m], or (N, d) with d <= 3
     edges : (m, 2), agents from 0
-    space : dimension of the space in which the agents move; below 3, they stay in the shape's plane or line
+    dimension : of the space in which the agents move, 1 to 3; below 3, they stay in the shape's plane or line
     masses : (N,) [kg], default equal
+    space : the former name of `dimension`
 
     Raises
     ------
@@ -149,17 +161,14 @@ def analyse(
         occurs twice; a slot is not finite; the shape does not fit into the space; or a mass is not positive.
     """
     p, e = checked(slots, edges)
-    n = len(p)
-    flat, axes = _flattened(p)
-    d = flat.shape[1]
-    if d > space:
-        raise ValueError(f"a shape of dimension {d} does not fit into a {_WHERE[space]}")
-    frame = Framework(np.pad(flat, [(0, 0), (0, space - d)]), e)
-    within = analyse(flat, e, space=d, masses=masses) if 0 < d < space else None
+    n, space, d = len(p), space or dimension, distance_geometry.dimension(p)
+    flat, axes = flattened(p, space)
+    frame = Framework(flat, e)
+    within = analyse(flat[:, :d], e, dimension=d, masses=masses) if 0 < d < space else None
     motions = localised(frame)
     to_world = axes[:space]
     flexes = tuple(Flex(agents, motion @ to_world) for agents, motion in motions)
-    rigidity_class, reason, stress, bent = _judge(frame, within)
+    rigidity_class, reason, stress, bent = judge(frame, within)
     return Rigidity(
         agents=n,
         edges=e,
@@ -213,14 +222,20 @@ def checked(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
     return p, e
 
 
-def _flattened(p: Floats) -> tuple[Floats, Floats]:
-    """Points (N, d) of a shape of dimension d in the axes (3, 3) that hold it, exactly flat."""
-    d = dimension(p)
+def flattened(p: Floats, space: int) -> tuple[Floats, Floats]:
+    """Points (N, space) about their centre, exactly flat, in axes (3, 3) of which those of the shape come first.
+
+    Raises
+    ------
+    ValueError
+        The shape does not fit into a space of this dimension.
+    """
+    d = distance_geometry.dimension(p)
+    if d > space:
+        raise ValueError(f"a shape of dimension {d} does not fit into a {WHERE[space]}")
     x = p - p.mean(axis=0)
-    if d == 3:
-        return x, np.eye(3)
-    axes = np.linalg.svd(x, full_matrices=True)[2]
-    return x @ axes[:d].T, axes
+    axes = np.eye(3) if d == 3 else np.linalg.svd(x, full_matrices=True)[2]
+    return np.pad(x @ axes[:d].T, [(0, 0), (0, space - d)]), axes
 
 
 def _index(frame: Framework, masses: ArrayLike | None) -> float:
@@ -236,8 +251,8 @@ def _index(frame: Framework, masses: ArrayLike | None) -> float:
     return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])
 
 
-def _judge(
-    frame: Framework, within: Rigidity | None
+def judge(
+    frame: Framework, within: Rigidity | None = None
 ) -> tuple[RigidityClass, str, Floats | None, Floats | None]:
     """Class, reason, blocking stress, deformed shape."""
     k = frame.flexes.shape[1]
@@ -247,7 +262,7 @@ def _judge(
             reason += f", but one motion hardly does (index {frame.s[-1]:.1e}): expect large forces"
         return RigidityClass.INFINITESIMALLY_RIGID, reason, None, None
     if within is not None and within.rigidity_class is RigidityClass.FLEXIBLE:
-        where = _WHERE[within.dimension]
+        where = WHERE[within.dimension]
         return (
             RigidityClass.FLEXIBLE,
             f"flexible already within its own {where}: {within.reason}",

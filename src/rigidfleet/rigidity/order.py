@@ -15,7 +15,6 @@ from __future__ import annotations
 import numpy as np
 
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.rigidity.framework import Framework, sparse
 from rigidfleet.typing import Floats, Ints
 
@@ -28,6 +27,10 @@ _EQUAL = 1e-12
 #: A flex is finite if it moves an agent this far, as a share of the shape's size; a walk along it ends at _FAR.
 #: A framework rigid at order n would be off by about the n-th power of it, which is far more than _EQUAL.
 _FINITE, _FAR = 0.01, 0.1
+
+#: Stride of a walk from one shape to another, as a share of the size for each agent, and the greatest number of them:
+#: few to the nearest shape of a family, and then enough to go round a closed curve.
+_STRIDE, STRIDES = 0.1, (20, 300)
 
 
 class StressEnergy:
@@ -187,7 +190,7 @@ def _follow(frame: Framework, direction: Floats) -> Floats | None:
     here, best, most = p, p, 0.0
     for _ in range(80):
         there = restore(here + step * direction, frame.edges, frame.lengths, _EQUAL * size)
-        moved = np.zeros_like(p) if there is None else _aligned(there, here) - here
+        moved = np.zeros_like(p) if there is None else aligned(there, here) - here
         if not 0.5 * step < np.linalg.norm(moved) < 2 * step:
             if here is p or step < 1e-3 * size:
                 break
@@ -195,7 +198,7 @@ def _follow(frame: Framework, direction: Floats) -> Floats | None:
             continue
         here, direction = here + moved, moved / np.linalg.norm(moved)
         step = min(1.5 * step, 0.05 * size * np.sqrt(len(p)))
-        gone = np.linalg.norm(_aligned(here, p) - p, axis=1).max()
+        gone = np.linalg.norm(aligned(here, p) - p, axis=1).max()
         best, most = (here, gone) if gone > most else (best, most)
         if most > _FAR * size:
             break
@@ -224,9 +227,37 @@ def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | Non
     return None
 
 
-def _aligned(p: Floats, onto: Floats) -> Floats:
-    """Points p (N, d) moved rigidly to fit others."""
-    space = [(0, 0), (0, 3 - p.shape[1])]
-    R = kabsch(np.pad(onto, space), np.pad(p, space))
-    x = np.pad(p - p.mean(axis=0), space) @ R.T
-    return x[:, : p.shape[1]] + onto.mean(axis=0)
+def joined(frame: Framework, goal: Floats, strides: int) -> bool:
+    """Whether shapes with the same lengths lead from a framework to another one, (N, d), in small steps.
+
+    The walk goes towards the other shape as far as the flexes let it. Where it would turn back, it goes on: a
+    family of one motion is a closed curve.
+    """
+    here, way = frame.p, np.zeros(frame.p.size)
+    size = np.linalg.norm(here - here.mean(axis=0), axis=1).max()
+    step = most = _STRIDE * size * np.sqrt(len(here))
+    for _ in range(strides):
+        gap = (aligned(goal, here) - here).ravel()
+        if np.linalg.norm(gap) <= step:
+            return True
+        flexes = Framework(here, frame.edges).flexes
+        ahead = flexes.T @ gap
+        ahead = flexes.T @ way if ahead @ flexes.T @ way < 0 else ahead
+        ahead = flexes @ ahead / max(np.linalg.norm(ahead), 1e-12)
+        there = here + step * ahead.reshape(here.shape)
+        there = restore(there, frame.edges, frame.lengths, 1e-9 * size)
+        if there is None or not 0.5 < np.linalg.norm(aligned(there, here) - here) / step < 2:
+            step /= 3  # round a sharp bend
+            if step < 1e-3 * most:
+                return False
+            continue
+        here, way, step = there, ahead, min(1.5 * step, most)
+    return False
+
+
+def aligned(p: Floats, onto: Floats) -> Floats:
+    """Points p (N, d) moved rigidly, without reflection in their d dimensions, to fit others."""
+    x, y = p - p.mean(axis=0), onto - onto.mean(axis=0)
+    u, _, vt = np.linalg.svd(y.T @ x)
+    u[:, -1] *= np.linalg.det(u @ vt)
+    return x @ (u @ vt).T + onto.mean(axis=0)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.math.rigid_body import kabsch
-from rigidfleet.rigidity.analysis import checked
+from rigidfleet.rigidity.analysis import RigidityClass, checked, flattened, judge
 from rigidfleet.rigidity.framework import Framework
+from rigidfleet.rigidity.order import STRIDES, aligned, joined
 from rigidfleet.typing import Floats, Ints
 
 #: Shapes whose all-pairs distances differ by less than this share of their size count as equal.
@@ -41,7 +41,8 @@ class Realisation:
     found : number of starts that led to this shape
     deviation : greatest difference of an all-pairs distance from the intended [m]
     closest : least distance between two agents [m]
-    rigid : whether it is infinitesimally rigid; if not, it may be one of a continuum of shapes
+    rigid : whether it is infinitesimally rigid
+    bends : whether it stands for a family of shapes, into which a finite motion bends it that keeps all distances
     """
 
     kind: Kind
@@ -50,6 +51,7 @@ class Realisation:
     deviation: float
     closest: float
     rigid: bool
+    bends: bool = False
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -59,6 +61,7 @@ class Realisation:
             "deviation": self.deviation,
             "closest": self.closest,
             "rigid": self.rigid,
+            "bends": self.bends,
             "slots": self.slots.tolist(),
         }
 
@@ -103,12 +106,14 @@ def realisations(
     seed: int = 0,
     start: ArrayLike | None = None,
     iterations: int = 150,
+    dimension: int = 3,
 ) -> Realisations:
     """Search for all shapes whose edges are as long as those of the slots.
 
     Levenberg-Marquardt runs on (L^2 - d^2)/(2 d) from random positions of the size of the shape, all starts at
-    once. Equal shapes are recognised by all-pairs distances and handedness. The search is no proof of completeness:
-    the share of starts that led to each shape shows how thorough it was.
+    once. Equal shapes are recognised by all-pairs distances. A mirror image counts as another shape only if it is that
+    of the intended one. Shapes that bend into each other count as one, the first found, or the intended one. The search
+    is no proof of completeness: the share of starts that led to each shape shows how thorough it was.
 
     Parameters
     ----------
@@ -117,6 +122,8 @@ def realisations(
     starts, seed, iterations : budget and seed of the search; 200 starts of 8 agents take a second
     start : (N, 3) [m] positions from which the distances are established; `leads_to` gives the result. The squared
         lengths are led from those at the start to the desired ones, as `reference = "squares"` does
+    dimension : of the space in which the agents move, 1 to 3; in a plane, a flat shape cannot be turned over, and has
+        a mirror image
 
     Raises
     ------
@@ -124,14 +131,15 @@ def realisations(
         As `analyse`; or the start is not (N, 3).
     """
     p, e = checked(slots, edges)
-    p = p - p.mean(axis=0)
+    drawn = p - p.mean(axis=0)
+    p, axes = flattened(p, dimension) if dimension < 3 else (drawn, np.eye(3))
     n, length = len(p), np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
     size = float(np.linalg.norm(p, axis=1).max(initial=0.0))
     if n < 2 or not len(e):
-        return Realisations((_describe(p, p, e, 1, size),), starts, starts)
+        return Realisations((_describe(p, p, e, 1, size, axes),), starts, starts)
     rng = np.random.default_rng(seed)
-    spread = np.sqrt((p**2).sum() / (3 * n))
-    at = rng.normal(scale=spread, size=(starts, n, 3))
+    spread = np.sqrt((p**2).sum() / (dimension * n))
+    at = rng.normal(scale=spread, size=(starts, n, dimension))
     groups = _Groups(p, _ALIKE * size)
     groups.add(p, 0)
     converged = 0
@@ -142,21 +150,28 @@ def realisations(
         converged += int(reached.sum())
         for end in ends[reached]:
             groups.add(end, 1)
-    end = None if start is None else _led(_positions(start, n), e, length, _REACHED * size)
+    end = None
+    if start is not None:
+        begin = aligned(_positions(start, n), drawn) @ axes[:dimension].T
+        end = lead(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
-    found = [_describe(q, p, e, count, size) for q, count in groups.shapes]
+    first = groups.families(e)
+    found = {}
+    for k in set(first):
+        count = sum(seen for (_, seen), j in zip(groups.shapes, first, strict=True) if j == k)
+        found[k] = _describe(groups.shapes[k][0], p, e, count, size, axes)
     rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
-    order = sorted(range(len(found)), key=lambda k: (rank.get(found[k].kind, 2), -found[k].found))
+    order = sorted(found, key=lambda k: (rank.get(found[k].kind, 2), -found[k].found, k))
     return Realisations(
         tuple(found[k] for k in order),
         starts,
         converged,
-        None if last is None else order.index(last),
+        None if last is None else order.index(first[last]),
     )
 
 
 class _Groups:
-    """Shapes distinguished by all-pairs distances and handedness."""
+    """Shapes distinguished by all-pairs distances, and the intended one, which comes first, by handedness."""
 
     def __init__(self, intended: Floats, tol: float) -> None:
         self._intended, self._tol = intended, tol
@@ -168,38 +183,53 @@ class _Groups:
         pairs = _pairs(p)
         for k in range(len(self.shapes)):
             q, seen = self.shapes[k]
-            if np.abs(self._pairs[k] - pairs).max() <= self._tol and self._fits(p, q):
+            if np.abs(self._pairs[k] - pairs).max() <= self._tol and (
+                np.abs(self._pairs[0] - pairs).max() > self._tol or self._fits(p, q)
+            ):
                 self.shapes[k] = (q, seen + count)
                 return k
         self._pairs.append(pairs)
-        self.shapes.append((_onto(p, self._intended), count))
+        self.shapes.append((aligned(p, self._intended), count))
         return len(self.shapes) - 1
+
+    def families(self, e: Ints) -> list[int]:
+        """Of each shape, the first one into which it bends while the edges (m, 2) keep their lengths; or itself."""
+        frames = [Framework(q, e) for q, _ in self.shapes]
+        bend = [k for k, frame in enumerate(frames) if frame.flexes.size]
+        first = list(range(len(frames)))
+        for strides in STRIDES:
+            for k in (k for k in bend if first[k] == k):
+                nearest: dict[int, int] = {}  # shape of each family
+                for j in sorted(bend, key=lambda j: np.abs(self._pairs[j] - self._pairs[k]).max()):
+                    nearest.setdefault(first[j], j)
+                for family, j in nearest.items():
+                    if family < k and joined(frames[k], frames[j].p, strides):
+                        first = [family if i == k else i for i in first]
+                        break
+        return first
 
     def _fits(self, p: Floats, q: Floats) -> bool:
         # Distance errors e make a flat shape sqrt(e) thick, so a wide gap must distinguish a mirror image.
-        return bool(np.linalg.norm(_onto(p, q) - q, axis=1).max() <= 30 * self._tol)
+        return bool(np.linalg.norm(aligned(p, q) - q, axis=1).max() <= 30 * self._tol)
 
 
-def _describe(q: Floats, p: Floats, e: Ints, found: int, size: float) -> Realisation:
+def _describe(q: Floats, p: Floats, e: Ints, found: int, size: float, axes: Floats) -> Realisation:
     deviation = float(np.abs(_pairs(q) - _pairs(p)).max(initial=0.0))
     closest = float(_pairs(q).min(initial=np.inf))
     if deviation <= _ALIKE * size:
-        same = np.linalg.norm(_onto(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
+        same = np.linalg.norm(aligned(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
         kind = Kind.SAME if same else Kind.MIRRORED
     else:
         kind = Kind.COINCIDENT if closest <= _ALIKE * size else Kind.FOLDED
-    rigid = Framework(q, e).flexes.shape[1] == 0
-    return Realisation(kind, q, found, deviation, closest, rigid)
+    frame = Framework(q, e)
+    rigid = frame.flexes.shape[1] == 0
+    bends = not rigid and judge(frame)[0] is RigidityClass.FLEXIBLE
+    return Realisation(kind, q @ axes[: q.shape[1]], found, deviation, closest, rigid, bends)
 
 
 def _pairs(p: Floats) -> Floats:
     i, j = np.triu_indices(len(p), 1)
     return np.linalg.norm(p[i] - p[j], axis=1)
-
-
-def _onto(p: Floats, q: Floats) -> Floats:
-    x, y = p - p.mean(axis=0), q - q.mean(axis=0)
-    return x @ kabsch(y, x).T
 
 
 def _positions(start: ArrayLike, n: int) -> Floats:
@@ -209,13 +239,24 @@ def _positions(start: ArrayLike, n: int) -> Floats:
     return at
 
 
-def _led(start: Floats, e: Ints, length: Floats, tol: float) -> Floats | None:
-    """Final positions (N, 3) when the squared lengths are led in small steps to the desired ones."""
+def lead(
+    start: Floats, e: Ints, length: Floats, tol: float, slots: Floats | None = None
+) -> Floats | None:
+    """Positions (N, d) to which lengths (m,) lead that go from those at the start to the desired ones in small steps.
+
+    Squared lengths are blended, or, given slots (N, d), the positions. None if the desired ones are not met within
+    tol [m].
+    """
     at = start[None]
     now = ((start[e[:, 0]] - start[e[:, 1]]) ** 2).sum(axis=1)
+    goal = None if slots is None else aligned(slots, start)
     steps = 50
     for k in range(1, steps + 1):
-        wanted = np.sqrt(np.maximum(now + (length**2 - now) * (k / steps), (1e-3 * length) ** 2))
+        squares = now + (length**2 - now) * (k / steps)
+        if goal is not None and k < steps:
+            between = start + (goal - start) * (k / steps)
+            squares = ((between[e[:, 0]] - between[e[:, 1]]) ** 2).sum(axis=1)
+        wanted = np.sqrt(np.maximum(squares, (1e-3 * length) ** 2))
         at, reached = _descend(at, e, wanted, tol, 8 if k < steps else 300)
     return at[0] if reached[0] else None
 
@@ -223,18 +264,18 @@ def _led(start: Floats, e: Ints, length: Floats, tol: float) -> Floats | None:
 def _descend(
     at: Floats, e: Ints, length: Floats, tol: float, iterations: int
 ) -> tuple[Floats, np.ndarray]:
-    """Levenberg-Marquardt from positions (B, N, 3): final positions, and which of them have the lengths within tol."""
+    """Levenberg-Marquardt from positions (B, N, d): final positions, and which of them have the lengths within tol."""
     at = at.copy()
-    count, n = at.shape[:2]
+    count, n, d = at.shape
     ends, done = at.copy(), np.zeros(count, dtype=bool)
     damping = np.full(count, 1e-2)
     i, j = e.T
-    rows, size = np.arange(len(e)), 3 * n
+    rows, size = np.arange(len(e)), d * n
     lane = np.arange(count)
     c = _lack(at, i, j, length)
     for _ in range(iterations):
         x = (at[:, i] - at[:, j]) / length[:, None]
-        J = np.zeros((len(at), len(e), n, 3))
+        J = np.zeros((len(at), len(e), n, d))
         J[:, rows, i], J[:, rows, j] = x, -x
         J = J.reshape(len(at), len(e), size)
         K = J.transpose(0, 2, 1) @ J

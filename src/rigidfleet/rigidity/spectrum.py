@@ -43,27 +43,28 @@ class Spectrum:
 
 
 def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:
-    """Both ends of the spectrum of a formation in space, by Lanczos' method, with inversion at the lower end.
+    """Both ends of the spectrum of a formation, by Lanczos' method, with inversion at the lower end.
 
-    Parameters: points (N, 3) [m], edges (m, 2), masses (N,) [kg].
+    Parameters: points (N, d) [m], d the dimension of the space in which they move; edges (m, 2); masses (N,) [kg].
     """
     from scipy.sparse import csr_array, eye_array
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 
     p, m = np.asarray(points, dtype=np.float64), np.asarray(masses, dtype=np.float64)
-    n, count = len(p), len(edges)
+    (n, d), count = p.shape, len(edges)
     u = p[edges[:, 0]] - p[edges[:, 1]]
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     share = np.sqrt(m.mean() / m)
     data = np.stack([u * share[edges[:, 0], None], -u * share[edges[:, 1], None]], axis=1)
-    columns = 3 * edges[:, :, None] + np.arange(3)
-    J = csr_array((data.ravel(), columns.ravel(), np.arange(0, 6 * count + 1, 6)), (count, 3 * n))
+    columns = d * edges[:, :, None] + np.arange(d)
+    rows = np.arange(0, 2 * d * count + 1, 2 * d)
+    J = csr_array((data.ravel(), columns.ravel(), rows), (count, d * n))
     K = (J.T @ J).tocsc()
-    start = np.random.default_rng(0).normal(size=3 * n)
+    start = np.random.default_rng(0).normal(size=d * n)
     w_max = float(eigsh(K, k=1, v0=start, return_eigenvectors=False)[0])
     # A shift slightly below zero, where K can be factored. Rigid motions are removed: they would hide the next ones.
     shift = -1e-6 * w_max
-    solve, rigid = splu(K - shift * eye_array(3 * n, format="csc")).solve, rigid_motions(p, m)
+    solve, rigid = splu(K - shift * eye_array(d * n, format="csc")).solve, rigid_motions(p, m)
 
     def inverse(x: Floats) -> Floats:
         y = solve(x - rigid @ (rigid.T @ x))

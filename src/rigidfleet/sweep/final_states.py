@@ -20,9 +20,9 @@ from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
+from rigidfleet.mission.bounds import LENGTH, SPEED
 from rigidfleet.mission.formations import coincident
 from rigidfleet.mission.kinds import seconds
-from rigidfleet.mission.values import HUGE
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import RunRecord, refusal
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from rigidfleet.sweep.definition import Sweep
 
 
-#: Relative extent along an axis below which agents may be in a plane or line; then their mission is checked in full.
-_CLEARLY = 1e-5
 #: Messages of failed checks, in the order of a verdict.
 _WORDS = {
     "complete": "the flight stopped early; fly its mission alone to see when, where and why",
@@ -106,31 +104,16 @@ def _prepare(sweep: Sweep) -> None:
 
 def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
-    bounded = np.all(np.abs(np.concatenate([r, v], axis=1)) <= HUGE, axis=(1, 2))
+    bounded = np.all((np.abs(r) <= LENGTH.most) & (np.abs(v) <= SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident(points)) for points in r.tolist()]
     found = {}
-    for k in np.flatnonzero(~(bounded & apart & _spread(sweep.mission, r, v))):
+    for k in np.flatnonzero(~(bounded & apart)):
         try:
             Mission.from_dict(sweep.varied(runs[k]))
         except MissionError as error:
             found[int(k)] = refusal(error)
     return found
-
-
-def _spread(mission: Mission, r: Floats, v: Floats) -> Bools:
-    """Mask (B,): agents and their velocities clearly span as many dimensions as each formation requires."""
-    asked = [
-        mission.formation_slots(p.shaping.formation)
-        for p in mission.phases
-        if p.shaping is not None
-    ]
-    needed = max((dimension(slots) for slots in asked if slots is not None), default=0)
-    if not needed:
-        return np.ones(len(r), dtype=bool)
-    x = np.concatenate([z - z.mean(axis=1, keepdims=True) for z in (r, v)], axis=1)
-    extent = np.linalg.eigvalsh(x.swapaxes(1, 2) @ x)  # squared, in ascending order
-    return np.asarray(extent[:, 3 - needed] > _CLEARLY**2 * extent[:, 2])
 
 
 def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
