@@ -29,6 +29,7 @@ from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
     NAME_OR_LIST,
     Acceleration,
+    AgentNumber,
     Angle,
     AttitudeGains,
     BodyDrag,
@@ -271,6 +272,9 @@ class Agents(Part):
     )
     velocity: tuple[Velocity, ...] = Field(
         (), description="initial velocity of each agent [m/s]; default: at rest"
+    )
+    fixed: tuple[AgentNumber, ...] = Field(
+        (), description="numbers of agents that never move, in missions that track no slots"
     )
     radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = Field(
         (0.25,),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, NotRequired, TypedDict
 
 _Three = tuple[float, float, float]
 
@@ -13,9 +13,10 @@ class _Moment(TypedDict):
 
 
 class Passed(_Moment):
-    """A point that the centre of mass is to pass, and when."""
+    """A point that the centre of mass is to pass, when, and at which velocity if that is commanded."""
 
     position: _Three
+    velocity: NotRequired[_Three]
 
 
 class Target(_Moment, total=False):
