@@ -70,8 +70,7 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
         return Course(None, t_end, None)
-    place = None if phase.shaping is None else phase.shaping.position
-    r = now.goal.r if place is None else np.array(place)
+    r = now.goal.r if (place := getattr(phase, "position", None)) is None else np.array(place)
     goal = changed(now.goal, r=r, v=np.zeros(3), omega=np.zeros(3))
     return _led(mission, phase, now, goal, arrival, t_end)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal, NamedTuple, NotRequired, TypedDict
+from typing import Annotated, Any, Literal, NamedTuple, TypedDict
 
 _Three = tuple[float, float, float]
 
@@ -12,11 +12,14 @@ class _Moment(TypedDict):
     time: float
 
 
-class Passed(_Moment):
+class _Place(_Moment):
+    position: _Three
+
+
+class Passed(_Place, total=False):
     """A point that the centre of mass is to pass, when, and at which velocity if that is commanded."""
 
-    position: _Three
-    velocity: NotRequired[_Three]
+    velocity: _Three
 
 
 class Target(_Moment, total=False):
