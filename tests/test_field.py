@@ -415,21 +415,20 @@ def test_fixed_agents_track_nothing():
 
 
 def test_each_example_of_the_page_prints_what_it_says(capsys):
-    """Every block of the page runs by itself, asserts its comparison, and prints the line below it."""
+    """Each block of the page runs after those above it, asserts its comparison, and prints the lines below it."""
     text = Path(__file__).parents[1].joinpath("docs/examples-of-the-field.md").read_text("utf-8")
-    parts = re.findall(
-        r"^```python\n(.*?)^```\n\n```text\n(.*?)^```", text, re.DOTALL | re.MULTILINE
+    blocks = re.findall(
+        r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```\n)?", text, re.DOTALL | re.MULTILINE
     )
-    assert len(parts) >= 6
-    assert len(parts) == text.count("```python")
-    number = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
-    for code, shown in parts:
-        assert "assert " in code
-        exec(compile(code, "examples-of-the-field.md", "exec"), {})
+    assert len(blocks) == 7
+    number, names = re.compile(r"-?\d+\.?\d*(?:e[-+]\d+)?"), {}
+    for code, shown in blocks:
+        exec(compile(code, "examples-of-the-field.md", "exec"), names)
         printed = capsys.readouterr().out
         assert number.sub("", printed) == number.sub("", shown)
+        assert "assert " in code or not shown
         for x, y in zip(number.findall(printed), number.findall(shown), strict=True):
             if "e" in y:  # an error of a method, which other processors round otherwise
-                assert abs(float(x)) < 5 * abs(float(y))
+                assert abs(float(x)) <= 10 * abs(float(y))
             else:
                 assert float(x) == pytest.approx(float(y), rel=1e-6)

@@ -274,7 +274,7 @@ class Agents(Part):
         (), description="initial velocity of each agent [m/s]; default: at rest"
     )
     fixed: tuple[AgentNumber, ...] = Field(
-        (), description="numbers of agents that never move, in missions that track no slots"
+        (), description="numbers of agents that never move; only with control 'open', solver 'pinv'"
     )
     radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = Field(
         (0.25,),
