@@ -183,11 +183,9 @@ def passed(trajectory: BodyTrajectory | None) -> tuple[dict[str, Any], ...]:
     """The points that a trajectory passes, as a result records them (`result.phases.Passed`)."""
     if not isinstance(trajectory, SmoothTrajectory):
         return ()
-    points = zip(trajectory.times()[1:-1].tolist(), trajectory.through, strict=True)
-    return tuple(
-        at.model_dump(mode="json", exclude_none=True) | {"time": trajectory.t0 + t}
-        for t, at in points
-    )
+    times = trajectory.t0 + trajectory.times()[1:-1]
+    points = [at.model_dump(mode="json", exclude_none=True) for at in trajectory.through]
+    return tuple(at | {"time": t} for at, t in zip(points, times.tolist(), strict=True))
 
 
 def rotation_of(start: Pose, T1: Floats) -> Floats:
