@@ -608,8 +608,9 @@ class Measurements:
             if samples.stop == samples.start or result.time[samples.stop - 1] < point["time"]:
                 continue
             k = self.nearest(point["time"], index)
-            miss = math.dist(result.cm[k].tolist(), point["position"])
-            yield Waypoint(float(result.time[k]), miss, None, None, None)
+            miss, v = math.dist(result.cm[k].tolist(), point["position"]), point.get("velocity")
+            off = None if v is None else math.dist(result.cm_velocity[k].tolist(), v)
+            yield Waypoint(float(result.time[k]), miss, off, None, None)
 
 
 def _meets(there: list[list[float]], phase: PhaseRecord) -> bool:

@@ -113,7 +113,7 @@ class PhaseVerdict:
     order : False if the agents of a line are out of order
     waypoint : the miss of a waypoint
     stay : how far a phase that promises to stay is off its place at its end
-    through : the misses of the points to pass on the way, in position
+    through : the misses of the points to pass on the way, in position, and in velocity where one is commanded
     worst : extremes by name: constraint |c| [m], separation [m], clearance [m], thrust [N],
         speed [m/s], acceleration [m/s^2], constraint_force [N], tension [N] (negative: a push),
         singular_value

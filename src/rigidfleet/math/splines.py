@@ -102,17 +102,20 @@ def stopping_piece(T: float, begin: Floats) -> Floats:
     return np.concatenate([ends + begin[0][None, ..., None], place, ends], axis=-1)
 
 
-def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats) -> Floats:
+def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Floats) -> Floats:
     """Pieces of degree 7 (n, ..., 8) through points x (n + 1, ...) at times (n + 1,) [s] with the least snap.
 
     Of all ways through the points, with velocity, acceleration and jerk ``begin`` and ``end`` (3, ...) at the ends,
     this one has the least integral of |snap|^2. It has six continuous derivatives: at the inner points, velocity,
-    acceleration and jerk follow from the continuity of the next three derivatives. A velocity of NaN at the end is
+    acceleration and jerk follow from the continuity of the next three derivatives. They may have a velocity ``v`` each
+    (...), NaN where it is free; where one is met, the sixth derivative may jump. A velocity of NaN at the end is
     free: the transversality condition x^(6) = 0 there leaves the least snap.
     """
     if np.isnan(end[0]).any():
-        ends = [np.stack([np.full_like(end[0], v), *end[1:]]) for v in (0.0, 1.0)]
-        slow, fast = (minimum_snap(times, x, begin, one) for one in ends)  # linear in the velocity
+        ends = [np.stack([np.full_like(end[0], speed), *end[1:]]) for speed in (0.0, 1.0)]
+        slow, fast = (
+            minimum_snap(times, x, begin, one, *v) for one in ends
+        )  # linear in the velocity
         h = times[-1] - times[-2]
         least, most = (way[-1, ..., 6] + 7.0 * h * way[-1, ..., 7] for way in (slow, fast))
         return slow + (least / (least - most))[..., None] * (fast - slow)
@@ -130,8 +133,12 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats) -> Floats
                 one = np.zeros((4, inner + 2, 1))
                 one[m + 1, k + 1] = 1.0
                 A[:, :, m, k] = _jumps(t, one)[..., 0]
-        b = -_jumps(t, full).reshape(3 * inner, -1)
-        found = np.linalg.solve(A.reshape(3 * inner, 3 * inner), b)
+        b = -_jumps(t, full)
+        for k, velocity in enumerate(v):
+            if not np.isnan(velocity).any():
+                A[k, 2], b[k, 2] = 0.0, unit * velocity
+                A[k, 2, 0, k] = 1.0
+        found = np.linalg.solve(A.reshape(3 * inner, 3 * inner), b.reshape(3 * inner, -1))
         full[1:, 1:-1] = found.reshape(3, inner, *shape)
     pieces = septic_pieces(t, full)
     return pieces / unit ** np.arange(POWERS)
@@ -161,11 +168,11 @@ def snap_cost(pieces: Floats, times: Floats) -> float:
     )
 
 
-def allocated(x: Floats, total: float, begin: Floats, end: Floats) -> Floats:
+def allocated(total: float, x: Floats, *state: Floats) -> Floats:
     """Times (n + 1,) [s] from 0 to ``total`` at points x (n + 1, d) that make the snap of `minimum_snap` least.
 
-    From times that grow with the square root of each distance, by a quasi-Newton search (Richter, Bry and Roy, 2013,
-    search the times in the same way).
+    ``state`` are its arguments after the points. From times that grow with the square root of each distance, by a
+    quasi-Newton search (Richter, Bry and Roy, 2013, search the times in the same way).
     """
     from scipy.optimize import minimize
 
@@ -181,7 +188,7 @@ def allocated(x: Floats, total: float, begin: Floats, end: Floats) -> Floats:
         t = times(shares)
         if np.diff(t).min() < 1e-3 * total / n:
             return 1e3 * first
-        return float(np.log(snap_cost(minimum_snap(t, x, begin, end), t) + 1e-300))
+        return float(np.log(snap_cost(minimum_snap(t, x, *state), t) + 1e-300))
 
     way = np.linalg.norm(np.diff(x, axis=0), axis=1)
     start = 0.5 * np.log(np.maximum(way, 1e-3 * max(float(way.max()), 1e-9)))

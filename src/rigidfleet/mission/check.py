@@ -91,6 +91,8 @@ def check(data: Mapping[str, Any], origin: str, shared: Shared | None = None) ->
     parts["phases"] = phases.check(collector, parts, n)
     disturbances.check(collector, parts, n)
     vehicles.check_flight(collector, parts)
+    if not collector.findings and n is not None and parts["agents"].fixed:
+        _fixed(collector, parts, n)
     avoidance.check(collector, parts)
     if collector.findings:
         raise MissionError(collector.findings)
@@ -220,6 +222,22 @@ def _agents(collector: FindingCollector, parts: dict[str, Any]) -> None:
         collector.add(
             ("agents", "saturate"), "no limit to saturate at is given", "give thrust_limit [N]"
         )
+
+
+def _fixed(collector: FindingCollector, parts: dict[str, Any], n: int) -> None:
+    """Check that fixed agents exist, and that nothing is to move them or to change what they hold."""
+    agents, where = parts["agents"], ("agents", "fixed")
+    phases.members(collector, agents.fixed, n, where)
+    solver = parts.get("constraint", Constraint()).solver
+    d = parts.get("disturbances", Disturbances())
+    for wrong, problem, remedy in (
+        (any(any(agents.velocity[i - 1]) for i in agents.fixed if i <= n), "starts with a velocity", "remove it"),
+        (agents.vehicle or d.lost or (d.links and d.links.lost), "needs points that are not lost", "remove these keys"),
+        (solver not in ("pinv", "spectral"), "needs another solver", "use constraint.solver = 'pinv'"),
+        (any(p.control != "open" for p in parts["phases"]), "cannot track slots", "use control = 'open' in all phases"),
+    ):  # fmt: skip
+        if wrong:
+            collector.add(where, problem, remedy)
 
 
 def _touching(collector: FindingCollector, parts: dict[str, Any], n: int) -> None:

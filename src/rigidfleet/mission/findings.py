@@ -146,7 +146,8 @@ class FindingCollector:
             self._structural(error, kind, path)
         wrong = {error["loc"][0] for error in errors}
         rest = {key: value for key, value in data.items() if key not in wrong}
-        stand_in = {key: value for key, value in _STAND_IN.items() if key in kind.model_fields}
+        needed = {key for key, field in kind.model_fields.items() if field.is_required()}
+        stand_in = {key: _STAND_IN[key] for key in needed & _STAND_IN.keys()}
         try:
             return kind.model_validate(stand_in | rest)
         except ValidationError:

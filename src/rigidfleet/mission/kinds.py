@@ -7,16 +7,12 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-from pydantic import (
-    Field,
-    Strict,
-    model_validator,
-)
+from pydantic import Field, model_validator
 
 from rigidfleet.foreign.pieces import joined, rows_to_curve
-from rigidfleet.mission import bounds
 from rigidfleet.mission.values import (
     AUTO,
+    AgentNumber,
     Angle,
     Duration,
     Dwell,
@@ -108,6 +104,12 @@ class AnyPhase(Part):
         return None
 
     @property
+    def angles(self) -> list[str]:
+        """Commanded angles in words; empty to keep the attitude commanded before."""
+        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
+        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
+
+    @property
     def meets(self) -> tuple[str, ...]:
         """Which of position, velocity, attitude and rates are commanded at the arrival."""
         return ()
@@ -181,12 +183,6 @@ class Attitude(Part):
             return None
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
-    @property
-    def angles(self) -> list[str]:
-        """Commanded angles in words; empty to keep the attitude commanded before."""
-        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
-        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
-
 
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
@@ -204,10 +200,19 @@ class Shaping(AnyPhase):
         description="duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
     )
 
+    position: Vector | None = Field(
+        None, description="centre of mass at the end, at rest [x, y, z] [m]; default: as before"
+    )
+
     @property
     def shaping(self) -> Shaping:
         """The phase itself."""
         return self
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity, if a place is commanded."""
+        return () if self.position is None else ("position", "velocity")
 
     @property
     def least_time(self) -> float:
@@ -221,8 +226,9 @@ class Shaping(AnyPhase):
 
     @property
     def leads_to(self) -> str:
-        """The formation."""
-        return self.formation
+        """The formation, and its place and angles if they are commanded."""
+        place = [] if self.position is None else [_vector(self.position, "m")]
+        return ", ".join([self.formation, *place, *self.angles])
 
     def ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
@@ -249,11 +255,6 @@ class Establish(Attitude, Shaping):
     def establishing(self) -> Establish:
         """The phase itself."""
         return self
-
-    @property
-    def leads_to(self) -> str:
-        """The formation and its commanded angles."""
-        return ", ".join([self.formation, *self.angles])
 
 
 class Reshape(Shaping):
@@ -341,6 +342,9 @@ class Through(Part):
         None,
         description="time from the start of the phase [s]; default: the times with the least snap",
     )
+    velocity: Velocity | None = Field(
+        None, description="its velocity then [m/s]; default: the one with the least snap"
+    )
 
 
 class Fly(Steering):
@@ -354,7 +358,7 @@ class Fly(Steering):
     through: tuple[Through, ...] = Field(
         (),
         description="points to pass on the way, with the least snap (smooth missions): "
-        "`through = [{ position = [x, y, z], time = 4.0 }]`",
+        "`through = [{ position = [x, y, z], time = 4.0, velocity = [vx, vy, vz] }]`",
     )
 
     @property
@@ -442,7 +446,7 @@ class Vertical(Arriving):
 
     grounded: ClassVar[bool] = True
 
-    agents: tuple[Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)], ...] = Field(
+    agents: tuple[AgentNumber, ...] = Field(
         (), description="numbers of the vehicles that move; the others stay. Default: all"
     )
     stagger: Time | None = Field(

@@ -90,7 +90,7 @@ def _check(
             _smoothness(collector, p, ("phases", k), smooth=_smooth(parts))
             _automatic(collector, p, ("phases", k), parts)
             if n is not None and p.vertical is not None:
-                _members(collector, p.vertical, n, ("phases", k))
+                members(collector, p.vertical.agents, n, ("phases", k, "agents"))
             if n is not None and isinstance(p, Follow):
                 _followers(collector, p, n, ("phases", k))
             if n is not None and isinstance(p, Reshape) and p.control_points is not None:
@@ -308,6 +308,8 @@ def _controls(
         if p.control != "open" and any(p.input_force):
             problem = f"has no effect with control '{p.control}'"
             collector.add((*path, "input_force"), problem, "remove it or use control = 'open'")
+        if p.control != "tracking" and p.shaping is not None and p.shaping.position is not None:
+            collector.add((*path, "position"), "needs tracked slots", "use control = 'tracking'")
         if own := _OWN.get(collector.data["phases"][k]["kind"]):
             own(collector, p, path, lengths[k])
 
@@ -501,13 +503,13 @@ _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
 }
 
 
-def _members(collector: FindingCollector, p: Vertical, n: int, path: Keys) -> None:
-    """Check that the agents that take off or land exist, and are named once."""
-    beyond = [i for i in p.agents if i > n]
+def members(collector: FindingCollector, agents: Sequence[int], n: int, path: Keys) -> None:
+    """Check that agents, such as those that take off or land, exist, and are named once."""
+    beyond = [i for i in agents if i > n]
     if beyond:
-        collector.add((*path, "agents"), "there is no such agent", f"use 1 to {n}", beyond[0])
-    if len(set(p.agents)) < len(p.agents):
-        collector.add((*path, "agents"), "names an agent twice", "name each once", None)
+        collector.add(path, "there is no such agent", f"use 1 to {n}", beyond[0])
+    if len(set(agents)) < len(agents):
+        collector.add(path, "names an agent twice", "name each once", None)
 
 
 def _formations(

@@ -30,6 +30,7 @@ from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
     NAME_OR_LIST,
     Acceleration,
+    AgentNumber,
     Angle,
     AttitudeGains,
     BodyDrag,
@@ -272,6 +273,9 @@ class Agents(Part):
     )
     velocity: tuple[Velocity, ...] = Field(
         (), description="initial velocity of each agent [m/s]; default: at rest"
+    )
+    fixed: tuple[AgentNumber, ...] = Field(
+        (), description="numbers of agents that never move; only with control 'open', solver 'pinv'"
     )
     radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = Field(
         (0.25,),

@@ -74,6 +74,8 @@ Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
 Limit = Annotated[float, Strict(), Field(ge=FORCE.least, allow_inf_nan=True)]
 Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
 Flag = Annotated[bool, Strict()]
+#: Number of an agent, from 1.
+AgentNumber = Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)]
 _Three = Field(min_length=3, max_length=3)
 Vector = Annotated[tuple[Coordinate, ...], _Three]
 Velocity = Annotated[tuple[Annotated[float, Strict(), signed(SPEED)], ...], _Three]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -135,9 +135,7 @@ class SmoothTrajectory:
         """Pieces of degree 7: one, or one to each point."""
         start, goal = self.start, self.goal
         zero, times = np.zeros(3), self.times()
-        points = np.array([start.r, *(at.position for at in self.through), goal.r])
-        end = np.stack([goal.v, zero, zero])
-        cm = splines.minimum_snap(times, points, np.stack([start.v, start.a, start.jerk]), end)
+        cm = splines.minimum_snap(times, *self._to_meet)
         phi = np.stack([rotation_of(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
         turn = splines.septic_pieces(times[[0, -1]], phi)
         each = np.repeat(turn, len(times) - 1, axis=0)
@@ -151,10 +149,15 @@ class SmoothTrajectory:
         given = [at.time for at in self.through if at.time is not None]
         if len(given) == len(self.through):
             return np.array([0.0, *given, total])
-        start = self.start
-        points = np.array([start.r, *(at.position for at in self.through), self.goal.r])
-        end = np.stack([self.goal.v, np.zeros(3), np.zeros(3)])
-        return splines.allocated(points, total, np.stack([start.v, start.a, start.jerk]), end)
+        return splines.allocated(total, *self._to_meet)
+
+    @property
+    def _to_meet(self) -> tuple[Floats, ...]:
+        """Points, states at the ends and velocities between them, as `splines.minimum_snap` takes them."""
+        start, goal, zero = self.start, self.goal, np.zeros(3)
+        points = np.array([start.r, *(at.position for at in self.through), goal.r])
+        begin, end = np.stack([start.v, start.a, start.jerk]), np.stack([goal.v, zero, zero])
+        return points, begin, end, *(np.array(at.velocity or zero * np.nan) for at in self.through)
 
 
 @dataclass
@@ -168,14 +171,13 @@ class GivenTrajectory:
         return self.found
 
 
-def passed(trajectory: BodyTrajectory | None) -> tuple[tuple[float, Floats], ...]:
-    """Times [s] and positions (3,) [m] of the CM at the points that a trajectory passes."""
+def passed(trajectory: BodyTrajectory | None) -> tuple[dict[str, Any], ...]:
+    """The points that a trajectory passes, as a result records them (`result.phases.Passed`)."""
     if not isinstance(trajectory, SmoothTrajectory):
         return ()
     times = trajectory.t0 + trajectory.times()[1:-1]
-    return tuple(
-        zip(times.tolist(), (np.array(at.position) for at in trajectory.through), strict=True)
-    )
+    points = [at.model_dump(mode="json", exclude_none=True) for at in trajectory.through]
+    return tuple(at | {"time": t} for at, t in zip(points, times.tolist(), strict=True))
 
 
 def rotation_of(start: Pose, T1: Floats) -> Floats:

@@ -67,11 +67,12 @@ def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cou
 
 
 def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
-    """Come to rest at the previous goal; by the end, if that is known, because no time is given."""
+    """Come to rest at the previous goal, or the phase's own place; by the end, if known, as no time is given."""
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
         return Course(None, t_end, None)
-    goal = changed(now.goal, v=np.zeros(3), omega=np.zeros(3))
+    r = now.goal.r if (place := getattr(phase, "position", None)) is None else np.array(place)
+    goal = changed(now.goal, r=r, v=np.zeros(3), omega=np.zeros(3))
     return _led(mission, phase, now, goal, arrival, t_end)
 
 

@@ -15,7 +15,7 @@ from rigidfleet.math import turbulence
 from rigidfleet.mission import Gusts, Mission
 from rigidfleet.mission.disturbances import gust_step, intensity
 from rigidfleet.planning import filters
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Mass of a lost vehicle in the control laws [kg]: too small to count, yet nothing is divided by zero.
 NOTHING = 1e-20
@@ -99,6 +99,17 @@ def _places(mission: Mission) -> Floats:
     names = (p.establishing.formation for p in mission.phases if p.establishing is not None)
     slots = next((s for s in map(mission.formation_slots, names) if s is not None), None)
     return mission.fleet.position.copy() if slots is None else slots
+
+
+def held_in_place(problem: Problem, fixed: Ints) -> Problem:
+    """The problem in which agents (F,), from 0, never move: for the equations of motion their mass is infinite."""
+    m, true = problem.vehicles.m.copy(), problem.disturbance.inverse.copy()
+    m[fixed], true[fixed] = math.inf, 0.0
+    return problem._replace(
+        vehicles=problem.vehicles._replace(inverse=1.0 / m),
+        disturbance=problem.disturbance._replace(inverse=true),
+        graph=graph(problem.graph.edges, m),
+    )
 
 
 def without(

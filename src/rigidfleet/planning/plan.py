@@ -51,7 +51,7 @@ from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import passed
 from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course, lifted, regulators
-from rigidfleet.planning.disturbances import without
+from rigidfleet.planning.disturbances import held_in_place, without
 from rigidfleet.planning.reference import (
     PhaseState,
     Pose,
@@ -113,7 +113,7 @@ class PhasePlan:
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
     loses: bool  # whether vehicles or links are lost at any time of the mission
     blend: Reference  # of all edges, before any is released
-    through: tuple[tuple[float, Floats], ...] = ()  # times [s] and CM (3,) [m] to pass on the way
+    through: tuple[dict[str, Any], ...] = ()  # points to pass on the way (`passed`)
     smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
 
     @cached_property
@@ -138,14 +138,13 @@ class PhasePlan:
         turns = lies or "attitude" in meets
         reference = self.problem.reference
         shaped = reference.t0 + reference.T_b
-        through = [{"time": t, "position": r.tolist()} for t, r in self.through]
         return {
             "time": max(self.arrival, shaped) if lies else self.arrival,
             "position": goal.r.tolist() if "position" in meets else None,
             "velocity": goal.v.tolist() if "velocity" in meets else None,
             "attitude": [*_quaternion(goal.T)] if turns else None,
             "rates": goal.omega.tolist() if turns and not lies else None,
-            **({"through": through} if through else {}),
+            **({"through": list(self.through)} if self.through else {}),
         }
 
     def stay(self, t: float) -> dict[str, Any] | None:
@@ -329,6 +328,8 @@ def plan_phase(
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
         external=_bounded(external or External(), motion, reference),
     )  # fmt: skip
+    if mission.agents.fixed:
+        problem = held_in_place(problem, np.array(mission.agents.fixed) - 1)
     slots = after
     if phase.control == "open" and kind != SHAPE:
         slots = target if shaping is not None else now.slots

@@ -324,7 +324,7 @@ def _phases(
         blends = [round(float(x), 6) for x in phase.blend * shares / shares.sum()]
     parts = []
     for name, blend in zip(names, blends, strict=False):
-        kept = {key: x for key, x in table.items() if key not in ("until", "settle")}
+        kept = {key: x for key, x in table.items() if key not in ("until", "settle", "position")}
         parts.append(
             kept
             | {

@@ -12,10 +12,14 @@ class _Moment(TypedDict):
     time: float
 
 
-class Passed(_Moment):
-    """A point that the centre of mass is to pass, and when."""
-
+class _Place(_Moment):
     position: _Three
+
+
+class Passed(_Place, total=False):
+    """A point that the centre of mass is to pass, when, and at which velocity if that is commanded."""
+
+    velocity: _Three
 
 
 class Target(_Moment, total=False):

@@ -233,7 +233,7 @@ class Leader:
 
         plan = self.plan
         plan.t_end, plan.arrival = moved(plan.t_end), moved(plan.arrival)
-        plan.through = tuple((moved(time), r) for time, r in plan.through)
+        plan.through = tuple(at | {"time": moved(at["time"])} for at in plan.through)
         if begun < plan.blend.t0 + plan.blend.T_b:
             plan.blend = plan.blend._replace(t0=plan.blend.t0 + lost)
 

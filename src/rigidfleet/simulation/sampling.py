@@ -34,7 +34,7 @@ class Sampling:
         grid = np.minimum(np.arange(low, high) * step, t_end)
         lost = plan.lost_at
         losses = (*lost[np.isfinite(lost)], *plan.links_lost[1])
-        passed = (t for t, _ in plan.through)
+        passed = (at["time"] for at in plan.through)
         for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
             if t < exact <= t_end:
                 grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))

@@ -85,7 +85,7 @@ def _plain(phase: ActivePhase) -> bool:
 def _kind(phase: ActivePhase) -> tuple[object, ...]:
     """What phases that share steps have in common: when they are flown and recorded, and sizes of arrays."""
     plan, extremes = phase.plan, phase.extremes
-    points = tuple(t for t, _ in plan.through)
+    points = tuple(at["time"] for at in plan.through)
     times = plan.start, plan.t_end, plan.arrival, points
     return *times, plan.integrator.rtol, len(phase.state.y), len(extremes.boxes)
 
