@@ -432,3 +432,22 @@ def test_each_example_of_the_page_prints_what_it_says(capsys):
                 assert abs(float(x)) <= 10 * abs(float(y))
             else:
                 assert float(x) == pytest.approx(float(y), rel=1e-6)
+
+
+def test_a_free_arrival_keeps_velocities_on_the_way():
+    """A way with velocities at its points whose own arrival is free: both hold, and no other arrival costs less."""
+    times, x = np.array([0.0, 2.0, 5.0]), np.array([[0.0], [3.0], [4.0]])
+    begin, v = np.zeros((3, 1)), np.array([[1.5]])[0]
+
+    def cost(way):  # the integral of the square of the snap
+        total = 0.0
+        for piece, h in zip(way[:, 0], np.diff(times), strict=True):
+            snap = np.polynomial.Polynomial(piece).deriv(4)
+            total += (snap * snap).integ()(h)
+        return total
+
+    free = splines.minimum_snap(times, x, begin, np.array([[np.nan], [0.0], [0.0]]), v)
+    assert np.polynomial.Polynomial(free[0, 0]).deriv()(2.0) == pytest.approx(1.5)
+    for speed in np.linspace(-3.0, 3.0, 25):
+        fixed = splines.minimum_snap(times, x, begin, np.array([[speed], [0.0], [0.0]]), v)
+        assert cost(free) <= cost(fixed) * (1 + 1e-9)
