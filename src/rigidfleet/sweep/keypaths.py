@@ -144,7 +144,7 @@ def _filled(value: Any, n: int, field: FieldInfo | None = None) -> Any:
             )
             for k, f in fields
         )
-    if isinstance(value, float):
+    if kind is not None and isinstance(value, float):
         return next(([value] * (count or n) for listed, count in _LISTS if listed == kind), value)
     if isinstance(value, Part):
         return {k: _filled(getattr(value, k), n, f) for k, f in type(value).model_fields.items()}

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,10 +22,14 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet.mission.findings import near
-from rigidfleet.mission.values import HUGE, Number, Part, Positive
+from rigidfleet.mission.values import Number, Part, Positive
 
 #: Signs in a line, and the change that each stands for.
 SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
+
+
+#: Greatest number, as an integer may be beyond.
+_MOST = sys.float_info.max
 
 
 class Variation(Part):
@@ -137,7 +142,7 @@ class _Listed(Variation):
     def wrong(self) -> tuple[str, str, str] | None:
         """Error if a value is of another type, or if values that are not numbers are to be added or scaled."""
         if not all(map(_usable, self.values)):
-            words = "numbers up to 1e15, words, true or false, or lists of these"
+            words = "finite numbers, words, true or false, or lists of these"
             return "values", f"must be {words}", "correct the value"
         if self.change != "set" and not self._numeric:
             return (
@@ -266,7 +271,7 @@ def _usable(value: object) -> bool:
     """Whether a mission may have a value."""
     if isinstance(value, list | tuple | dict):
         return all(map(_usable, value.values() if isinstance(value, dict) else value))
-    return isinstance(value, str) or (isinstance(value, int | float) and abs(value) <= HUGE)
+    return isinstance(value, str) or (isinstance(value, int | float) and abs(value) <= _MOST)
 
 
 def _words(text: str) -> list[str]:

@@ -34,20 +34,25 @@ _KEPT = {-1: 256 << 20, -3: 32 << 20}
 _CONNECT = 20.0
 
 
-def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
-    """Fly a chunk of a sweep, given as JSON, for another process.
+def chunk(sweep: str, version: str, code: str, runs: Sequence[int]) -> list[RunRecord]:
+    """Fly a chunk of a sweep, given as JSON, for another process; ``code`` is the digest of its controller's file.
 
     Raises
     ------
     RigidfleetError
-        The other process has another version of rigidfleet.
+        The other process has another version of rigidfleet, or of the user's controller.
     """
     if version != __version__:
         raise RigidfleetError(
             f"a worker has rigidfleet {__version__}, but the sweep was started by {version}. Install the same version"
             " on all machines."
         )
-    return fly_runs(shared(sweep), runs)
+    flown = shared(sweep)
+    if flown.law[1] != code:
+        raise RigidfleetError(
+            f"a worker has another file of the controller {flown.header.controller}. Install the same on all machines."
+        )
+    return fly_runs(flown, runs)
 
 
 @contextmanager
