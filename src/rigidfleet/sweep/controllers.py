@@ -31,13 +31,16 @@ def imported(name: str) -> tuple[Any, str]:
         There is none, its module fails, or no controller can be made of the class. The message says why.
     """
     module, _, inside = name.partition(":")
+    search("")
     try:
         there = import_module(module)
         law = attrgetter(inside)(there)
         controller = law() if isinstance(law, type) else law
         code = Path(there.__file__ or "").read_bytes()
     except (Exception, SystemExit) as error:  # it runs a user's code
-        raise ImportError(f"cannot be imported: {type(error).__name__}: {error}") from error
+        raise ImportError(
+            f"{name!r} cannot be imported: {type(error).__name__}: {error}"
+        ) from error
     if not callable(controller):
-        raise ImportError(f"is {controller!r}, which cannot be called")
+        raise ImportError(f"{name!r} is {controller!r}, which cannot be called")
     return law, hashlib.sha256(code).hexdigest()

@@ -49,12 +49,9 @@ _LEAST = 2.0**-54
 #: Greatest number of runs.
 _RUNS = 10**8
 #: Tables with seeds of random numbers.
-_SEEDED = (
-    ("disturbances", "noise"),
-    ("disturbances", "gusts"),
-    ("disturbances", "links"),
-    ("avoidance",),
-)
+_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("disturbances", "links"), ("avoidance",)  # fmt: skip
+#: Keys that stores have since there are any: they are kept where they are not their defaults.
+_LATER = {"random_numbers", "controller", "rate"}
 
 
 class SweepHeader(Part):
@@ -123,6 +120,8 @@ class Sweep:
         self.mission, self.variations, self.header = mission, tuple(variations), header
         self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
         self.runs = header.runs or math.prod(self.grid_sizes.values())
+        if self.runs > _RUNS:
+            raise RigidfleetError(f"the grid has {self.runs:,} points: give runs, or fewer values.")
 
     @classmethod
     def of(
@@ -161,7 +160,7 @@ class Sweep:
         mission = as_mission(mission)
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
-        data = {"mission": mission.name, "vary": list(vary), **_without_none(keys)}
+        data = {"mission": mission.name, "vary": list(vary), **keys}
         return cls(mission, *_checked(data, origin, mission), name or mission.name)
 
     @classmethod
@@ -188,7 +187,7 @@ class Sweep:
         if isinstance(named, str):
             shipped = named in mission_names()
             mission = load_mission(named if shipped else path.parent / named)
-        data |= _without_none(keys)
+        data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(given := data.get("vary", []), list):
             data["vary"] = [*given, *more]
         controllers.search(path.parent)
@@ -227,21 +226,22 @@ class Sweep:
         """
         if not (name := self.header.controller):
             return None, ""
-        controllers.search("")
         try:
             return controllers.imported(name)
         except ImportError as error:
-            raise RigidfleetError(
-                f"controller = {name!r} {error}\n    {controllers.REMEDY}"
-            ) from error
+            raise RigidfleetError(f"controller: {error}\n    {controllers.REMEDY}") from error
 
-    @cached_property
-    def random_sources(self) -> list[str]:
-        """Sources of random numbers in the first run: noise, gusts, links, avoidance."""
-        tables = [(keys[-1], keypaths.look_up(self.varied(0), keys)) for keys in _SEEDED]
-        return [
-            k for k, x in tables if x is not None and (k != "avoidance" or x.get("sensing_noise"))
-        ]
+    @property
+    def version(self) -> str:
+        """What flies it: the version of rigidfleet, and the user's controller."""
+        law = f" with {self.header.controller} {self.law[1][:8]}" if self.header.controller else ""
+        return f"rigidfleet {__version__}{law}"
+
+    @property
+    def random(self) -> bool:
+        """Whether the first run has random numbers: of noise, gusts, links or sensing."""
+        tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
+        return any(keypaths.look_up(self.varied(0), keys) for keys in tables)
 
     @cached_property
     def document(self) -> dict[str, Any]:
@@ -324,13 +324,7 @@ class Sweep:
             "runs": self.runs,
             "seed": self.seed,
             "evaluate": self.evaluate,
-        } | self.header.model_dump(
-            include={"random_numbers", "controller", "rate"}, exclude_defaults=True
-        )
-
-
-def _without_none(keys: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in keys.items() if value is not None}
+        } | self.header.model_dump(include=_LATER, exclude_defaults=True)
 
 
 def _copied(x: Any, places: Sequence[Keys]) -> Any:
@@ -397,6 +391,7 @@ def _checked(
     data: dict[str, Any], origin: str, mission: Mission | None
 ) -> tuple[list[Variation], SweepHeader]:
     """Check a sweep and return its variations and header."""
+    data = {key: value for key, value in data.items() if value is not None}
     wrong: dict[int, WrongLine] = {}
     if isinstance(given := data.get("vary"), list):
         parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
@@ -429,7 +424,6 @@ def _checked(
     if mission is not None and whole is not None:
         _taken(collector, lacked, mission, whole)
     if header is not None and (name := header.controller):
-        controllers.search("")
         try:
             controllers.imported(name)
         except ImportError as error:
@@ -448,10 +442,6 @@ def _checked(
     gridded = any(isinstance(v, Gridded) for v in variations)
     if "runs" not in data and variations and not gridded:
         collector.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
-    if not collector.findings and mission is not None and header is not None:
-        points = Sweep(mission, variations, header, "").runs
-        if points > _RUNS:
-            collector.add(("runs",), f"is missing; the grid has {points:,} points", "give it")
     if collector.findings or header is None:
         raise SweepError(collector.findings)
     return variations, header

@@ -260,7 +260,7 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
         word, words = unknown[0] if unknown else (" ".join(over), list(numbers))
         why = " (a seed has no order)" if word.endswith("seed") else ""
         raise RigidfleetError(
-            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words) or 'nothing varies'}."
+            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
         )
     from rigidfleet.plotting.figure import Figure
 

@@ -13,7 +13,6 @@ from rigidfleet.sweep.metrics import METRICS, measure
 from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal
 
 if TYPE_CHECKING:
-    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
 
 #: Number of consecutive runs in a group. The first run of a group is a multiple of it.
@@ -38,34 +37,28 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
 def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     """Fly a group of runs side by side; one by one, if anything unforeseen happens to any of them."""
+    from rigidfleet.simulation.flight import simulate
     from rigidfleet.simulation.together import simulate_together
 
-    law, _ = sweep.law
+    law, rate = sweep.law[0], sweep.header.rate
+    new = law if isinstance(law, type) else lambda: law
     begun = perf_counter()
     values = {run: sweep.values(run) for run in runs}
     flown: dict[int, Any] = {
         run: _tried(lambda run=run: sweep.mission_of(run, values[run])) for run in runs
     }
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
-    together: Any = law
-    if law is None:
-        together = _tried(lambda: simulate_together([flown[run] for run in valid]))
+    together = law or _tried(lambda: simulate_together([flown[run] for run in valid]))
     if law is not None or isinstance(together, Exception):
-        together = [_tried(lambda run=run: _alone(sweep, flown[run])) for run in valid]
+        together = [
+            _tried(lambda run=run: simulate(flown[run], controller=new(), rate=rate))
+            for run in valid
+        ]
     flown |= zip(valid, together, strict=True)
     del together
     shared = (perf_counter() - begun) / len(runs)
     # Each flight is let go of when it is judged: the next one's record takes its memory over.
     return [_row(sweep, run, values[run], flown.pop(run), shared) for run in runs]
-
-
-def _alone(sweep: Sweep, mission: Mission) -> Result:
-    """Fly a mission by its own laws, or by the user's, with a new controller if they are a class."""
-    from rigidfleet.simulation.flight import simulate
-
-    law, _ = sweep.law
-    controller = law() if isinstance(law, type) else law
-    return simulate(mission, controller=controller, rate=sweep.header.rate)
 
 
 def _tried(job: Callable[[], Any]) -> Any:

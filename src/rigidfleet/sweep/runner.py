@@ -13,7 +13,6 @@ from time import perf_counter
 
 import numpy as np
 
-from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
@@ -139,7 +138,7 @@ class _Sweeping:
         """Fly all missing runs by a pool of workers. Runs that do not come back are missing again."""
         executor, capacity = pool
         flying: dict[Future[list[RunRecord]], list[int]] = {}
-        sweep = self.sweep.json(), __version__, self.sweep.law[1]
+        sweep = self.sweep.json(), self.sweep.version
         try:
             while self.missing or flying:
                 workers = capacity()

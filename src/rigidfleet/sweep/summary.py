@@ -30,12 +30,6 @@ PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
 CONFIDENCE = 0.95
 #: Share of the rank correlations shown that chance may have made (false discovery rate).
 _CHANCE = 0.01
-#: What the summary says of random numbers.
-_RANDOM = {
-    "shared": "the same in every run",
-    "own": "each run has its own",
-    "varied": "by seeds that vary",
-}
 #: Maximum number of rank correlations in the table.
 _SHOWN = 8
 #: A metric whose range is below these limits, relative and absolute (in its unit), counts as constant.
@@ -159,10 +153,9 @@ def summarise(table: Table) -> Summary:
 
 
 def _random_numbers(table: Table) -> str:
-    if not table.sweep.random_sources:
-        return "none"
-    seeds = any(column.keys[-1] == "seed" for column in table.sweep.columns)
-    return "varied" if seeds else table.sweep.header.random_numbers
+    seeded = any(column.keys[-1] == "seed" for column in table.sweep.columns)
+    word = "varied" if seeded else table.sweep.header.random_numbers
+    return word if table.sweep.random else "none"
 
 
 def failures(table: Table) -> dict[str, int]:
@@ -361,13 +354,13 @@ def _rendered(summary: Summary) -> RenderableType:
             rank.add_row(d.varied, d.outcome, f"{d.correlation:+.2f}")
         shown.append(rank)
     if n := len(summary.drivers):
-        words = (
-            f"{len(strong)} of {n} pairs of a varied number and an outcome correlate beyond chance"
-        )
-        words += f" (at most {100 * _CHANCE:g} % of these by chance: Benjamini-Hochberg)."
+        words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
         shown.append(Text(words))
     if summary.random_numbers != "none":
-        shown.append(Text(f"Random numbers of noise and gusts: {_RANDOM[summary.random_numbers]}."))
+        words = {"shared": "the same in all runs", "own": "of each run its own"}
+        shown.append(
+            Text(f"Random numbers: {words.get(summary.random_numbers, 'by varied seeds')}.")
+        )
     for name, rates in summary.by_value.items():
         values = _grid(name, "passed", "95 % interval")
         for word, r in rates.items():

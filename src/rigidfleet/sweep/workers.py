@@ -16,7 +16,6 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.processes import safe_path
-from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
 from rigidfleet.sweep.record import RunRecord
@@ -34,23 +33,19 @@ _KEPT = {-1: 256 << 20, -3: 32 << 20}
 _CONNECT = 20.0
 
 
-def chunk(sweep: str, version: str, code: str, runs: Sequence[int]) -> list[RunRecord]:
-    """Fly a chunk of a sweep, given as JSON, for another process; ``code`` is the digest of its controller's file.
+def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
+    """Fly a chunk of a sweep, given as JSON, for another process.
 
     Raises
     ------
     RigidfleetError
         The other process has another version of rigidfleet, or of the user's controller.
     """
-    if version != __version__:
-        raise RigidfleetError(
-            f"a worker has rigidfleet {__version__}, but the sweep was started by {version}. Install the same version"
-            " on all machines."
-        )
     flown = shared(sweep)
-    if flown.law[1] != code:
+    if version != flown.version:
         raise RigidfleetError(
-            f"a worker has another file of the controller {flown.header.controller}. Install the same on all machines."
+            f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
+            " machines."
         )
     return fly_runs(flown, runs)
 
