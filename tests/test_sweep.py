@@ -1042,6 +1042,11 @@ def test_the_example_flies(folder, capsys):
 BARE = "narrow-passage"  # without [disturbances]
 
 
+def first(*vary: str, mission: Any = BARE) -> Any:
+    """The mission of the first run."""
+    return Sweep.of(mission, vary, runs=1).mission_of(0)
+
+
 def complaint(line: str, mission: Any = BARE) -> tuple[str, str]:
     """The only finding of a variation: problem and remedy."""
     with pytest.raises(SweepError) as caught:
@@ -1098,25 +1103,20 @@ def test_a_key_of_a_table_that_is_missing_is_completed_step_by_step():
         "disturbances.gusts.model = grid(first-order)",
         "disturbances.gusts.time_scale = grid(2)",
     ]
-    gusts = Sweep.of(BARE, [line, *rest]).mission_of(0).disturbances.gusts
+    gusts = first(line, *rest).disturbances.gusts
     assert (gusts.model, gusts.time_scale) == ("first-order", 2.0)
     assert 0.1 < gusts.intensity < 0.2
     problem, remedy = complaint("constraint.solver = uniform(0, 1)")
     example = remedy.split("as ")[1]
-    assert (
-        Sweep.of(BARE, [f"constraint.solver = {example}"]).mission_of(0).constraint.solver
-        == "iterated"
-    )
+    assert first(f"constraint.solver = {example}").constraint.solver == "iterated"
 
 
 def test_one_number_for_all_agents_is_varied_for_each():
     """`disturbances.mass_error.*` and `drag.*` draw for each vehicle, whether the mission has one number or none."""
-    found = Sweep.of(BARE, ["disturbances.mass_error.* = normal(0, 0.05)"], runs=1)
-    errors = found.mission_of(0).disturbances.mass_error
+    errors = first("disturbances.mass_error.* = normal(0, 0.05)").disturbances.mass_error
     assert len(set(errors)) == 3
-    assert list(errors) == found.values(0)
-    windy = Sweep.of("windy-passage", ["disturbances.drag.2 *= grid(2)"])
-    assert windy.mission_of(0).disturbances.drag == (0.3, 0.6, 0.3)
+    windy = first("disturbances.drag.2 *= grid(2)", mission="windy-passage")
+    assert windy.disturbances.drag == (0.3, 0.6, 0.3)
     assert "there is no" in complaint("disturbances.*.seed = grid(1)")[0]
 
 
