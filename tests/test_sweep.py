@@ -1034,3 +1034,370 @@ def test_the_example_flies(folder, capsys):
     unstable = gamma >= 2 * alpha * table.sweep.mission.constraint.beta**2
     assert 0 < unstable.sum() < 12
     assert (table.reason == "mission").tolist() == unstable.tolist()
+
+
+# -- paths and files of all kinds --------------------------------------------------------------------
+
+
+BARE = "narrow-passage"  # without [disturbances]
+
+
+def first(*vary: str, mission: Any = BARE) -> Any:
+    """The mission of the first run."""
+    return Sweep.of(mission, vary, runs=1).mission_of(0)
+
+
+def complaint(line: str, mission: Any = BARE) -> tuple[str, str]:
+    """The only finding of a variation: problem and remedy."""
+    with pytest.raises(SweepError) as caught:
+        Sweep.of(mission, [line], runs=2)
+    (finding,) = caught.value.findings
+    return finding.problem, finding.remedy
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "agents.mass.1.1.1", "agents.mass.1.1.1.1.1", "agents.position.1.1.1.*", "1.1.1.1", "agents.*.1.*.1",
+        "agents..mass", ".agents", "agents.", "agents[].mass", "agents[[1]]", "agents.mass.0", "agents.mass.-1",
+        "agents.mass." + "9" * 5000, "agents.mass.²", "constraint.solver.1.1", "phases.1.kind.x.1", "obstacles.1.1.1",
+        "agents.vehicle.*", '"', "[", "", "agents.mass.1 .1", "formations.triangle.size.1.2.3", "__class__.x.1.1.1",
+    ],
+)  # fmt: skip
+def test_a_wrong_path_is_one_clear_error(path):
+    """However deep, empty, large or odd a path is, it is refused with a problem and a remedy, not by an exception."""
+    problem, remedy = complaint(f"{path} = normal(1, 0.1)")
+    assert problem
+    assert remedy
+
+
+@pytest.mark.parametrize(
+    ("path", "meant"),
+    [
+        ("gusts.seed", "disturbances.gusts.seed"),
+        ("mass_error.*", "disturbances.mass_error.*"),
+        ("agents.mass_error.2", "disturbances.mass_error.2"),
+        ("agents.3.mass", "agents.mass.3"),
+        ("agents.mas.*", "agents.mass.*"),
+        ("mass.1", "agents.mass.1"),
+        ("agents.mass.1.1.1", "agents.mass.1"),
+        ("phases.2.untl", "phases.2.until"),
+        ("formations.trangle.size", "formations.triangle.size"),
+    ],
+)
+def test_following_a_remedy_about_a_path_works(path, meant):
+    """The path that a message suggests exists, and varies what was meant."""
+    _, remedy = complaint(f"{path} *= uniform(1, 2)", "windy-passage")
+    if remedy != "the path ends there; remove the rest":
+        assert remedy == f"did you mean '{meant}'?"
+    assert Sweep.of("windy-passage", [f"{meant} *= uniform(1, 2)"], runs=2).columns
+
+
+def test_a_key_of_a_table_that_is_missing_is_completed_step_by_step():
+    """The key that a message asks for, written with the mission or varied, is all that is missing."""
+    line = "disturbances.gusts.intensity = uniform(0.1, 0.2)"
+    problem, remedy = complaint(line)
+    assert "disturbances.gusts.model is missing" in problem
+    assert remedy.startswith("in the mission, add model: first-order")
+    rest = [
+        "disturbances.gusts.model = grid(first-order)",
+        "disturbances.gusts.time_scale = grid(2)",
+    ]
+    gusts = first(line, *rest).disturbances.gusts
+    assert (gusts.model, gusts.time_scale) == ("first-order", 2.0)
+    assert 0.1 < gusts.intensity < 0.2
+    problem, remedy = complaint("constraint.solver = uniform(0, 1)")
+    example = remedy.split("as ")[1]
+    assert first(f"constraint.solver = {example}").constraint.solver == "iterated"
+
+
+def test_one_number_for_all_agents_is_varied_for_each():
+    """`disturbances.mass_error.*` and `drag.*` draw for each vehicle, whether the mission has one number or none."""
+    errors = first("disturbances.mass_error.* = normal(0, 0.05)").disturbances.mass_error
+    assert len(set(errors)) == 3
+    windy = first("disturbances.drag.2 *= grid(2)", mission="windy-passage")
+    assert windy.disturbances.drag == (0.3, 0.6, 0.3)
+    assert "there is no" in complaint("disturbances.*.seed = grid(1)")[0]
+
+
+@pytest.mark.parametrize(
+    "values",
+    ["NaN", "Infinity", "1, 1e999", "null", "9" * 400, "9" * 5000, '{"a": null}', "1, [2, NaN]"],
+)
+def test_values_that_are_none(values):
+    """Numbers that are not finite, and values that TOML does not have, are refused."""
+    assert complaint(f"agents.mass = grid({values})")[0].startswith("must be finite numbers, words")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "vary = 3", "vary = [3]", "vary = [[]]", "vary = [{}]", "vary = ['']", "vary = [{path = 3, kind = 'grid'}]",
+        "vary = [{path = 'agents.mass', kind = 'grid', values = [2020-01-01]}]", "vary = [{kind = ['grid']}]",
+        "vary = [{path = 'agents.mass', kind = 'grid', values = {a = 1}}]", "runs = 1.5", "runs = 0", "runs = 'x'",
+        "runs = 100000000000", "seed = 1.5", "seed = []", "seed = -1", "evaluate = 3", "random_numbers = true",
+        "random_numbers = 'common'", "controller = 3", "controller = ''\nrate = 1", "rate = 50", "controller = ':'",
+        "controller = 'json'", "controller = 'json:'", "controller = 'json:x.y'", "controller = '.x:y'",
+        "controller = 'nowhere:law'", "controller = 'os:sep'", "controller = 'fractions:Fraction.x'",
+        "controller = 'shutil:copy'\nrate = -1", "controller = 'shutil:copy'\nrate = inf", "wrong = 1",
+        "vary = ['agents.mass = linspace(1, 2, 1000000)', 'agents.radius = linspace(1, 2, 1000)']",
+    ],
+)  # fmt: skip
+def test_a_wrong_sweep_file_is_one_error(folder, capsys, text):
+    """Whatever stands in a sweep file, the command says what is wrong and exits with 2, and never flies."""
+    vary = "" if "vary" in text else "\nvary = ['agents.mass = grid(1, 2)']"
+    Path("study.toml").write_text(f"mission = 'pair.toml'\n{text}{vary}\n")
+    assert cli.main(["sweep", "study.toml", "--quiet", "--no-figures"]) == codes.BAD_INPUT
+    err = capsys.readouterr().err
+    assert err.startswith("error: ")
+    assert "bug" not in err
+    assert not Path("sweeps").exists()
+
+
+# -- random numbers, and what they drive -----------------------------------------------------------------
+
+NOISY = PAIR | {
+    "disturbances": {
+        "noise": {"position": 0.01, "seed": 4},
+        "gusts": {"model": "first-order", "intensity": 0.1, "time_scale": 1.0},
+    }
+}
+
+
+def test_runs_share_random_numbers_or_have_their_own(tmp_path):
+    """Shared: the mission's seeds in all runs; own: another in each, whatever else varies, unless a seed is varied."""
+    mission = Mission.from_dict(NOISY)
+
+    def seeds(*vary: str, **keys: Any) -> list[tuple[int, int]]:
+        found = Sweep.of(mission, ["agents.mass *= grid(1, 1, 1, 1)", *vary], seed=5, **keys)
+        tables = [found.varied(k)["disturbances"] for k in range(4)]
+        assert found.mission.disturbances is not None
+        assert Sweep.from_json(found.json()).identity == found.identity
+        return [(t["noise"]["seed"], t["gusts"].get("seed", 0)) for t in tables]
+
+    assert seeds() == [(4, 0)] * 4
+    own = seeds(random_numbers="own")
+    assert len(set(own)) == 4
+    assert all(a == b for a, b in own)
+    more = seeds("agents.radius.* = uniform(0.1, 0.2)", random_numbers="own")
+    assert more == own
+    varied = seeds("disturbances.noise.seed = grid(9)", random_numbers="own")
+    assert varied == [(9, b) for _, b in own]
+    assert "random_numbers" not in json.loads(Sweep.of(mission, SCATTER, runs=2).json())
+    calm = Sweep.of(MISSION, SCATTER, runs=2, random_numbers="own")
+    assert "disturbances" not in calm.varied(0)
+    for keys, word in (({}, "shared"), ({"random_numbers": "own"}, "own")):
+        table = fly(Sweep.of(mission, ["agents.mass *= grid(1, 1)"], **keys), tmp_path / word)
+        assert summarise(table).random_numbers == word
+        same = table.metrics["tracking_error"][0] == table.metrics["tracking_error"][1]
+        assert same == (word == "shared")
+        assert {"shared": "the same in all runs", "own": "of each run its own"}[word] in shown(
+            table, 200
+        )
+    assert summarise(made()).random_numbers == "none"
+
+
+def test_a_seed_is_neither_an_axis_nor_a_driver(tmp_path):
+    """Seeds are numbers without an order: no map has one on an axis, and nothing is driven by one."""
+    found = Sweep.of(
+        Mission.from_dict(NOISY),
+        [
+            "disturbances.noise.seed = grid(1, 2, 3, 4)",
+            "disturbances.*.seed += uniform(0, 9)",
+            SCATTER[1],
+        ],
+        runs=8,
+    )
+    table = fly(found, tmp_path)
+    assert {d.varied for d in drivers(table)} == {"agents.mass.1", "agents.mass.2"}
+    assert summarise(table).random_numbers == "varied"
+    with pytest.raises(RigidfleetError, match="a seed has no order"):
+        over_two(table, ["disturbances.noise.seed", "agents.mass.1"])
+
+
+def test_drivers_are_corrected_for_their_number():
+    """Adjusted p-values are SciPy's; of pure chance, nothing is shown, though some pairs have p < 0.01."""
+    noise = np.random.default_rng(2)
+    table = made(60)
+    metrics = {name: noise.normal(size=60) for name in METRICS}
+    table = replace(
+        table, metrics=metrics, codes=noise.normal(size=(60, 2)), passed=noise.random(60) < 0.5
+    )
+    found = drivers(table)
+    chances = [d.chance for d in found]
+    np.testing.assert_allclose(
+        [d.adjusted for d in found], stats.false_discovery_control(chances), rtol=1e-12
+    )
+    assert min(chances) < 0.05
+    text = shown(table, 200)
+    assert "rank correlation" not in text
+    assert f"0 of {len(found)} pairs" in text
+    assert json.loads(summarise(table).json())["pairs_tested"] == len(found)
+    few = drivers(made(4))
+    assert abs(few[0].correlation) == 1.0
+    assert few[0].chance == pytest.approx(
+        2 / 24
+    )  # of the 24 orders of four runs, two correlate as much
+
+
+# -- a controller of the user ----------------------------------------------------------------------------
+
+LAW = """
+class Own:
+    def __init__(self):
+        self.last = -1.0
+    def __call__(self, seen):
+        assert seen.t > self.last
+        self.last = seen.t
+        return follow(seen)
+
+def follow(seen):
+    a = seen.reference_acceleration - 2.0 * (seen.position - seen.reference_position)
+    a = a - 2.8 * (seen.velocity - seen.reference_velocity)
+    a[:, 2] += seen.gravity
+    return seen.masses[:, None] * a
+
+def fails(seen):
+    raise ValueError("no law")
+"""
+
+
+def test_a_sweep_flies_a_controller_by_name(folder, capsys, monkeypatch):
+    """Rows are those of `simulate` with the controller, by one process and by workers; each run has a new object."""
+    from rigidfleet.simulation.flight import simulate
+
+    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    Path("a_law.py").write_text(LAW)
+    line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--runs", "9", "--no-figures", "--quiet"]
+    own = [*line, "--controller", "a_law:Own", "--rate", "100"]
+    for count in ("1", "2"):
+        assert cli.main([*own, "--workers", count, "--out", count]) == codes.PASSED
+    table = read("1")
+    assert numbers(read("2")) == numbers(table)
+    assert (table.sweep.header.controller, table.sweep.header.rate) == ("a_law:Own", 100.0)
+    law: Any = sys.modules["a_law"]
+    for k in (0, 8):
+        flown = simulate(table.sweep.mission_of(k), controller=law.follow, rate=100.0)
+        assert measure(flown, assess(flown))["thrust"] == table.metrics["thrust"][k]
+    assert cli.main([*line, "--out", "1"]) == codes.BAD_INPUT
+    assert "differs in: file of the controller, controller, rate" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_a_sweep_goes_on_only_with_the_same_controller(folder):
+    """The command continues a sweep with the file that it began with, and refuses a changed or missing one."""
+    Path("b_law.py").write_text(LAW)
+    line = [
+        "sweep",
+        "pair.toml",
+        "--vary",
+        SCATTER[1],
+        "--controller",
+        "b_law:follow",
+        "--out",
+        "s",
+    ]
+
+    def again(*words: str) -> tuple[int, str]:
+        done = subprocess.run(
+            command(*words, "--no-figures", "--quiet"), check=False, capture_output=True, text=True
+        )
+        return done.returncode, done.stderr
+
+    assert again(*line, "--runs", "2") == (codes.PASSED, "")
+    assert again("sweep", "s", "--runs", "3") == (codes.PASSED, "")
+    Path("b_law.py").write_text(LAW + "# changed")
+    code, err = again("sweep", "s", "--runs", "4")
+    assert (code, "differs in: file of the controller" in err) == (codes.BAD_INPUT, True)
+    Path("b_law.py").unlink()
+    code, err = again("sweep", "s", "--runs", "4")
+    assert (code, "No module named 'b_law'" in err) == (codes.BAD_INPUT, True)
+    assert again("sweep", "s", "--summary")[0] == codes.PASSED  # imports nothing
+
+
+def test_a_worker_with_another_controller_is_refused(folder):
+    """A worker compares the file of the controller, not its name alone."""
+    from rigidfleet.sweep.workers import chunk
+
+    Path("c_law.py").write_text(LAW)
+    found = Sweep.of(MISSION, SCATTER, runs=2, controller="c_law:follow")
+    with pytest.raises(RigidfleetError, match=r"a worker has rigidfleet .* with c_law:follow"):
+        chunk(found.json(), found.version.replace("c_law:follow ", "c_law:follow x"), [0])
+
+
+# -- no verdict, no room, no time ------------------------------------------------------------------------
+
+
+def test_a_sweep_without_a_single_verdict_exits_with_2(folder, capsys):
+    """All missions refused, or a controller that always fails: an error with an example; one verdict is enough."""
+    Path("d_law.py").write_text(LAW)
+    line = ["sweep", "pair.toml", "--no-figures", "--quiet", "--force", "--vary"]
+    assert cli.main([*line, "agents.mass = grid(-1, -2)"]) == codes.BAD_INPUT
+    err = capsys.readouterr().err
+    assert "no run has a verdict" in err
+    assert "mission refused: agents.mass" in err
+    assert (
+        cli.main(["sweep", "sweeps/pair", "--summary", "--no-figures", "--quiet"])
+        == codes.BAD_INPUT
+    )
+    fails = ["agents.mass = grid(1, 2)", "--controller", "d_law:fails"]
+    assert cli.main([*line, *fails]) == codes.BAD_INPUT
+    assert "the controller raised ValueError" in capsys.readouterr().err
+    assert cli.main([*line, "agents.mass = grid(-1, 2)"]) == codes.PASSED  # flown, and failed
+
+
+def test_a_full_disk_is_named_and_the_sweep_goes_on(flown, tmp_path, monkeypatch):
+    """Where SQLite finds the disk full in mid-sweep, one error says so; with room, the sweep ends as ever."""
+    from rigidfleet.sweep.store import Store
+
+    opened = Store._open
+
+    def small(self: Store, asked: Sweep) -> None:
+        opened(self, asked)
+        pages = self.db.execute("PRAGMA page_count").fetchone()[0]
+        self.db.execute(f"PRAGMA max_page_count = {pages}")
+
+    with monkeypatch.context() as full:
+        full.setattr(Store, "_open", small)
+        with pytest.raises(ResultError, match=r"the disk is full\. Make room"):
+            fly(sweep(), tmp_path, workers=1)
+    assert numbers(fly(sweep(), tmp_path, workers=1)) == numbers(flown)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is sent as a signal")
+@pytest.mark.parametrize("verb", ["run", "sweep", "check", "missions"])
+def test_ctrl_c_while_loading_is_quiet(tmp_path, verb):
+    """While the command's modules are loaded, Ctrl-C ends it with 130 and without a word, wherever it comes."""
+    script = """
+import builtins, os, signal, sys
+plain, left = builtins.__import__, int(sys.argv.pop(1))
+def slow(name, *rest, **more):
+    global left
+    if name.startswith(("rigidfleet.cli", "cyclopts", "rich", "rigidfleet.mission")):
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+    return plain(name, *rest, **more)
+builtins.__import__ = slow
+from rigidfleet.__main__ import main
+sys.exit(main())
+"""
+    for moment in (1, 2, 8, 60):
+        words = [sys.executable, "-c", script, str(moment), verb, "single-waypoint"]
+        done = subprocess.run(words, check=False, capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == codes.INTERRUPTED, done.stderr
+        assert "Traceback" not in done.stderr
+        assert "bug" not in done.stderr
+
+
+@pytest.mark.long
+def test_errors_of_mass_that_the_laws_know_and_do_not(tmp_path):
+    """The numbers of the manual: of 200 narrow passages, all pass with known masses, 27 and 1 % with unknown ones."""
+    lines = {
+        "agents.mass.* *= normal(1, 0.05)": 200,
+        "disturbances.mass_error = normal(0, 0.05)": 54,
+        "disturbances.mass_error.* = normal(0, 0.05)": 2,
+    }
+    for k, (line, passed) in enumerate(lines.items()):
+        table = fly(Sweep.of(BARE, [line], runs=200), tmp_path / str(k))
+        assert int(table.passed.sum()) == passed

@@ -10,11 +10,13 @@ nor for the plotting library.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from rigidfleet._version import __version__ as __version__
 
+TYPE_CHECKING = False  # for the command, which has to take over Ctrl-C before it loads `typing`
 if TYPE_CHECKING:
+    from typing import Any
+
     from rigidfleet.assessment import Verdict, assess
     from rigidfleet.errors import (
         FlightError,
@@ -122,7 +124,7 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     """Load a public name from its module on first use."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

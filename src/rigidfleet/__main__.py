@@ -3,14 +3,23 @@
 Nothing is loaded with this module: the processes of a sweep load it again, and are not the command.
 """
 
+import os
 import sys
 
 
 def main() -> int:
     """Run the command; return its exit code."""
-    from rigidfleet.cli import app
+    try:
+        import signal
 
-    return app.main()
+        # Nothing is lost by Ctrl-C while the command is loaded, and no import can turn it into another error.
+        before = signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+        from rigidfleet.cli import app
+
+        signal.signal(signal.SIGINT, before)
+        return app.main()
+    except KeyboardInterrupt:
+        return 130
 
 
 if __name__ == "__main__":

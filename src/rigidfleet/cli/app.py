@@ -6,9 +6,9 @@ for terminals only, and `NO_COLOR` is respected.
 Exit codes
 ----------
 - 0: success; for `run`, `assess` and `report`: the flight passed its verdict; for `sweep`: all runs are flown, whether
-  they passed or failed; for `tune`: gains are chosen, perhaps the mission's own
+  they passed or failed, and one at least has a verdict; for `tune`: gains are chosen, perhaps the mission's own
 - 1: the flight failed its verdict or ended early; for `check`: the flight will fail
-- 2: invalid input, or files that cannot be read or written
+- 2: invalid input, or files that cannot be read or written; for `sweep`: no run has a verdict
 - 130: interrupted (Ctrl-C); the flight so far is saved, marked incomplete
 
 Packages that load slowly are imported only by the commands that need them.
@@ -22,6 +22,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -79,7 +80,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     console.prepare_streams()
     try:
-        return app(tokens, console=console.out(), error_console=console.err()) or PASSED
+        with run.heeding_interrupts() if tokens is None else nullcontext():
+            return app(tokens, console=console.out(), error_console=console.err()) or PASSED
     except CycloptsError as error:
         console.complain(_usage(error))
         return BAD_INPUT

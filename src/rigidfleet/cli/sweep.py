@@ -12,12 +12,12 @@ from cyclopts import Parameter
 
 from rigidfleet.cli import console, drawing
 from rigidfleet.cli.arguments import check_workers, exact
+from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
+from rigidfleet.cli.run import DRAWN, Format, heeding_interrupts, write_figures
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
     from rigidfleet.sweep import Sweep
-from rigidfleet.cli.codes import INTERRUPTED, PASSED
-from rigidfleet.cli.run import DRAWN, Format, heeding_interrupts, write_figures
 
 
 def sweep(
@@ -30,6 +30,9 @@ def sweep(
     out: Path | None = None,
     force: bool = False,
     final_states: bool = False,
+    random_numbers: Literal["shared", "own"] | None = None,
+    controller: str | None = None,
+    rate: float | None = None,
     workers: Annotated[int | None, Parameter(converter=exact)] = None,
     cluster: str | None = None,
     summary: bool = False,
@@ -63,6 +66,14 @@ def sweep(
     final_states : bool
         Evaluate only the final states of phases: thousands of runs per second, for open-loop missions with varied
         start states.
+    random_numbers : str
+        Of noise, gusts and links: shared: every run has the seeds of the mission; own: each run has a seed of its own.
+        Default: shared.
+    controller : str
+        Controller of your own, MODULE:NAME: a function of an observation, or a class, of which each run has a new
+        object.
+    rate : float
+        Calls of the controller per second [Hz]. Default: 50.
     workers : int
         Number of processes on this machine. Default: number of cores.
     cluster : str
@@ -88,18 +99,34 @@ def sweep(
     if not no_figures:
         drawing.prepare("rigidfleet.sweep.figures")
     from rigidfleet._common.files import write_file
-    from rigidfleet.sweep import figures, store
+    from rigidfleet.kernel.engine.native import is_compiled
+    from rigidfleet.sweep import figures, fly, store
+    from rigidfleet.sweep.record import UNJUDGED, called
     from rigidfleet.sweep.summary import summarise
 
     if summary:
         folder = Path(mission)
         table = store.read(folder)
     else:
-        asked, folder = _asked(mission, vary or [], runs, seed, out, final_states=final_states)
+        keys = {
+            "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
+            "controller": controller, "rate": rate,
+        }  # fmt: skip
+        asked, folder = _asked(mission, vary or [], runs, out, keys)
         watch = None if quiet else console.SweepWatch()
         try:
             with watch or nullcontext(), heeding_interrupts():
-                table = _fly_sweep(asked, folder, workers, cluster, force, watch)
+                if watch is not None and not is_compiled():
+                    watch.compiling()
+                progress = None if watch is None else watch.update
+                table = fly(
+                    asked,
+                    folder,
+                    workers=workers,
+                    cluster=cluster,
+                    replace=force,
+                    progress=progress,
+                )
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
             words = f"Interrupted: {done} of {asked.runs} runs are saved in {folder}"
@@ -123,17 +150,18 @@ def sweep(
         if drawn:
             text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
             console.out().print(text, soft_wrap=True)
+    if found.reasons and set(table.reason) <= {*UNJUDGED}:
+        reason, example = next(iter(found.examples.items()))
+        console.complain(
+            f"{folder}: no run has a verdict. Run {example.run}: {called(reason)}: {example.detail}\n    correct the"
+            " mission, what varies, or the controller; --force overwrites this sweep"
+        )
+        return BAD_INPUT
     return PASSED
 
 
 def _asked(
-    what: str,
-    vary: list[str],
-    runs: int | None,
-    seed: int | None,
-    out: Path | None,
-    *,
-    final_states: bool,
+    what: str, vary: list[str], runs: int | None, out: Path | None, keys: dict[str, Any]
 ) -> tuple[Sweep, Path]:
     """Sweep of the command line, and its folder."""
     from rigidfleet.mission import mission_names
@@ -141,48 +169,16 @@ def _asked(
     from rigidfleet.sweep.definition import is_sweep_file
 
     if store.is_store(Path(what)):
-        if vary or seed is not None or out is not None or final_states:
+        if vary or out is not None or any(value is not None for value in keys.values()):
             raise RigidfleetError(
-                f"{what}: is the folder of a sweep, whose definition cannot change. Remove --vary, --seed,"
-                " --final-states and --out."
+                f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
+                " only --runs may grow."
             )
         found = store.read_sweep(Path(what))
-        found.runs = runs or found.runs
+        found.runs = found.runs if runs is None else runs
         return found, Path(what)
-    evaluate: Literal["final"] | None = "final" if final_states else None
     if what not in mission_names() and is_sweep_file(what):
-        found = Sweep.load(what, more=vary, runs=runs, seed=seed, evaluate=evaluate)
+        found = Sweep.load(what, more=vary, runs=runs, **keys)
     else:
-        found = Sweep.of(
-            what,
-            vary,
-            runs=runs,
-            seed=seed or 0,
-            evaluate=evaluate or "flight",
-            origin="rigidfleet sweep",
-        )
+        found = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
     return found, out or Path("sweeps", found.name)
-
-
-def _fly_sweep(
-    asked: Sweep,
-    folder: Path,
-    workers: int | None,
-    cluster: str | None,
-    force: bool,
-    watch: console.SweepWatch | None,
-) -> Any:
-    """Fly a sweep and return the table of its rows."""
-    from rigidfleet.kernel.engine.native import is_compiled
-    from rigidfleet.sweep import fly
-
-    if watch is not None and not is_compiled():
-        watch.compiling()
-    return fly(
-        asked,
-        folder,
-        workers=workers,
-        cluster=cluster,
-        replace=force,
-        progress=None if watch is None else watch.update,
-    )

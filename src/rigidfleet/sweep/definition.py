@@ -1,7 +1,7 @@
 """Definition of a sweep: a mission, its variations, the number of runs and a seed. It is checked as a whole.
 
 Run k depends only on the definition and on k: its grid point is k modulo the size of the grid, and its random numbers
-come from a separate Philox stream, keyed by (seed, k).
+come from a separate Philox stream, keyed by (seed, k). So does its seed of noise and gusts, if each run has its own.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from os.path import commonprefix
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,14 +21,14 @@ from pydantic import Field, Strict
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.renamed import successor
 from rigidfleet._version import __version__
-from rigidfleet.errors import MissionError, SweepError, wrong_type
+from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, Shared, unknown_key
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part
-from rigidfleet.sweep import keypaths
+from rigidfleet.sweep import controllers, keypaths
 from rigidfleet.sweep.variation import (
     KINDS,
     Drawn,
@@ -41,9 +42,16 @@ from rigidfleet.sweep.variation import (
 Evaluate = Literal["flight", "final"]
 
 #: Remedy if final states cannot be evaluated alone.
+_STARTS = ("agents", "position"), ("agents", "velocity")
 _WHOLE = 'evaluate whole flights: evaluate = "flight", no --final-states'
 #: Smallest fraction at which a distribution is evaluated, so that no normal number is infinite.
 _LEAST = 2.0**-54
+#: Greatest number of runs.
+_RUNS = 10**8
+#: Tables with seeds of random numbers.
+_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("disturbances", "links"), ("avoidance",)  # fmt: skip
+#: Keys that stores have since there are any: they are kept where they are not their defaults.
+_LATER = {"random_numbers", "controller", "rate"}
 
 
 class SweepHeader(Part):
@@ -52,7 +60,7 @@ class SweepHeader(Part):
     mission: str = Field(
         description="a shipped mission, or the path of a mission file relative to this file"
     )
-    runs: Annotated[int, Strict(), Field(ge=1, le=10**8)] | None = Field(
+    runs: Annotated[int, Strict(), Field(ge=1, le=_RUNS)] | None = Field(
         None, description="number of runs; default: one per point of the grid"
     )
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
@@ -62,6 +70,19 @@ class SweepHeader(Part):
         "flight",
         description="flight: evaluate whole flights; final: evaluate only the final states of phases, thousands of "
         "runs per second, for open-loop missions with varied start states",
+    )
+    random_numbers: Literal["shared", "own"] = Field(
+        "shared",
+        description="of noise, gusts and links: shared: every run has the seeds of the mission, so that runs differ "
+        "only in what varies; own: each run has a seed of its own",
+    )
+    controller: str = Field(
+        "",
+        description="controller of your own, MODULE:NAME: a function of an observation, or a class, of which each run "
+        "has a new object; default: the laws of the mission",
+    )
+    rate: Annotated[float, Strict(), Field(gt=0, le=1e6)] = Field(
+        50.0, description="rate at which the controller is called [Hz]"
     )
 
 
@@ -86,6 +107,7 @@ class Sweep:
     ----------
     mission : the mission to vary
     variations : its variations
+    header : its other keys
     runs : number of runs
     seed : seed of the random numbers
     name : name of the sweep
@@ -93,17 +115,13 @@ class Sweep:
     """
 
     def __init__(
-        self,
-        mission: Mission,
-        variations: Sequence[Variation],
-        runs: int | None,
-        seed: int,
-        name: str,
-        evaluate: Evaluate = "flight",
+        self, mission: Mission, variations: Sequence[Variation], header: SweepHeader, name: str
     ) -> None:
-        self.mission, self.variations = mission, tuple(variations)
-        self.seed, self.name, self.evaluate = seed, name, evaluate
-        self.runs = runs or math.prod(self.grid_sizes.values())
+        self.mission, self.variations, self.header = mission, tuple(variations), header
+        self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
+        self.runs = header.runs or math.prod(self.grid_sizes.values())
+        if self.runs > _RUNS:
+            raise RigidfleetError(f"the grid has {self.runs:,} points: give runs, or fewer values.")
 
     @classmethod
     def of(
@@ -111,23 +129,26 @@ class Sweep:
         mission: Mission | str | Path,
         vary: Iterable[str | Mapping[str, Any]],
         *,
-        runs: int | None = None,
-        seed: int = 0,
-        evaluate: Evaluate = "flight",
         name: str = "",
         origin: str = "sweep",
+        **keys: Any,
     ) -> Self:
         """Define a sweep of a mission, given as a `Mission`, a shipped name or a path.
 
         Parameters
         ----------
         vary : variations, each a line such as `agents.mass.* *= normal(1, 0.05)` or a table
-        runs : number of runs; default: one per point of the grid
-        seed : seed of the random numbers
-        evaluate : "flight", or "final" to evaluate only the final states of phases, for open-loop missions with
-            varied start states
         name : name of the sweep; default: the name of the mission
         origin : name of the sweep in messages
+        runs : number of runs; default: one per point of the grid
+        seed : seed of the random numbers; default: 0
+        evaluate : "flight", or "final" to evaluate only the final states of phases, for open-loop missions with
+            varied start states
+        random_numbers : "shared": noise and gusts of every run have the seeds of the mission; "own": each run has a
+            seed of its own
+        controller : a controller of your own, "MODULE:NAME" of a function, or of a class, of which each run has a new
+            object; the module is installed or in the current folder
+        rate : rate at which the controller is called [Hz]; default: 50
 
         Raises
         ------
@@ -139,30 +160,17 @@ class Sweep:
         mission = as_mission(mission)
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
-        data: dict[str, Any] = {"mission": mission.name, "seed": seed, "vary": list(vary)}
-        data |= {} if runs is None else {"runs": runs}
-        data |= {} if evaluate == "flight" else {"evaluate": evaluate}
-        header, variations = _checked(data, origin, mission)
-        return cls(
-            mission, variations, header.runs, header.seed, name or mission.name, header.evaluate
-        )
+        data = {"mission": mission.name, "vary": list(vary), **keys}
+        return cls(mission, *_checked(data, origin, mission), name or mission.name)
 
     @classmethod
-    def load(
-        cls,
-        path: str | Path,
-        *,
-        more: Iterable[str] = (),
-        runs: int | None = None,
-        seed: int | None = None,
-        evaluate: Evaluate | None = None,
-    ) -> Self:
+    def load(cls, path: str | Path, *, more: Iterable[str] = (), **keys: Any) -> Self:
         """Read a sweep file.
 
         Parameters
         ----------
         more : lines of additional variations
-        runs, seed, evaluate : replace those of the file
+        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate
 
         Raises
         ------
@@ -179,14 +187,13 @@ class Sweep:
         if isinstance(named, str):
             shipped = named in mission_names()
             mission = load_mission(named if shipped else path.parent / named)
-        data |= {} if runs is None else {"runs": runs}
-        data |= {} if seed is None else {"seed": seed}
-        data |= {} if evaluate is None else {"evaluate": evaluate}
+        data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(given := data.get("vary", []), list):
             data["vary"] = [*given, *more]
-        header, variations = _checked(data, origin, mission)
+        controllers.search(path.parent)
+        variations, header = _checked(data, origin, mission)
         assert mission is not None  # otherwise the check has raised
-        return cls(mission, variations, header.runs, header.seed, path.stem, header.evaluate)
+        return cls(mission, variations, header, path.stem)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -194,7 +201,8 @@ class Sweep:
         data = json.loads(text)
         variations = [KINDS[entry["kind"]].model_validate(entry) for entry in data["vary"]]
         mission = Mission.from_toml(data["mission"], "mission of the sweep")
-        return cls(mission, variations, data["runs"], data["seed"], data["name"], data["evaluate"])
+        header = {key: data[key] for key in SweepHeader.model_fields if key in data}
+        return cls(mission, variations, SweepHeader.model_validate(header), data["name"])
 
     def json(self) -> str:
         """Return the definition as JSON text, including the mission."""
@@ -205,7 +213,35 @@ class Sweep:
         """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
         data = self._data()
         del data["runs"], data["name"]
-        return data | {"version": __version__}
+        return data | {"version": __version__} | ({"code": self.law[1]} if self.law[0] else {})
+
+    @cached_property
+    def law(self) -> tuple[Any, str]:
+        """The user's controller, or its class, with a digest of its file; None if the mission's laws fly.
+
+        Raises
+        ------
+        RigidfleetError
+            It cannot be imported.
+        """
+        if not (name := self.header.controller):
+            return None, ""
+        try:
+            return controllers.imported(name)
+        except ImportError as error:
+            raise RigidfleetError(f"controller: {error}\n    {controllers.REMEDY}") from error
+
+    @property
+    def version(self) -> str:
+        """What flies it: the version of rigidfleet, and the user's controller."""
+        law = f" with {self.header.controller} {self.law[1][:8]}" if self.header.controller else ""
+        return f"rigidfleet {__version__}{law}"
+
+    @property
+    def random(self) -> bool:
+        """Whether the first run has random numbers: of noise, gusts, links or sensing."""
+        tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
+        return any(keypaths.look_up(self.varied(0), keys) for keys in tables)
 
     @cached_property
     def document(self) -> dict[str, Any]:
@@ -253,9 +289,17 @@ class Sweep:
 
         ``values`` are those of the run, if they are known.
         """
-        document = _copied(self.document, [column.keys for column in self.columns])
+        varied = {column.keys for column in self.columns}
+        document = _copied(self.document, [*varied, *((*keys, "") for keys in _SEEDED)])
         for column, value in zip(self.columns, values or self.values(run), strict=True):
             apply(document, self.whole, column, value)
+        if self.header.random_numbers == "own":
+            stream = np.random.SeedSequence(self.seed, spawn_key=(run, 1))
+            seed = int(stream.generate_state(1)[0] >> 1)
+            for keys in _SEEDED:
+                table = keypaths.look_up(document, keys)
+                if table is not None and (*keys, "seed") not in varied:
+                    table["seed"] = seed
         return document
 
     def mission_of(self, run: int, values: Sequence[Any] | None = None) -> Mission:
@@ -280,7 +324,7 @@ class Sweep:
             "runs": self.runs,
             "seed": self.seed,
             "evaluate": self.evaluate,
-        }
+        } | self.header.model_dump(include=_LATER, exclude_defaults=True)
 
 
 def _copied(x: Any, places: Sequence[Keys]) -> Any:
@@ -345,8 +389,9 @@ def apply(
 
 def _checked(
     data: dict[str, Any], origin: str, mission: Mission | None
-) -> tuple[SweepHeader, list[Variation]]:
-    """Check a sweep and return its header and variations."""
+) -> tuple[list[Variation], SweepHeader]:
+    """Check a sweep and return its variations and header."""
+    data = {key: value for key, value in data.items() if value is not None}
     wrong: dict[int, WrongLine] = {}
     if isinstance(given := data.get("vary"), list):
         parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
@@ -361,22 +406,32 @@ def _checked(
     header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
     whole = None if mission is None else keypaths.whole_document(mission)
-    variations = []
+    variations: list[Variation] = []
+    lacked: list[tuple[int, SweepColumn]] = []
     for k, entry in enumerate(tables(collector, "vary")):
         if k in wrong:
             collector.add(("vary", k), wrong[k].problem, wrong[k].remedy)
             continue
         found = _variation(collector, entry, k)
-        if mission is not None and whole is not None:
-            _fits(collector, k, entry, found, mission, whole)
+        if whole is not None and isinstance(entry, dict) and isinstance(entry.get("path"), str):
+            _fits(collector, k, entry["path"], found, whole, lacked, starts=by_final_states)
         variations += [] if found is None else [found]
-        if by_final_states and found is not None and whole is not None:
-            _moves_starts(collector, k, found, whole)
     if by_final_states and mission is not None:
         from rigidfleet.simulation.ensemble import unfit
 
         if (why := unfit(mission)) is not None:
             collector.add(("evaluate",), why, _WHOLE, "final")
+    if mission is not None and whole is not None:
+        _taken(collector, lacked, mission, whole)
+    if header is not None and (name := header.controller):
+        try:
+            controllers.imported(name)
+        except ImportError as error:
+            collector.add(("controller",), str(error), controllers.REMEDY)
+        if by_final_states:
+            collector.add(("controller",), "does not act on final states alone", _WHOLE)
+    elif "rate" in data:
+        collector.add(("rate",), "is that of a controller", "give a controller, or remove rate")
     _same_length(collector, variations)
     if "vary" not in data or data["vary"] == []:
         collector.add(
@@ -389,7 +444,7 @@ def _checked(
         collector.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
     if collector.findings or header is None:
         raise SweepError(collector.findings)
-    return header, variations
+    return variations, header
 
 
 def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:
@@ -409,15 +464,18 @@ def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | N
 def _fits(
     collector: FindingCollector,
     k: int,
-    entry: Any,
+    path: str,
     v: Variation | None,
-    mission: Mission,
     whole: dict[str, Any],
+    lacked: list[tuple[int, SweepColumn]],
+    *,
+    starts: bool,
 ) -> None:
-    """Check that the path of a variation exists in the mission and can take its values."""
-    path = v.path if v is not None else entry.get("path") if isinstance(entry, dict) else None
-    if not isinstance(path, str):
-        return
+    """Check that the path of a variation exists in the mission and can take its values.
+
+    Places of keys that the mission does not have are added to those that are ``lacked``. With ``starts``, only start
+    states can vary.
+    """
     where = ("vary", k, "path")
     try:
         places = keypaths.expand(whole, path)
@@ -426,36 +484,35 @@ def _fits(
         return
     if v is None:
         return
-    values = getattr(v, "values", None)
-    numeric = values is None or all(map(is_number, values))
-    for word in values or ():
+    values = getattr(v, "values", ())
+    numeric = all(map(is_number, values))
+    for word in values:
         if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
             collector.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
     for keys in places:
         leaves = keypaths.numbers(keypaths.look_up(whole, keys))
         absent = any(x is None for x in leaves)
         table = next((x for x in leaves if isinstance(x, dict)), None)
+        words = [x for x in leaves if not is_number(x)]
         if table is not None:
-            collector.add(
-                where,
+            problem, remedy = (
                 "is a table",
                 f"continue the path with one of its keys: {', '.join(table)}",
-                path,
             )
         elif absent and v.change != "set":
-            collector.add(
-                where,
-                f"the mission has no value to {v.change} to",
-                "set the value, or write one in the mission",
-                path,
-            )
-        elif absent:
-            _taken(collector, where, v, keys, mission, whole)
-        elif numeric and not all(map(is_number, leaves)):
-            remedy = "vary it by a choice or grid of words"
-            collector.add(
-                where, f"has the value {leaves[0]!r}, which is not a number", remedy, path
-            )
+            problem = f"the mission has no value to {v.change} to"
+            remedy = "set the value by =, or write one in the mission"
+        elif numeric and words and not absent:
+            problem = f"has the value {words[0]!r}, which is not a number"
+            remedy = f"vary it by a choice or grid of words, as grid({json.dumps(words[0])})"
+        elif starts and not (numeric and keys[:2] in _STARTS):
+            problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
+            remedy = f"remove it, or {_WHOLE}"
+        else:
+            if absent or keypaths.lacking(whole, keys):
+                lacked.append((k, SweepColumn(v, keys, None)))
+            continue
+        collector.add(where, problem, remedy, path)
 
 
 def _same_length(collector: FindingCollector, variations: list[Variation]) -> None:
@@ -470,36 +527,27 @@ def _same_length(collector: FindingCollector, variations: list[Variation]) -> No
                 collector.add(("vary", k, "group"), problem, remedy, v.group)
 
 
-def _moves_starts(collector: FindingCollector, k: int, v: Variation, whole: dict[str, Any]) -> None:
-    """Check that a variation changes only start states, as the evaluation of final states requires."""
-    values = getattr(v, "values", ())
-    starts = ("agents", "position"), ("agents", "velocity")
-    try:
-        places = keypaths.expand(whole, v.path)
-    except keypaths.PathError:
-        return  # already reported
-    if any(keys[:2] not in starts for keys in places) or not all(map(is_number, values)):
-        problem = (
-            "with final states alone, only numbers in agents.position and agents.velocity can vary"
-        )
-        collector.add(("vary", k, "path"), problem, f"remove it, or {_WHOLE}", v.path)
-
-
 def _taken(
     collector: FindingCollector,
-    where: Keys,
-    v: Variation,
-    keys: Keys,
+    lacked: list[tuple[int, SweepColumn]],
     mission: Mission,
     whole: dict[str, Any],
 ) -> None:
-    """Check that the mission accepts a value for a key that it does not have."""
-    middle = v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
+    """Check that the mission accepts values for the keys that it does not have, all of them together."""
     document = mission.to_dict()
-    apply(document, whole, SweepColumn(v, keys, None), middle)
+    for _, column in lacked:
+        v = column.variation
+        value = (
+            v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
+        )
+        apply(document, whole, column, value)
     try:
         Mission.from_dict(document)
     except MissionError as error:
-        first = error.findings[0]
-        problem = f"the mission does not accept a value: {first.key} {first.problem}"
-        collector.add(where, problem, first.remedy, v.path)
+        for finding in error.findings:
+            names = [[c.name, finding.key.replace("[", ".")] for _, c in lacked]
+            near = [len(commonprefix(pair)) for pair in names]  # noqa: RUF071
+            k, column = lacked[near.index(max(near))]
+            problem = f"the mission does not accept a value: {finding.key} {finding.problem}"
+            remedy = f"in the mission, {finding.remedy}"
+            collector.add(("vary", k, "path"), problem, remedy, column.variation.path)

@@ -258,7 +258,10 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     unknown += [(metric, known)] if metric not in known else []
     if unknown or len(over) != 2:
         word, words = unknown[0] if unknown else (" ".join(over), list(numbers))
-        raise RigidfleetError(f"map: '{word}' cannot be drawn. Choose from: {', '.join(words)}.")
+        why = " (a seed has no order)" if word.endswith("seed") else ""
+        raise RigidfleetError(
+            f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
+        )
     from rigidfleet.plotting.figure import Figure
 
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]

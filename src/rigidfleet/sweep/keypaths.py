@@ -1,7 +1,7 @@
 """Paths of keys in a mission, written as in its messages: `agents.mass.2`, `phases[3].until`.
 
-Indices count from 1; `*` stands for every index or name. A key that the mission does not have takes its default. One
-number for all agents can be addressed as a list with an entry per agent.
+Indices count from 1; `*` stands for every index or name, but for no table that the mission lacks. A key that the
+mission does not have takes its default. One number for all agents can be addressed as a list with an entry per agent.
 """
 
 from __future__ import annotations
@@ -10,19 +10,31 @@ import copy
 import difflib
 import re
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, get_args
+
+from pydantic.fields import FieldInfo
 
 from rigidfleet._common.toml import toml_key
+from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.findings import Keys, model_of
-from rigidfleet.mission.values import Part
+from rigidfleet.mission.values import Part, PerAgent, PerAgentError, PerAxis
 
 #: Stands for any index or name.
 ANY = "*"
 _STEP = re.compile(r'"([^"]*)"|\[(\d+|\*)\]|([^.\[\]"]+)')
+_PATH = re.compile(r'(\.?("[^"]*"|[^.\[\]"]+)|\.?\[(\d+|\*)\])+')
+#: Digits of the largest index: no list is longer.
+_DIGITS = 9
+#: Types of keys that take one number or a list, and the length of the list; 0: the number of agents.
+_LISTS = ((get_args(PerAgentError)[0], 0), (PerAgent | None, 0), (PerAxis | None, 3))
 
 
-class PathError(ValueError):
+class Absent(dict[str, Any]):
+    """Defaults of a table that a mission does not have."""
+
+
+class PathError(RigidfleetError):
     """A path that does not exist, with problem and remedy."""
 
     def __init__(self, problem: str, remedy: str) -> None:
@@ -43,25 +55,21 @@ def expand(whole: Mapping[str, Any], path: str) -> list[Keys]:
     PathError
         No place matches.
     """
+    if not _PATH.fullmatch("." + path):
+        remedy = "write agents.mass.2, or agents.position.*.3 for every agent"
+        raise PathError("is not a valid path", remedy)
     steps = [quoted or index or word for quoted, index, word in _STEP.findall(path)]
-    if not steps or _STEP.sub("", path).strip(".[]"):
-        raise PathError(
-            "is not a valid path", "write agents.mass.2, or agents.position.*.3 for every agent"
-        )
-    found: list[tuple[Keys, Any]] = [((), whole)]
-    for depth, step in enumerate(steps):
-        further = [(keys + (k,), inner) for keys, at in found for k, inner in _below(at, step)]
-        if not further:
-            there = ".".join(steps[:depth]) or "the mission"
-            problem = f"there is no '{step}' in {there}"
-            raise PathError(problem, _remedy(whole, found[0][1], steps, depth))
-        found = further
+    found, depth = _matches(whole, steps)
+    if depth < len(steps):
+        problem = f"there is no '{steps[depth]}' in {'.'.join(steps[:depth]) or 'the mission'}"
+        raise PathError(problem, _remedy(whole, found[0][1], steps, depth))
     return [keys for keys, _ in found]
 
 
 def whole_document(mission: Mission) -> dict[str, Any]:
     """A mission as plain data with all defaults; None for optional keys without a value."""
-    return _filled(mission)
+    whole: dict[str, Any] = _filled(mission, mission.n_agents)
+    return whole
 
 
 def look_up(data: Any, keys: Keys) -> Any:
@@ -91,6 +99,11 @@ def change(
         at = at[k]
 
 
+def lacking(whole: Mapping[str, Any], keys: Keys) -> bool:
+    """Whether a place is in a table that the mission does not have."""
+    return any(isinstance(look_up(whole, keys[:k]), Absent) for k in range(1, len(keys)))
+
+
 def numbers(value: Any) -> list[Any]:
     """Entries of nested lists, in order."""
     return [x for v in value for x in numbers(v)] if isinstance(value, list) else [value]
@@ -117,57 +130,79 @@ def meaning(mission: Mission, keys: Keys) -> str:
     return text
 
 
-def _filled(value: Any) -> Any:
+def _filled(value: Any, n: int, field: FieldInfo | None = None) -> Any:
+    """Plain data of a value with all defaults, of a key with a type, in a mission of n agents."""
+    kind = None if field is None else field.annotation
+    if value is None and (model := model_of(kind)):
+        fields = model.model_fields.items()
+        return Absent(
+            (
+                k,
+                _filled(
+                    None if f.is_required() else f.get_default(call_default_factory=True), n, f
+                ),
+            )
+            for k, f in fields
+        )
+    if kind is not None and isinstance(value, float):
+        return next(([value] * (count or n) for listed, count in _LISTS if listed == kind), value)
     if isinstance(value, Part):
-        filled = {}
-        for name, field in type(value).model_fields.items():
-            inner = getattr(value, name)
-            absent = model_of(field.annotation) if inner is None else None
-            filled[name] = _defaults(absent) if absent else _filled(inner)
-        return filled
+        return {k: _filled(getattr(value, k), n, f) for k, f in type(value).model_fields.items()}
     if isinstance(value, Mapping):
-        return {key: _filled(inner) for key, inner in value.items()}
-    return [_filled(v) for v in value] if isinstance(value, tuple | list) else value
+        return {key: _filled(inner, n) for key, inner in value.items()}
+    return [_filled(v, n) for v in value] if isinstance(value, tuple | list) else value
 
 
-def _defaults(kind: type[Part]) -> dict[str, Any]:
-    """Defaults of a table that a mission does not have."""
-    fields = kind.model_fields.items()
-    return {
-        name: None if f.is_required() else _filled(f.get_default(call_default_factory=True))
-        for name, f in fields
-    }
+def _matches(whole: Mapping[str, Any], steps: list[str]) -> tuple[list[tuple[Keys, Any]], int]:
+    """Places, with what is there, that match as many of the first steps as any place does, and how many these are."""
+    found: list[tuple[Keys, Any]] = [((), whole)]
+    for depth, step in enumerate(steps):
+        further = [(keys + (k,), inner) for keys, at in found for k, inner in _below(at, step)]
+        if not further:
+            return found, depth
+        found = further
+    return found, len(steps)
 
 
 def _below(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
-    if isinstance(at, dict):
-        yield from at.items() if step == ANY else [(step, at[step])] if step in at else []
+    if isinstance(at, dict) and step == ANY:
+        yield from ((k, inner) for k, inner in at.items() if not isinstance(inner, Absent))
+    elif isinstance(at, dict):
+        yield from [(step, at[step])] if step in at else []
     elif isinstance(at, list) and step == ANY:
         yield from enumerate(at)
-    elif isinstance(at, list) and step.isdecimal() and 1 <= int(step) <= len(at):
-        yield int(step) - 1, at[int(step) - 1]
+    elif isinstance(at, list) and step.isdecimal() and len(step) <= _DIGITS:
+        yield from [*enumerate(at)][int(step) - 1 : int(step)] if int(step) else []
 
 
 def _remedy(whole: Mapping[str, Any], at: Any, steps: list[str], depth: int) -> str:
-    """Suggest a similar path, or list what exists at this depth."""
-    rest = steps[depth + 1 :]
-    if isinstance(at, dict):
-        close = difflib.get_close_matches(steps[depth], [str(k) for k in at], n=1, cutoff=0.55)
-        if close:
-            return f"did you mean '{'.'.join([*steps[:depth], close[0], *rest])}'?"
-    elif isinstance(at, list) and not steps[depth].isdecimal() and rest == []:
-        return f"use an index from 1 to {len(at)}, or * for all"
-    # agents.2.mass instead of agents.mass.2
-    turned = [*steps[:depth], *rest, steps[depth]]
-    if rest and (steps[depth].isdecimal() or steps[depth] == ANY):
-        try:
-            expand(whole, ".".join(turned))
-        except PathError:
-            pass
-        else:
-            return f"did you mean '{'.'.join(turned)}'?"
+    """Suggest a similar path that exists, or list what exists at this depth."""
+    for guess in _guesses(whole, at, steps, depth):
+        places, reached = _matches(whole, guess)
+        if reached == len(guess) and not any(isinstance(x, dict) for _, x in places):
+            words = (word if word == ANY else toml_key(word) for word in guess)
+            return f"did you mean '{'.'.join(words)}'?"
+    if isinstance(at, dict | list) and not at:
+        return "nothing is there: write it in the mission, or remove this variation"
     if isinstance(at, dict):
         return f"keys there: {', '.join(map(str, at))}"
     if isinstance(at, list):
         return f"use an index from 1 to {len(at)}, or * for all"
     return "the path ends there; remove the rest"
+
+
+def _guesses(
+    whole: Mapping[str, Any], at: Any, steps: list[str], depth: int
+) -> Iterator[list[str]]:
+    """Paths that may be meant, the likeliest first."""
+    before, (first, *rest) = steps[:depth], steps[depth:]
+    if first.isdecimal() or first == ANY:
+        yield [*before, *rest, first]  # agents.2.mass instead of agents.mass.2
+    if isinstance(at, dict):
+        for name, table in whole.items() if depth < 2 else ():  # a key of another table
+            if isinstance(table, dict):
+                yield from ([name, *way, first, *rest] for way in ((), *((k,) for k in table)))
+        yield from (
+            [*before, k, *rest]
+            for k in difflib.get_close_matches(first, map(str, at), n=1, cutoff=0.55)
+        )

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from rigidfleet.errors import MissionError
 
-#: Reasons other than failed checks: the varied mission has errors; the program failed.
-REFUSED, BROKEN = "mission", "error"
+#: Reasons other than failed checks, of runs without a verdict: the varied mission has errors; the program failed; the
+#: user's controller failed.
+REFUSED, BROKEN, RAISED = UNJUDGED = "mission", "error", "controller"
 _CALLED = {REFUSED: "mission refused", BROKEN: "program error"}
 
 
@@ -19,7 +20,7 @@ class RunRecord:
     ----------
     run : number of the run, from 0
     passed : whether the run passed its verdict
-    reason : failed checks, separated by commas; `REFUSED` or `BROKEN` if the run was not flown; "" if it passed
+    reason : failed checks, separated by commas; one of `UNJUDGED` if the run has no verdict; "" if it passed
     detail : message of the first failure
     codes : value of every column of the sweep, encoded by `Variation.code`
     metrics : value of each of `METRICS`; NaN if it does not apply

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from rigidfleet.errors import MissionError
+from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
-from rigidfleet.sweep.record import BROKEN, RunRecord, refusal
+from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal
 
 if TYPE_CHECKING:
     from rigidfleet.result import Result
@@ -40,15 +40,20 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     from rigidfleet.simulation.flight import simulate
     from rigidfleet.simulation.together import simulate_together
 
+    law, rate = sweep.law[0], sweep.header.rate
+    new = law if isinstance(law, type) else lambda: law
     begun = perf_counter()
     values = {run: sweep.values(run) for run in runs}
     flown: dict[int, Any] = {
         run: _tried(lambda run=run: sweep.mission_of(run, values[run])) for run in runs
     }
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
-    together = _tried(lambda: simulate_together([flown[run] for run in valid]))
-    if isinstance(together, Exception):
-        together = [_tried(lambda run=run: simulate(flown[run])) for run in valid]
+    together = law or _tried(lambda: simulate_together([flown[run] for run in valid]))
+    if law is not None or isinstance(together, Exception):
+        together = [
+            _tried(lambda run=run: simulate(flown[run], controller=new(), rate=rate))
+            for run in valid
+        ]
     flown |= zip(valid, together, strict=True)
     del together
     shared = (perf_counter() - begun) / len(runs)
@@ -77,6 +82,8 @@ def _row(
     match found:
         case MissionError():
             reason, detail = refusal(found)
+        case FlightError() if sweep.header.controller:
+            reason, detail = RAISED, str(found)
         case Exception():
             reason, detail = BROKEN, f"{type(found).__name__}: {found}"
         case _:

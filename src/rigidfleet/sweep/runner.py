@@ -13,7 +13,6 @@ from time import perf_counter
 
 import numpy as np
 
-from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
@@ -82,7 +81,7 @@ def fly(
     ResultError
         The folder contains another sweep or cannot be written.
     RigidfleetError
-        The cluster does not answer, or workers keep dying.
+        The cluster does not answer, workers keep dying, or the controller cannot be imported.
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
@@ -139,13 +138,13 @@ class _Sweeping:
         """Fly all missing runs by a pool of workers. Runs that do not come back are missing again."""
         executor, capacity = pool
         flying: dict[Future[list[RunRecord]], list[int]] = {}
-        text = self.sweep.json()
+        sweep = self.sweep.json(), self.sweep.version
         try:
             while self.missing or flying:
                 workers = capacity()
                 while self.missing and len(flying) < _AHEAD * workers:
                     runs = self.take(workers)
-                    flying[executor.submit(pools.chunk, text, __version__, runs)] = runs
+                    flying[executor.submit(pools.chunk, *sweep, runs)] = runs
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
                     self.keep(future.result())
                     del flying[future]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import sqlite3
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
@@ -31,6 +32,8 @@ FILE = "sweep.db"
 _LOCK = "sweep.lock"
 #: Version of the format, stored as `user_version`; 0 in files of the first format.
 _FORMAT = 3
+#: Space on a disk that SQLite needs to work, and reports as errors of all kinds if it has less [bytes].
+_ROOM = 1 << 20
 _COLUMNS = ("passed", "reason", "detail", "wall", "codes", *METRICS)
 #: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")
@@ -158,7 +161,8 @@ class Store:
             yield
             self.db.execute("COMMIT")
         except BaseException:
-            self.db.execute("ROLLBACK")
+            if self.db.in_transaction:  # SQLite has rolled back where the disk is full
+                self.db.execute("ROLLBACK")
             raise
 
 
@@ -247,6 +251,8 @@ def _explained(path: Path) -> Generator[None]:
     except sqlite3.OperationalError as error:
         if "locked" in str(error):
             why, remedy = "another sweep is writing it", "Wait until it ends"
+        elif "full" in str(error) or shutil.disk_usage(path.parent).free < _ROOM:
+            why, remedy = "the disk is full", "Make room and repeat the command, which goes on"
         else:
             why, remedy = str(error), "Check the disk"
         raise ResultError(
@@ -274,13 +280,12 @@ def _difference(there: dict[str, str], identity: str) -> str:
     """Message about the differences between a stored sweep and another definition."""
     old, new = json.loads(there["identity"]), json.loads(identity)
     names = {
-        "mission": "mission",
         "vary": "variations",
-        "seed": "seed",
         "evaluate": "what is evaluated",
-        "version": "version",
+        "code": "file of the controller",
     }
-    other = [words for key, words in names.items() if old.get(key) != new[key]]
+    keys = [key for key in {**new, **old} if old.get(key) != new.get(key)]
+    other = [names.get(key, key.replace("_", " ")) for key in keys]
     return (
         f"contains another sweep; it differs in: {', '.join(other)}. Use --force to overwrite, or --out to choose"
         " another folder."

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
 #: Confidence level of the intervals of rates [-].
 CONFIDENCE = 0.95
-#: Significance level below which a rank correlation is shown.
+#: Share of the rank correlations shown that chance may have made (false discovery rate).
 _CHANCE = 0.01
 #: Maximum number of rank correlations in the table.
 _SHOWN = 8
@@ -59,12 +59,17 @@ class Example:
 
 @dataclass(frozen=True)
 class Driver:
-    """Spearman's rank correlation of a varied number with an outcome, and its p-value (`chance`)."""
+    """Spearman's rank correlation of a varied number with an outcome, and its p-value (`chance`).
+
+    `adjusted` is the p-value after Benjamini and Hochberg: of all drivers that it is below q for, chance makes the
+    share q at most.
+    """
 
     varied: str
     outcome: str
     correlation: float
     chance: float
+    adjusted: float
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,8 @@ class Summary:
     percentiles : values of each metric at `PERCENTILES`
     drivers : rank correlations of every varied number with success and every metric, strongest first
     by_value : success rate for each value of a variation that is not numeric
+    random_numbers : "shared": all runs have the same ones; "own": each run has its own; "varied": their seeds vary;
+        "none": no random numbers act
     """
 
     name: str
@@ -93,6 +100,7 @@ class Summary:
     percentiles: dict[str, list[float]]
     drivers: list[Driver]
     by_value: dict[str, dict[str, Rate]]
+    random_numbers: str
 
     def to_dict(self) -> dict[str, Any]:
         """The summary as plain data."""
@@ -102,7 +110,8 @@ class Summary:
             for name, values in self.percentiles.items()
         }
         units = {name: METRICS[name].unit for name in self.percentiles}
-        return plain(found | {"units": units, "confidence": CONFIDENCE})
+        tested = {"pairs_tested": len(self.drivers), "false_discovery_rate": _CHANCE}
+        return plain(found | tested | {"units": units, "confidence": CONFIDENCE})
 
     def json(self) -> str:
         """The summary as JSON text."""
@@ -139,7 +148,14 @@ def summarise(table: Table) -> Summary:
         percentiles,
         drivers(table),
         by_value,
+        _random_numbers(table),
     )
+
+
+def _random_numbers(table: Table) -> str:
+    seeded = any(column.keys[-1] == "seed" for column in table.sweep.columns)
+    word = "varied" if seeded else table.sweep.header.random_numbers
+    return word if table.sweep.random else "none"
 
 
 def failures(table: Table) -> dict[str, int]:
@@ -189,18 +205,18 @@ def outcomes(table: Table) -> dict[str, Floats]:
 
 
 def varied(table: Table) -> dict[str, Floats]:
-    """Varied numbers by path, without variations that are not numeric."""
+    """Varied numbers by path, without seeds, which have no order, and variations that are not numeric."""
     worded = _worded(table)
     return {
         column.name: table.codes[:, k]
         for k, column in enumerate(table.sweep.columns)
-        if column.name not in worded and _differs(table.codes[:, k])
+        if column.name not in worded and column.keys[-1] != "seed" and _differs(table.codes[:, k])
     }
 
 
 def drivers(table: Table) -> list[Driver]:
     """Rank correlation of every varied number with every outcome, strongest first."""
-    found = []
+    found: list[tuple[str, str, float, float]] = []
     numbers = varied(table)
     ranked = {name: _ranks(x) for name, x in numbers.items()}
     for outcome, y in outcomes(table).items():
@@ -212,8 +228,19 @@ def drivers(table: Table) -> list[Driver]:
         for name, x in numbers.items():
             if every or _differs(x[there]):
                 x_ranked = ranked[name] if every else _ranks(x[there])
-                found.append(Driver(name, outcome, *_correlated(x_ranked, y_ranked)))
-    return sorted(found, key=lambda d: -abs(d.correlation))
+                found.append((name, outcome, *_correlated(x_ranked, y_ranked)))
+    adjusted = _adjusted(np.array([chance for *_, chance in found]))
+    pairs = [Driver(*d, float(q)) for d, q in zip(found, adjusted, strict=True)]
+    return sorted(pairs, key=lambda d: -abs(d.correlation))
+
+
+def _adjusted(chance: Floats) -> Floats:
+    """P-values (n,) corrected for their number, by Benjamini and Hochberg."""
+    n = len(chance)
+    order = np.argsort(-chance)
+    found = np.empty(n)
+    found[order] = np.minimum.accumulate(chance[order] * n / np.arange(n, 0, -1))
+    return found
 
 
 def _ranks(x: Floats) -> Floats:
@@ -223,14 +250,18 @@ def _ranks(x: Floats) -> Floats:
 
 
 def _correlated(x: Floats, y: Floats) -> tuple[float, float]:
-    """Correlation of ranks, and the chance of a larger one: Student's t with n - 2 degrees of freedom."""
+    """Correlation of ranks, and the chance of a larger one: Student's t with n - 2 degrees of freedom.
+
+    It is at least that of the strongest correlation, which two of all orders have: t is too sure of a few runs.
+    """
     from scipy.special import stdtr
 
     r = float(np.clip(x @ y / math.sqrt(x @ x * (y @ y)), -1.0, 1.0))
+    free, least = len(x) - 2, 2.0 * math.exp(-math.lgamma(len(x) + 1.0))
     if abs(r) == 1.0:
-        return r, 0.0
-    free = len(x) - 2
-    return r, float(2.0 * stdtr(free, -abs(r) * math.sqrt(free / ((1.0 + r) * (1.0 - r)))))
+        return r, least
+    t = abs(r) * math.sqrt(free / ((1.0 + r) * (1.0 - r)))
+    return r, max(float(2.0 * stdtr(free, -t)), least)
 
 
 def _worded(table: Table) -> set[str]:
@@ -315,13 +346,21 @@ def _rendered(summary: Summary) -> RenderableType:
             words = Text(f"run {example.run}{': ' if example.detail else ''}{example.detail}")
             reasons.add_row(called(reason), str(count), f"{100 * count / s.of:.3g} %", words)
         shown.append(reasons)
-    strong = [d for d in summary.drivers if d.chance < _CHANCE]
+    strong = [d for d in summary.drivers if d.adjusted < _CHANCE]
     failing = [d for d in strong if d.outcome == "success"]
     if strong:
         rank = _grid("varied number", "outcome", "rank correlation")
         for d in (failing + [d for d in strong if d not in failing])[:_SHOWN]:
             rank.add_row(d.varied, d.outcome, f"{d.correlation:+.2f}")
         shown.append(rank)
+    if n := len(summary.drivers):
+        words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
+        shown.append(Text(words))
+    if summary.random_numbers != "none":
+        words = {"shared": "the same in all runs", "own": "of each run its own"}
+        shown.append(
+            Text(f"Random numbers: {words.get(summary.random_numbers, 'by varied seeds')}.")
+        )
     for name, rates in summary.by_value.items():
         values = _grid(name, "passed", "95 % interval")
         for word, r in rates.items():

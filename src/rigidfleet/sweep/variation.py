@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +26,10 @@ from rigidfleet.mission.values import Number, Part, Positive
 
 #: Signs in a line, and the change that each stands for.
 SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
+
+
+#: Greatest number, as an integer may be beyond.
+_MOST = sys.float_info.max
 
 
 class Variation(Part):
@@ -135,7 +140,10 @@ class _Listed(Variation):
         return code if self._numeric else self.values[int(code)]
 
     def wrong(self) -> tuple[str, str, str] | None:
-        """Error if values that are not numbers are to be added or scaled."""
+        """Error if a value is of another type, or if values that are not numbers are to be added or scaled."""
+        if not all(map(_usable, self.values)):
+            words = "finite numbers, words, true or false, or lists of these"
+            return "values", f"must be {words}", "correct the value"
         if self.change != "set" and not self._numeric:
             return (
                 "values",
@@ -259,6 +267,13 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+def _usable(value: object) -> bool:
+    """Whether a mission may have a value."""
+    if isinstance(value, list | tuple | dict):
+        return all(map(_usable, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, str) or (isinstance(value, int | float) and abs(value) <= _MOST)
+
+
 def _words(text: str) -> list[str]:
     """Split text at commas outside of brackets."""
     words, depth = [""], 0
@@ -276,7 +291,7 @@ def _value(word: str) -> Any:
     for read in (json.loads, float):
         try:
             return read(word)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
     return word.strip("'\"")
 

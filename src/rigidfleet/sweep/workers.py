@@ -16,7 +16,6 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.processes import safe_path
-from rigidfleet._version import __version__
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import shared
 from rigidfleet.sweep.record import RunRecord
@@ -40,14 +39,15 @@ def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     Raises
     ------
     RigidfleetError
-        The other process has another version of rigidfleet.
+        The other process has another version of rigidfleet, or of the user's controller.
     """
-    if version != __version__:
+    flown = shared(sweep)
+    if version != flown.version:
         raise RigidfleetError(
-            f"a worker has rigidfleet {__version__}, but the sweep was started by {version}. Install the same version"
-            " on all machines."
+            f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
+            " machines."
         )
-    return fly_runs(shared(sweep), runs)
+    return fly_runs(flown, runs)
 
 
 @contextmanager
