@@ -26,6 +26,7 @@ from rigidfleet.mission.values import (
     Tolerance,
     Trajectories,
     Vector,
+    Velocity,
     VelocityOrFree,
 )
 from rigidfleet.typing import Floats
