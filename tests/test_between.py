@@ -12,6 +12,7 @@ from rich.console import Console
 import rigidfleet as rf
 from rigidfleet.assessment import CheckResult, Verdict, safety
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.preflight.check import check as foresee
 from rigidfleet.reporting import html_page
 from rigidfleet.result import Extremum, Result
 from rigidfleet.simulation.together import simulate_together
@@ -436,3 +437,18 @@ def test_nobody_lands_on_a_wall():
     check = checks(rf.assess(result))["touch_down"]
     assert not check.passed
     assert "no vehicle is on the ground" in check.message
+
+
+@pytest.mark.parametrize("phases", [["takeoff"], ["takeoff", "land"]])
+@pytest.mark.parametrize("depth", [0.0, 1e-5])
+def test_a_check_lets_vehicles_stand_on_the_ground(phases, depth):
+    """Vehicles that start in contact with the ground pass, and a check foresees no hit; .01 mm in it, both fail."""
+    every = {"takeoff": {"kind": "takeoff", "height": 6.0}, "land": {"kind": "land"}}
+    data = {
+        "schema_version": 1, "name": "pad", "obstacles": [{"kind": "ground"}],
+        "agents": {"mass": 1.0, "radius": 0.25, "position": [[0.0, 0.0, 0.25 - depth], [4.0, 0.0, 0.25]]},
+        "phases": [every[kind] | {"duration": 8.0} for kind in phases],
+    }  # fmt: skip
+    pad = Mission.from_dict(data)
+    assert any(remark.level == "fails" for remark in foresee(pad).remarks) == (depth > 0.0)
+    assert rf.assess(rf.simulate(pad)).passed == (depth == 0.0)

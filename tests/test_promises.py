@@ -316,13 +316,22 @@ def test_tolerance_is_given_once():
         mission(ESTABLISH, formations={"a": form})
 
 
+@pytest.mark.parametrize("key", ["tolerance", "tolerance_share"])
+def test_no_shape_is_exact(key):
+    """A tolerance of zero, which no flight keeps, is refused in metres as in shares."""
+    with pytest.raises(MissionError, match=rf"{key} = 0.0: must be > 0"):
+        mission(ESTABLISH, formations={"a": {"slots": SLOTS, key: 0.0}})
+
+
 def test_a_flight_by_hand_keeps_the_tolerance():
-    """The record of phases begun by hand has the tolerance, also where agents are assigned to slots."""
-    form = {"slots": SLOTS, "tolerance": 0.2}
+    """The record of phases begun by hand has tolerance and dimension, also where agents are assigned to slots."""
+    flat = [[x, y, 0.0] for x, y, _ in SLOTS[:3]] + [[3.0, 3.0, 0.0]]
+    form = {"slots": flat, "tolerance": 0.2, "dimension": 2}
     flight = rf.Flight(mission(ESTABLISH, formations={"a": form}, assignment="shortest"))
     flight.begin(ESTABLISH | {"duration": 3.0, "blend": 2.0})
     flight.advance()
-    assert flight.finish().mission.formations["a"].tolerance == 0.2
+    kept = flight.finish().mission.formations["a"]
+    assert (kept.tolerance, kept.dimension) == (0.2, 2)
 
 
 # -- free velocity ---------------------------------------------------------------------------------

@@ -482,7 +482,7 @@ class Formation(Part):
         None, description="greatest error of a distance [m]; default: by tolerance_share"
     )
     tolerance_share: Share = Field(
-        SHAPE_TOLERANCE, description="the same, as a share of the formation's shortest distance [-]"
+        SHAPE_TOLERANCE, gt=0, description="the same, as a share of the shortest distance [-]"
     )
     colour: Colour | None = Field(
         None,

@@ -63,7 +63,7 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         if worst:
             shown[b] = min(worst.values())
         for exact, (clearance, t, i, phase) in worst.items():
-            if clearance <= 0:
+            if clearance < -1e-6:  # a vehicle that stands is in contact
                 verb = "hits" if exact else "may hit"
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
                 if isinstance(thing, Ground):

@@ -174,6 +174,6 @@ def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
 def _written_out(mission: Mission, name: str) -> dict[str, Any]:
     """A formation with its slots and edges in the order of the agents."""
     edges = (mission.formation_edges(name) + 1).tolist()
-    kept = {"distances", "tolerance", "tolerance_share"}
+    kept = {"distances", "dimension", "tolerance", "tolerance_share"}
     given = mission.formations[name].model_dump(include=kept, exclude_defaults=True)
     return {"slots": mission.formation_slots(name), "edges": edges} | given
