@@ -189,8 +189,8 @@ THROUGH = {"through": [{"position": [20.0, 3, 4]}]}
 @pytest.mark.parametrize(
     ("phase", "where", "drag"),
     [
-        ({"kind": "hold", "duration": 6.0}, "place at the end", {"wind": [3.0, 0, 0], "drag": 0.1}),
-        ({"kind": "brake", "duration": 6.0}, "place at the end", {"wind": [3.0, 0, 0], "drag": 0.1}),
+        ({"kind": "hold", "duration": 6.0}, "its place at the end", {"wind": [3.0, 0, 0], "drag": 0.1}),
+        ({"kind": "brake", "duration": 6.0}, "its place at the end", {"wind": [3.0, 0, 0], "drag": 0.1}),
         (FLY | {"position": [40.0, 0, 5], "duration": 16.0} | THROUGH, "point 1 on", {"drag": 0.2}),
     ],
 )  # fmt: skip
@@ -200,7 +200,7 @@ def test_offsets_are_held_against_places_that_are_no_waypoints(phase, where, dra
         mission(phase, disturbances=drag | {"drag": drag["drag"] * x}) for x in (1, 0.1)
     )
     (text,) = (r.text for r in check(strong, search=False).remarks if r.level == "fails")
-    assert where in text
+    assert f": {where}" in text
     assert failed(assess(simulate(strong))) == {"waypoint_position"}
     assert not foreseen(check(weak, search=False))
     assert assess(simulate(weak)).passed

@@ -160,7 +160,7 @@ def _broken(
         if by > tolerance["position"]:
             yield (
                 "waypoint",
-                f"its {place} is missed by {by:.2f} m (limit {tolerance['position']} m)",
+                f"{place} is missed by {by:.2f} m (limit {tolerance['position']} m)",
             )
     forms, turns = phase.establishing is not None, "attitude" in phase.meets
     lies, goal = forms and not mission.free_attitude(phase), leg.after.goal
