@@ -930,6 +930,24 @@ def test_a_figure_fits_its_column(triangle, tmp_path, width):
         assert image.width / image.info["dpi"][0] * 25.4 == pytest.approx(width, abs=0.5)
 
 
+@pytest.mark.parametrize("width", [80.0, 88.0, 130.0])
+def test_words_at_a_point_are_on_the_page(width):
+    """Wherever the least clearance of a flight is, what is written beside it is in its axes."""
+    result = a_flight(n=12, samples=41, formation=None)
+    apart = np.linspace(2.0, 3.0, len(result.time))
+    for k in range(0, len(apart), 4):
+        dip = apart.copy()
+        dip[k] = -0.228
+        with style.shape(width=width):
+            figure, ((ax,),) = style.time_figure(result, "Clearance", 1)
+            ax.plot(result.time, dip)
+            at = style.around(result.time[k], dip[k])
+            style.annotate(ax, f"-0.228 m at {result.time[k]:.2f} s, agents 11 and 12", at)
+            style.place_words(figure)
+        box = ax.texts[-1].get_window_extent()
+        assert ax.bbox.x0 - 1 <= box.x0 < box.x1 <= ax.bbox.x1 + 1
+
+
 @pytest.mark.parametrize("width", [0.0, -88.0, 59.0, 401.0, math.nan])
 def test_a_width_has_bounds(triangle, width):
     """A width that no page has is refused with the bounds."""

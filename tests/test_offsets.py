@@ -181,3 +181,40 @@ def test_nothing_is_said_to_fail_that_passes(model):
         broken = failed(assess(simulate(blown)))
         for topic in foreseen(check(blown, search=False)):
             assert broken & set(FORESEEN[topic]), topic
+
+
+THROUGH = {"through": [{"position": [20.0, 3, 4]}]}
+
+
+@pytest.mark.parametrize(
+    ("phase", "where", "drag"),
+    [
+        ({"kind": "hold", "duration": 6.0}, "its place at the end", {"wind": [3.0, 0, 0], "drag": 0.1}),
+        ({"kind": "brake", "duration": 6.0}, "its place at the end", {"wind": [3.0, 0, 0], "drag": 0.1}),
+        (FLY | {"position": [40.0, 0, 5], "duration": 16.0} | THROUGH, "point 1 on", {"drag": 0.2}),
+    ],
+)  # fmt: skip
+def test_offsets_are_held_against_places_that_are_no_waypoints(phase, where, drag):
+    """Where a phase stays, and points on its way, are missed in flight where a check says so."""
+    strong, weak = (
+        mission(phase, disturbances=drag | {"drag": drag["drag"] * x}) for x in (1, 0.1)
+    )
+    (text,) = (r.text for r in check(strong, search=False).remarks if r.level == "fails")
+    assert f": {where}" in text
+    assert failed(assess(simulate(strong))) == {"waypoint_position"}
+    assert not foreseen(check(weak, search=False))
+    assert assess(simulate(weak)).passed
+
+
+@pytest.mark.parametrize("tolerance", [{"tolerance": 0.3}, {"tolerance_share": 0.1}])
+def test_a_tolerance_of_a_formation_is_that_of_its_check(tolerance):
+    """Errors of mass that a formation's own tolerance allows are no fault, and those that it does not allow are."""
+    for error, share, passes in ((0.02, 1.0, True), (0.002, 0.03, False)):
+        own = {name: share * x for name, x in tolerance.items()}
+        errors = [error, error, -error, -error]
+        tilted = mission(
+            TAKE | {"formation": "upright", "duration": 12.0},
+            upright=APART | own,
+            disturbances={"mass_error": errors},
+        )
+        assert check(tilted, search=False).passed == passes == assess(simulate(tilted)).passed

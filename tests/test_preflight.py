@@ -704,3 +704,38 @@ def test_large_planar_formations_are_judged_in_their_plane():
         form = {"slots": p, "edges": "neighbours", "reach": 1.2}
         flown = mission(start, agents={"radius": 0.01}, formations={"f": form}, phases=[OPEN])
         assert failures(check(flown, search=False)) == fails
+
+
+@pytest.mark.parametrize("tolerance", [{"tolerance": 0.3}, {"tolerance_share": 0.2}])
+def test_flexible_formations_are_held_against_their_own_tolerance(tolerance):
+    """A square by five distances, started off its plane, misses 1 % and keeps a tolerance of its own, as it flies."""
+    start = np.array(LEVEL) + [[0, 0, 1], [0, 0, 0], [0, 0, 0], [0, 0, 0]]
+    for own, passes in (({}, False), (tolerance, True)):
+        flown = mission(start, formations={"f": FIVE | own}, phases=[OPEN])
+        assert check(flown, search=False).passed == passes == assess(simulate(flown)).passed
+
+
+@pytest.mark.parametrize(("along", "fails"), [([1.0, 0, 0], True), ([0, 1.0, 0], False)])
+def test_a_force_on_unequal_masses_along_their_line_does_not_unfold_it(along, fails):
+    """Unequal masses leave their line by a force across it, not along it."""
+    flown = mission(
+        COLLINEAR,
+        agents={"mass": [1.0, 2.0, 1.5]},
+        formations={"f": TRIANGLE},
+        phases=[OPEN | {"input_force": along}],
+    )
+    assert check(flown).passed != fails
+    assert assess(simulate(flown)).passed != fails
+
+
+def test_a_flat_formation_does_not_become_spatial_by_its_edges():
+    """Agents that form a level square by edges alone cannot form a tetrahedron by edges after it."""
+    forms = {"f": {"shape": "square", "size": 3.0}, "g": {"shape": "tetrahedron", "size": 3.0}}
+    phases = [OPEN, {"kind": "reshape", "formation": "g", "control": "open", "until": 30.0}]
+    flown = mission(LEVEL, formations=forms, phases=phases)
+    assert failures(check(flown)) == {"formation"}
+    assert not assess(simulate(flown)).passed
+    phases[1]["control"] = "tracking"
+    flown = mission(LEVEL, formations=forms, phases=phases)
+    assert check(flown).passed
+    assert assess(simulate(flown)).passed

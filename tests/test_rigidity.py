@@ -558,6 +558,14 @@ def test_spatial_shapes_have_no_plane():
         realisations(SPREAD, graphs.complete_graph(5), dimension=2)
 
 
+@pytest.mark.parametrize("dimension", [0, 4, 2.0, None, "2"])
+@pytest.mark.parametrize("search", [analyse, realisations])
+def test_a_dimension_is_that_of_a_space(search, dimension):
+    """A dimension that no space has is refused by its value."""
+    with pytest.raises(ValueError, match="dimension must be 1, 2 or 3"):
+        search(SPREAD[:, :2], graphs.complete_graph(5), dimension=dimension)
+
+
 def chair(bond=4.0, angle=110.0):
     """A ring of six with equal sides and angles, up and down in turn, as cyclohexane's, with sides and next sides."""
     across = 2 * bond * np.sin(np.deg2rad(angle) / 2)  # of next neighbours

@@ -47,6 +47,7 @@ _COLUMN = 5.5  # a figure that is narrower has one column of axes [in]
 _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
 _DOT = _DPI / 100  # a hundredth of an inch [pixels]
+_OUTSIDE = 100  # cost of a text that leaves its axes
 _SLANT = 38.0  # slant of phase names that do not fit horizontally [deg]
 _LONGEST = 28  # greatest length of a phase name
 _POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
@@ -372,6 +373,10 @@ def place_words(fig: Figure) -> None:
                 if not covered:
                     break
             _move(label, chosen)
+            if best >= _OUTSIDE:  # beside its place rather than off the page
+                box, page = label.get_window_extent(), ax.bbox
+                over = min(0.0, page.x1 - box.x1) or max(0.0, page.x0 - box.x0)
+                label.set_position((chosen[2][0] + 72.0 * over / fig.dpi, chosen[2][1]))
 
 
 def _move(label: Annotation, place: Place) -> None:
@@ -395,7 +400,7 @@ def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
     inside = ax.bbox.padded(_DOT)
     if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
         over = (inside.x0 - box.x0, box.x1 - inside.x1, inside.y0 - box.y0, box.y1 - inside.y1)
-        n += 100 + int(max(over))
+        n += _OUTSIDE + int(max(over))
     return n
 
 

@@ -14,7 +14,7 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, some
+from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, some
 from rigidfleet.rigidity import (
     Kind,
     Rigidity,
@@ -113,8 +113,8 @@ def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
         return None
     given = mission.formation_distances(name)
     error = np.abs(distance_geometry.distances(slots, edges) - given)
-    worst = int(error.argmax())
-    return (worst, float(error[worst])) if error[worst] > TOLERANCE * given.min() else None
+    worst, most = int(error.argmax()), mission.formations[name].greatest_error(given.min())
+    return (worst, float(error[worst])) if error[worst] > most else None
 
 
 def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
@@ -188,22 +188,32 @@ def _spanned(points: Floats, *moves: Floats) -> int:
 
 def _confined(mission: Mission) -> Iterator[Remark]:
     """Remark on agents that start on a line or in a plane, which forces along their edges cannot move them off."""
-    first = next((phase for phase in mission.phases if phase.shaping is not None), None)
-    name = first.shaping.formation if first is not None and first.shaping is not None else None
-    slots, unequal = mission.slots_about_cm(name), len(set(mission.agents.mass)) > 1
-    if first is None or name is None or slots is None or first.control != "open":
-        return
-    if not len(mission.formation_edges(name)) or (unequal and any(first.input_force)):
-        return  # no forces; or equal ones, which accelerate unequal masses differently
-    start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
-    if start < _spanned(slots):
+    unequal, moves = len(set(mission.agents.mass)) > 1, [centred(mission.fleet.velocity)]
+    formed = turned = False
+    for phase in mission.phases:
+        formed |= phase.shaping is not None
+        if phase.control != "open":
+            if formed:
+                return  # slots lead anywhere
+            turned |= "attitude" in phase.meets
+            continue
+        # Equal forces accelerate unequal masses differently.
+        moves.append(unequal * np.array([phase.input_force]))
+        name = None if phase.shaping is None else phase.shaping.formation
+        if name is not None and not len(mission.formation_edges(name)):
+            return  # no forces between agents
+        slots = mission.slots_about_cm(name)
+        start = _spanned(mission.fleet.position, *moves)
+        if slots is None or start >= _spanned(slots):
+            continue
         # Where they share coordinates, not even rounding moves them off.
-        shared = np.ptp(np.hstack([mission.fleet.position, mission.fleet.velocity]), axis=0) == 0
-        sure = (shared[:3] & shared[3:]).sum() >= 3 - start
+        shared = ~np.ptp([mission.fleet.position, moves[0]], axis=1).any(axis=0)
+        sure = not turned and (shared & ~np.any(moves[1:], axis=(0, 1))).sum() >= 3 - start
         sure &= mission.disturbances is None and mission.vehicle_models is None
         text = f"all agents start on one {WHERE[start]}; forces between them cannot move them off it to '{name}'"
-        text += f". Move one agent off the {WHERE[start]}, or use control = 'tracking' in '{first.name}'"
+        text += f". Move one agent off the {WHERE[start]}, or use control = 'tracking' in '{phase.name}'"
         yield Remark("fails" if sure else "note", "formation", text)
+        return
 
 
 def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, float]]:
@@ -232,8 +242,8 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, 
             off, before = np.inf, out.get(name, (0, 0.0, 0.0))
             if led is not None:
                 slots = led
-                off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / apart.min()
-            worst = max(before[1], off / TOLERANCE)
+                off = np.abs(distance_geometry.distances(led, pairs) - apart).max()
+            worst = max(before[1], off / mission.formations[name].greatest_error(apart.min()))
             out[name] = max(before[0], space), worst, max(before[2], sure)
         r, v = slots, 0 * v
     return out

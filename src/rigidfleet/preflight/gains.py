@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet.math import pid
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import phase_spans
-from rigidfleet.preflight.findings import TOLERANCE, FormationCheck, GainsCheck, Preflight, Remark
+from rigidfleet.preflight.findings import FormationCheck, GainsCheck, Preflight, Remark
 
 
 def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsCheck:
@@ -71,6 +71,7 @@ def _drift(mission: Mission) -> Iterator[Remark]:
     error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.least_time / 2
     error = np.abs(np.where(first.reference == "step", L - d + c_dot * end, error))
     worst = error.max(initial=0.0)
-    fails = worst > TOLERANCE * d.min(initial=np.inf)
+    form = mission.formations[first.formation]
+    fails = worst > form.greatest_error(d.min(initial=np.inf))
     text += f"; by {end:g} s they reach {worst:.2g} m"
     yield Remark("fails" if fails else "note", "gains", text)

@@ -19,9 +19,10 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.margins import shares
 from rigidfleet.mission import Mission
+from rigidfleet.mission.kinds import Fly
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import air_force, jets
-from rigidfleet.preflight.findings import DENSE, TOLERANCE, Preflight, Remark
+from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import feedback
 from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import downwash_remarks, geofence_remarks, separation_remarks
@@ -143,31 +144,47 @@ def _broken(
         nearer = proved.separation - least[0]
         if nearer > limits.separation_allowance:
             yield "collision", f"{least[2]} come {nearer:.2f} m nearer than the plan proves"
-    k = min(int(np.searchsorted(planned.time, leg.arrival)), len(r) - 1)
-    by = float(np.linalg.norm(masses @ off[k]) / masses.sum())
-    if "position" in phase.meets and by > tolerance["position"]:
-        yield "waypoint", f"its waypoint is missed by {by:.2f} m (limit {tolerance['position']} m)"
-    lies = phase.establishing is not None and not mission.free_attitude(phase)
-    turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
-    by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
-    if (lies or "attitude" in phase.meets) and by > tolerance["attitude"]:
-        yield (
-            "attitude",
-            f"its attitude is missed by {by:.1f} deg (limit {tolerance['attitude']} deg)",
-        )
     far = np.linalg.norm(off, axis=2)
+    arrival = min(int(np.searchsorted(planned.time, leg.arrival)), len(r) - 1)
+    # As `Plan.target` and `Plan.stay` promise.
+    stays, later = "position" not in phase.meets, arrival < len(r) - 1
+    places = [("its waypoint", arrival)] * (not stays)
+    places += [("its place at the end", -1)] * (stays or (later and not phase.free))
+    way = masses @ planned.position / masses.sum()
+    for n, at in enumerate(phase.through if isinstance(phase, Fly) else (), start=1):
+        nearest = np.linalg.norm(way - at.position, axis=1).argmin()
+        places.append((f"point {n} on the way", int(nearest)))
+    for place, k in places:
+        by = float(np.linalg.norm(masses @ off[k]) / masses.sum())
+        by = by if leg.after.formation else max(by, far[k].max())
+        if by > tolerance["position"]:
+            yield (
+                "waypoint",
+                f"{place} is missed by {by:.2f} m (limit {tolerance['position']} m)",
+            )
+    forms, turns = phase.establishing is not None, "attitude" in phase.meets
+    lies, goal = forms and not mission.free_attitude(phase), leg.after.goal
+    kept = stays and not forms and goal is not None and goal.named
+    for k in [arrival] * (lies or turns) + [-1] * (later if turns else kept):
+        turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
+        by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
+        if by > tolerance["attitude"]:
+            limit = f"limit {tolerance['attitude']} deg"
+            yield "attitude", f"its attitude is missed by {by:.1f} deg ({limit})"
     if limits.tracking_error is not None and far.max() > limits.tracking_error:
         yield (
             "tracking error",
             f"the tracking error is {far.max():.2g} m (limit {limits.tracking_error:g} m)",
         )
-    if (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
+    form = mission.formations.get(leg.after.formation or "")
+    if form and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
         # To first order: a turn of the whole changes no distance.
         i, j = proximity.all_pairs(len(masses))
         apart, moved = planned.position[-1, i] - planned.position[-1, j], off[-1, i] - off[-1, j]
         length = np.linalg.norm(apart, axis=1)
-        by, limit = np.abs((apart * moved).sum(axis=1) / length).max(), TOLERANCE * length.min()
-        if leg.after.formation and by > limit:
+        by = np.abs((apart * moved).sum(axis=1) / length).max()
+        limit = form.greatest_error(length.min())
+        if by > limit:
             yield "formation", f"the shape is {by:.2g} m off at its end (limit {limit:.2g} m)"
     settle = None if mission.tracking.integral else phase.settle  # an integral settles later
     if settle is not None and far[-1].max() > settle.tolerance:

@@ -161,7 +161,8 @@ def analyse(
         occurs twice; a slot is not finite; the shape does not fit into the space; or a mass is not positive.
     """
     p, e = checked(slots, edges)
-    n, space, d = len(p), space or dimension, distance_geometry.dimension(p)
+    n, d = len(p), distance_geometry.dimension(p)
+    space = dimension if space is None else space
     flat, axes = flattened(p, space)
     frame = Framework(flat, e)
     within = analyse(flat[:, :d], e, dimension=d, masses=masses) if 0 < d < space else None
@@ -228,8 +229,10 @@ def flattened(p: Floats, space: int) -> tuple[Floats, Floats]:
     Raises
     ------
     ValueError
-        The shape does not fit into a space of this dimension.
+        The dimension is not 1, 2 or 3, or the shape does not fit into it.
     """
+    if not isinstance(space, int | np.integer) or not 1 <= space <= 3:
+        raise ValueError(f"dimension must be 1, 2 or 3, not {space!r}")
     d = distance_geometry.dimension(p)
     if d > space:
         raise ValueError(f"a shape of dimension {d} does not fit into a {WHERE[space]}")

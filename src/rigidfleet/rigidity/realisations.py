@@ -132,7 +132,7 @@ def realisations(
     """
     p, e = checked(slots, edges)
     drawn = p - p.mean(axis=0)
-    p, axes = flattened(p, dimension) if dimension < 3 else (drawn, np.eye(3))
+    p, axes = (drawn, np.eye(3)) if dimension == 3 else flattened(p, dimension)
     n, length = len(p), np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
     size = float(np.linalg.norm(p, axis=1).max(initial=0.0))
     if n < 2 or not len(e):
