@@ -738,12 +738,12 @@ def test_run_draws(capsys, plot):
 
 
 @pytest.mark.parametrize("command", [["run", "short.toml"], ["report", "flights/short/short.nc"]])
-@pytest.mark.parametrize("width", ["59", "1000", "nan", "-88"])
+@pytest.mark.parametrize("width", ["79", "1000", "nan", "-88"])
 def test_width_of_figures(capsys, plot, command, width):
     """--width is checked before anything is flown or drawn."""
     assert cli.main(["run", "short.toml", "--width", "88"]) == codes.PASSED
     assert cli.main([*command, "--width", width, "--force"]) == codes.BAD_INPUT
-    assert "--width must be 60 to 400 [mm]" in capsys.readouterr().err
+    assert "--width must be 80 to 400 [mm]" in capsys.readouterr().err
 
 
 def test_formats_and_titles_of_figures(capsys, plot):

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import tomllib
+from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.sweep import Sweep, metrics, read
 from rigidfleet.tuning.gains import RANGES, Screen, Space, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown
-from rigidfleet.tuning.study import OBJECTIVES, cost
+from rigidfleet.tuning.study import OBJECTIVES, _Study, cost
 
 TEXT = """# a pair of quadrotors
 schema_version = 1
@@ -224,7 +225,7 @@ def test_study(study):
     assert tuned.after.mean("shape_tracked") >= min(errors)
     assert tuned.validation is not None
     mission = rf.load_mission(folder / "pair-tuned.toml").to_dict()
-    for k, error in enumerate(tuned.validation[1].values["shape_tracked"]):
+    for k, error in enumerate(tuned.validation[0 if tuned.worse else 1].values["shape_tracked"]):
         mission["disturbances"]["noise"]["seed"] = 2 + k
         result = rf.simulate(rf.Mission.from_dict(mission))
         tracked = np.isfinite(result.slot_position).all(axis=(1, 2))
@@ -444,3 +445,22 @@ def test_a_part_that_is_not_flown_is_refused(tmp_path, control, objective, words
     mission = rf.Mission.from_dict(tables | {"phases": [establish | {"control": control}]})
     with pytest.raises(rf.RigidfleetError, match=words):
         rf.tune(mission, tmp_path, objective=objective)
+
+
+def test_gains_that_are_worse_on_new_seeds_are_not_taken(tmp_path, monkeypatch):
+    """If the best gains of the search are no better on new seeds, the file keeps those of the mission, and says so."""
+
+    def worsened(found, seeds):
+        before = found.before
+        after = found.after = replace(before, gains={k: 1.1 * g for k, g in before.gains.items()})
+        rest = {k: [1.0] for k in before.values}
+        found.validation = (
+            replace(before, values=rest),
+            replace(after, values={k: [2.0] for k in rest}),
+        )
+
+    monkeypatch.setattr(_Study, "validate", lambda self, found, seeds: worsened(found, seeds))
+    tuned = small(PAIR, tmp_path, budget=20)
+    assert tuned.after.gains != tuned.before.gains
+    assert own_gains(rf.load_mission(tmp_path / "pair-tuned.toml")) == tuned.before.gains
+    assert tuned.conclusion.endswith("100 % larger on new seeds; the mission keeps its own gains.")

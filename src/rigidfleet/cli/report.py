@@ -59,7 +59,7 @@ def report(
     no_titles : bool
         Draw the figure files without titles, for papers with captions.
     width : float
-        Width of the figure files [mm], such as 88 for one column of a paper.
+        Width of the figure files [mm], such as 88 for one column of a paper; summary and formations keep their own.
     json : bool
         Print the verdict as JSON; for several flights, a list of verdicts.
     quiet : bool

@@ -63,7 +63,7 @@ def run(
     no_titles : bool
         Draw figures without titles, for papers with captions.
     width : float
-        Width of the figures [mm], such as 88 for one column of a paper.
+        Width of the figures [mm], such as 88 for one column of a paper; summary and formations keep their own.
     replay : bool
         Also write replay.html, which replays the flight in a browser.
     csv : bool

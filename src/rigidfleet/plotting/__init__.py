@@ -73,7 +73,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
 #: File formats of figures.
 FORMATS = ("png", "svg", "pdf")
 #: Least and greatest width of a figure [mm].
-WIDTHS = (60.0, 400.0)
+WIDTHS = (80.0, 400.0)
 _MARGIN = 0.05  # [in] around a figure cropped to its content
 
 
@@ -154,7 +154,7 @@ def plot(
     names : figures to draw, from `figure_names`; by default all in which there is something to draw
     titles : whether a title and the mission's name stand above each figure. Without them, the figure is cropped
         to its content, for a paper with its own captions; a note that the flight is incomplete is always shown
-    width : width of the figures [mm], 60 to 400, such as 88 for one column of a paper; letters keep their size. Those
+    width : width of the figures [mm], 80 to 400, such as 88 for one column of a paper; letters keep their size. Those
         of `summary` and `formations` have a width of their own
 
     Returns

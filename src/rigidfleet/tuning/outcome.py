@@ -97,6 +97,16 @@ class Tuned:
         return 1.0 - after.mean(self.metric) / before.mean(self.metric)
 
     @property
+    def worse(self) -> bool:
+        """Whether the best gains of the search are no better on new seeds, so that the mission keeps its own."""
+        if self.validation is None:
+            return False
+        before, after = self.validation
+        return after.passed < before.passed or (
+            after.passed == before.passed and not self.improvement > 0
+        )
+
+    @property
     def conclusion(self) -> str:
         """The result in a sentence."""
         words = f"{_WORDS[self.metric].capitalize()}"
@@ -106,7 +116,8 @@ class Tuned:
             return f"{words}: unknown, because some flights did not reach their end."
         where = "on new seeds" if self.validation else "in the flights of the search"
         side = "smaller" if self.improvement >= 0 else "larger"
-        return f"{words}: {100 * abs(self.improvement):.0f} % {side} {where}."
+        kept = "; the mission keeps its own gains" if self.worse else ""
+        return f"{words}: {100 * abs(self.improvement):.0f} % {side} {where}{kept}."
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data; quantities that are not finite are None."""

@@ -127,9 +127,10 @@ def tune(
     with study.flights.processes(cores() if workers is None else workers):
         found = study.search(_Seeds(paths, range(seed, seed + seeds)))
         after = _Seeds(paths, range(seed + seeds, seed + seeds + validation))
-        found.text = with_gains(given.text, found.after.gains)
         if random:
             study.validate(found, after)
+        chosen = found.before if found.worse else found.after
+        found.text = with_gains(given.text, chosen.gains)
     claim.write(found)
     return found
 
