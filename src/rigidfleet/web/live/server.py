@@ -108,7 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             length = int(self.headers.get("Content-Length", ""))
             if not 0 < length <= _LARGEST:
-                raise ValueError("the command is too long")
+                raise ValueError(f"a command has 1 to {_LARGEST} bytes")
             asked = json.loads(self.rfile.read(length))
             if not isinstance(asked, dict):
                 raise ValueError("a command must be an object")
