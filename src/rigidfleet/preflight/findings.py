@@ -25,8 +25,6 @@ from rigidfleet.rigidity.analysis import WHERE
 _TOLD = 6
 
 
-#: Tolerance of distances, relative to the shortest one; the verdict has the same.
-TOLERANCE = 0.01
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
 #: A limit is exceeded only by more than this rounding error.

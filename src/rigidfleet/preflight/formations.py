@@ -14,7 +14,7 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, TOLERANCE, FormationCheck, Remark, some
+from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, some
 from rigidfleet.rigidity import (
     Kind,
     Rigidity,
@@ -83,7 +83,7 @@ def _formation(
         start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
         if held == "distances" and max(start, _spanned(slots)) == 2:
             space = 2  # which they do not leave
-        points = slots if space == 3 else flattened(slots, space)[0]
+        points = flattened(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
@@ -114,7 +114,8 @@ def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
     given = mission.formation_distances(name)
     error = np.abs(distance_geometry.distances(slots, edges) - given)
     worst = int(error.argmax())
-    return (worst, float(error[worst])) if error[worst] > TOLERANCE * given.min() else None
+    most = mission.formations[name].greatest_error(given.min())
+    return (worst, float(error[worst])) if error[worst] > most else None
 
 
 def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Iterator[Remark]:
@@ -132,7 +133,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.rigidity is not None and f.held_by == "distances"
         and (f.rigidity.rigidity_class is RigidityClass.FLEXIBLE or f.rigidity.space < 3)
     }  # fmt: skip
-    forecasts = _forecasts(mission, soft) if soft else {}
+    forecasts = _forecasts(mission, soft)
     for f in formations:
         if f.held_by == "nothing":
             continue
@@ -152,13 +153,13 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
                 held = ". Add edges, or track slots" if alone else "; slots hold it"
                 yield Remark("fails" if alone else "note", "formation", text + held)
             continue
-        if r is None and alone and not len(mission.formation_edges(f.name)):
-            text = f"'{f.name}' has no edges: where no slots are tracked, only a force of your own (simulate) forms it"
-            yield Remark("note", "formation", text)
-        if r is None and mission.formation_slots(f.name) is not None:
-            continue  # too large to check
         if r is None:
-            if len(mission.formation_edges(f.name)):
+            if alone and not len(mission.formation_edges(f.name)):
+                text = (
+                    f"'{f.name}' has no edges: only slots or a force of your own (simulate) form it"
+                )
+                yield Remark("note", "formation", text)
+            elif mission.formation_slots(f.name) is None:  # else it has no edges, or is too large
                 text = f"the distances of '{f.name}' do not determine positions: its rigidity is not checked"
                 yield Remark("note", "formation", text)
             continue
@@ -188,15 +189,14 @@ def _spanned(points: Floats, *moves: Floats) -> int:
 
 def _confined(mission: Mission) -> Iterator[Remark]:
     """Remark on agents that start on a line or in a plane, which forces along their edges cannot move them off."""
-    first = next((phase for phase in mission.phases if phase.shaping is not None), None)
-    name = first.shaping.formation if first is not None and first.shaping is not None else None
-    slots, unequal = mission.slots_about_cm(name), len(set(mission.agents.mass)) > 1
-    if first is None or name is None or slots is None or first.control != "open":
+    first = next((s for phase in mission.phases if (s := phase.shaping) is not None), None)
+    if first is None or first.control != "open":
         return
+    name, unequal = first.formation, len(set(mission.agents.mass)) > 1
     if not len(mission.formation_edges(name)) or (unequal and any(first.input_force)):
         return  # no forces; or equal ones, which accelerate unequal masses differently
     start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
-    if start < _spanned(slots):
+    if (slots := mission.slots_about_cm(name)) is not None and start < _spanned(slots):
         # Where they share coordinates, not even rounding moves them off.
         shared = np.ptp(np.hstack([mission.fleet.position, mission.fleet.velocity]), axis=0) == 0
         sure = (shared[:3] & shared[3:]).sum() >= 3 - start
@@ -206,13 +206,13 @@ def _confined(mission: Mission) -> Iterator[Remark]:
         yield Remark("fails" if sure else "note", "formation", text)
 
 
-def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, float]]:
+def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
     """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
 
-    By name: the greatest dimension of the space that the agents keep to, the greatest error of a pair at the end of a
-    phase, in tolerances, and the one above which it is sure to be missed.
+    By name: the greatest dimension of the space that the agents keep to, and the greatest error of a pair at the end of
+    a phase, as a share of the one from which on the shape is sure to be missed.
     """
-    out: dict[str, tuple[int, float, float]] = {}
+    out: dict[str, tuple[int, float]] = {}
     name, unequal = None, len(set(mission.agents.mass)) > 1
     r, v = mission.fleet.position, centred(mission.fleet.velocity)
     for phase in mission.phases:
@@ -228,44 +228,37 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, 
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
             led = None if torn else lead(r, edges, lengths, 1e-6 * apart.min(), slots)
-            sure = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
-            off, before = np.inf, out.get(name, (0, 0.0, 0.0))
+            most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
+            most *= mission.formations[name].greatest_error(apart.min())
+            off, before = np.inf, out.get(name, (0, 0.0))
             if led is not None:
                 slots = led
-                off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / apart.min()
-            worst = max(before[1], off / TOLERANCE)
-            out[name] = max(before[0], space), worst, max(before[2], sure)
+                off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / most
+            out[name] = max(before[0], space), max(before[1], off)
         r, v = slots, 0 * v
     return out
 
 
-def _flexible(
-    name: str, r: Rigidity, forecast: tuple[int, float, float] | None
-) -> Iterator[Remark]:
+def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Iterator[Remark]:
     """Remark on a formation that is flexible or in a plane; the forecast is None where slots hold it."""
     who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
     more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
     text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
     if not r.flexes:
         text = f"'{name}' has dimension = 2, but its agents leave their plane"
-    space, off, sure = forecast or (3, 0.0, 0.0)
-    kept = r.own.rigid and space <= r.own.space < 3
-    where = f"to within {off:.2g} tolerances of" if off <= sure else "past"
-    if kept:
-        text += (
-            f". It is rigid in its {WHERE[r.own.space]}, which forces between agents do not leave"
-        )
-    elif forecast is not None:
-        text += f". Distances lead it {where} its shape"
-    if forecast is None:
-        yield Remark("note", "formation", f"{text}; slots hold it")
-    elif not kept and off > sure:
-        yield Remark("fails", "formation", f"{text}. Add edges (rigidfleet design), or track slots")
-    elif not kept or r.space == 3:  # else it is as the mission says
-        text += (
-            "; nothing resists what else moves it (gusts, unequal weights, lags). Tracked slots do"
-        )
-        yield Remark("note", "formation", text)
+    level, held = "note", "; slots hold it"
+    if forecast is not None:
+        held = "; nothing but tracked slots resists gusts, unequal weights and lags"
+        if r.own.rigid and forecast[0] <= r.own.space < 3:
+            if r.space < 3:  # as the mission says
+                return
+            text += f". It is rigid in its {WHERE[r.own.space]}, which its forces do not leave"
+        elif forecast[1] <= 1.0:
+            text += ". Distances lead it to its shape"
+        else:
+            text += ". Distances lead it past its shape"
+            level, held = "fails", ". Add edges (rigidfleet design), or track slots"
+    yield Remark(level, "formation", text + held)
 
 
 def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
@@ -290,9 +283,8 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
         )
         yield Remark("note", "formation", text)
     elif not others.unique:
-        n = sum(r.kind not in (Kind.SAME, Kind.MIRRORED) for r in others.found)
-        share = sum(r.found for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED))
-        bent = sum(r.bends for r in others.found)
+        rest = [r for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED)]
+        n, share, bent = len(rest), sum(r.found for r in rest), sum(r.bends for r in others.found)
         families = f", {bent} as a family that bends" * (bent > 0)
         what = "1 other shape has" if n == 1 else f"{n} other shapes have"
         text = (
