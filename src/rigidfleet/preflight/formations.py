@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -28,6 +29,8 @@ from rigidfleet.rigidity.realisations import lead
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
+#: Remarks on formations, by their text.
+_note, _fails = partial(Remark, "note", "formation"), partial(Remark, "fails", "formation")
 #: Maximum number of agents for which other shapes with the same distances are searched by default.
 SEARCHED = 12
 
@@ -122,10 +125,9 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
     """Remarks on formations that are not rigid, contradict themselves, or share their distances with other shapes."""
     exact = mission.constraint.solver == "exact"
     if skipped := [f.name for f in formations if f.skipped]:
-        text = f"to limit the time of the check, {some(skipped)} skipped"
-        yield Remark("note", "formation", text)
+        yield _note(f"to limit the time of the check, {some(skipped)} skipped")
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
-        yield Remark("note", "formation", f"{some(idle)} not used in any phase")
+        yield _note(f"{some(idle)} not used in any phase")
     yield from _confined(mission)
     soft = {
         f.name
@@ -141,43 +143,40 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if (off := contradiction(mission, f.name)) is not None:
             i, j = mission.formation_edges(f.name)[off[0]] + 1
             given = mission.formation_distances(f.name)[off[0]]
-            text = (
+            yield _fails(
                 f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {given:.4g} m,"
                 f" which differs from that of their slots by {off[1]:.3g} m"
             )
-            yield Remark("fails", "formation", text)
         r = f.rigidity
         if f.spectrum is not None:
             if f.spectrum.free:
                 text = f"'{f.name}' is flexible to first order: at least {f.spectrum.free} motions are free"
                 held = ". Add edges, or track slots" if alone else "; slots hold it"
-                yield Remark("fails" if alone else "note", "formation", text + held)
+                yield (_fails if alone else _note)(text + held)
             continue
         if r is None:
             if alone and not len(mission.formation_edges(f.name)):
-                text = (
+                yield _note(
                     f"'{f.name}' has no edges: only slots or a force of your own (simulate) form it"
                 )
-                yield Remark("note", "formation", text)
             elif mission.formation_slots(f.name) is None:  # else it has no edges, or is too large
                 text = f"the distances of '{f.name}' do not determine positions: its rigidity is not checked"
-                yield Remark("note", "formation", text)
+                yield _note(text)
             continue
         if r.rigidity_class is RigidityClass.FLEXIBLE or f.name in soft:
             yield from _flexible(f.name, r, forecasts.get(f.name))
         elif r.rigidity_class is RigidityClass.UNDECIDED and alone:
-            yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
+            yield _note(f"'{f.name}' is undecided: {r.reason}")
         elif r.rigidity_class is RigidityClass.PRESTRESS_STABLE and alone:
             where = "line" if r.dimension == 1 else "plane"
             across = f" across its {where}" if r.dimension < 3 else ""
             text = f"'{f.name}' is only prestress stable{across}; tracked slots hold it firmly"
-            yield Remark("note", "formation", text)
+            yield _note(text)
         if exact and alone and len(r.edges) > r.rank:
-            text = (
+            yield _fails(
                 f"solver 'exact' has no solution at '{f.name}': only {r.rank} of its {len(r.edges)} distances are"
                 " independent. Use solver = 'iterated'"
             )
-            yield Remark("fails", "formation", text)
         yield from _other_shapes(mission, f, alone=alone)
 
 
@@ -203,7 +202,7 @@ def _confined(mission: Mission) -> Iterator[Remark]:
         sure &= mission.disturbances is None and mission.vehicle_models is None
         text = f"all agents start on one {WHERE[start]}; forces between them cannot move them off it to '{name}'"
         text += f". Move one agent off the {WHERE[start]}, or use control = 'tracking' in '{first.name}'"
-        yield Remark("fails" if sure else "note", "formation", text)
+        yield (_fails if sure else _note)(text)
 
 
 def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
@@ -272,26 +271,23 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
         by = reference_kind(mission, first, start, slots)
     end = None if others.leads_to is None else others.found[others.leads_to].kind
     if by == "shape" and slots is not None and _flattens(start, slots):
-        text = (
+        yield _note(
             f"the agents start with the handedness of the mirror image of '{f.name}' and must pass through a plane,"
             " where distances alone may return them to the mirror image. Swap two slots or track slots"
         )
-        yield Remark("note", "formation", text)
     elif by in ("squares", "step") and end not in (None, Kind.SAME):
-        text = (
+        yield _note(
             f"from the start positions, the distances of '{f.name}' lead to another shape ({end})"
         )
-        yield Remark("note", "formation", text)
     elif not others.unique:
         rest = [r for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED)]
         n, share, bent = len(rest), sum(r.found for r in rest), sum(r.bends for r in others.found)
         families = f", {bent} as a family that bends" * (bent > 0)
         what = "1 other shape has" if n == 1 else f"{n} other shapes have"
-        text = (
+        yield _note(
             f"{what} the distances of '{f.name}'{families}; {share} of {others.starts} random starts reach"
             f" {'it' if n == 1 else 'them'}. Redundant edges or tracked slots prevent this"
         )
-        yield Remark("note", "formation", text)
 
 
 def _flattens(start: Floats, slots: Floats) -> bool:
