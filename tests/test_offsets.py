@@ -101,6 +101,20 @@ def test_every_limit_that_an_offset_moves_is_held_against_it(what):
     assert not foreseen(check(weak, search=False))
 
 
+@pytest.mark.parametrize(
+    ("tolerance", "fails"),
+    [({}, True), ({"tolerance": 0.5}, False), ({"tolerance_share": 0.2}, False)],
+)
+def test_an_offset_is_held_against_the_tolerance_of_its_formation(tolerance, fails):
+    """A shape that errors of mass bend is missed as far as its own tolerance says, before the flight and after it."""
+    bent = mission(
+        TAKE | {"formation": "upright"}, upright=APART | tolerance,
+        disturbances={"mass_error": [0.02, 0.02, -0.02, -0.02]},
+    )  # fmt: skip
+    assert ("formation" in foreseen(check(bent, search=False))) == fails
+    assert ("shape" in failed(assess(simulate(bent)))) == fails
+
+
 def test_wind_on_points_against_the_closed_form():
     """A wind that sets in holds a point off by f/k1 (1 - the step response of its tracking), to 1e-6 m."""
     blown = mission({"kind": "establish", "formation": "square", "duration": 9.0, "blend": 4.0},

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import CheckResult, value
+from rigidfleet.assessment.outcome import CheckResult, Extreme, bounded, value
 from rigidfleet.result import Extremum, Result
 
 #: The two margins: between vehicles, and between vehicles and obstacles.
@@ -24,14 +24,12 @@ def guarantee_checks(measured: Measurements) -> Iterator[CheckResult]:
         return
     if (lost := _lost(measured)) is not None:
         name, x, phase = lost
-        who = _who(measured, name, x)
+        e = Extreme(x.value, x.time, _who(measured, name, x), phase)
         words = (
-            f"the guarantee of [avoidance] is lost at {x.time:.2f} s, by {who}: braking at once would leave them"
+            f"the guarantee of [avoidance] is lost at {x.time:.2f} s, by {e.who}: braking at once would leave them"
             f" {value(-x.value, 'm')} too near"
         )
-        yield CheckResult(
-            "guarantee", False, words, x.value, 0.0, "m", at_least=True, when=x.time, who=who, phase=phase
-        )  # fmt: skip
+        yield bounded("guarantee", e, "m", 0.0, words, passed=False, at_least=True)
         return
     state = "held" if _doubt(measured) else "proved"
     least = _least(measured)
@@ -40,11 +38,9 @@ def guarantee_checks(measured: Measurements) -> Iterator[CheckResult]:
         yield CheckResult("guarantee", True, words, limit=0.0, unit="m", at_least=True)
         return
     name, x, phase = least
-    who = _who(measured, name, x)
+    e = Extreme(max(x.value, 0.0), x.time, _who(measured, name, x), phase)
     words = f"the guarantee of [avoidance] is {state}, with {value(x.value, 'm')} to spare at least"
-    yield CheckResult(
-        "guarantee", True, words, max(x.value, 0.0), 0.0, "m", at_least=True, when=x.time, who=who, phase=phase
-    )  # fmt: skip
+    yield bounded("guarantee", e, "m", 0.0, words, passed=True, at_least=True)
 
 
 def avoidance_notes(measured: Measurements) -> Iterator[str]:

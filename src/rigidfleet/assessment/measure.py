@@ -17,6 +17,7 @@ from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
 from rigidfleet.assessment.outcome import SENSE, Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
+from rigidfleet.math.bernstein import SIZES
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -242,17 +243,18 @@ class Measurements:
         """Greatest speed or acceleration in a direction, named as in `DIRECTIONS`; None if unknown."""
         way, what = name.split("_")
         x = getattr(self.result, what.replace("speed", "velocity"))
-        size = abs(x[..., 2]) if way == "vertical" else np.hypot(x[..., 0], x[..., 1])
-        return self.worst(name, self.extreme(self.of_left(size), agent))
+        return self.worst(name, self.extreme(self.of_left(SIZES[way](x)), agent))
 
-    def first_contact(self, name: str) -> Extreme | None:
-        """The first contact of agents ("separation") or with an obstacle ("clearance"); None if it is unknown."""
+    def first_contact(self, name: str, e: Extreme) -> Extreme | None:
+        """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
+        if e.value > 0.0:
+            return None
         every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
         if every:
             return self.between(f"{name}_first", every[0])
         quantity = self.measured[name]
         k = int(np.argmax(quantity.values <= 0.0))
-        return self.worst_sample(quantity, slice(k, k + 1), alone=True)
+        return self.worst_sample(quantity, slice(k, k + 1), alone=True) or e
 
     def below(self) -> Extreme | None:
         """Least height [m] between two agents, one below the other."""

@@ -10,13 +10,10 @@ import numpy as np
 
 from rigidfleet._common.text import percent
 from rigidfleet.assessment.measure import Measurements, agent
-from rigidfleet.assessment.outcome import CheckResult, Extreme, value
+from rigidfleet.assessment.outcome import SLACK, CheckResult, Extreme, bounded, value
 from rigidfleet.math import attitude as att
 from rigidfleet.result import LABELS
 from rigidfleet.typing import Floats
-
-#: Share of a limit by which rounding may exceed it.
-_SLACK = 1e-9
 
 
 def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
@@ -34,17 +31,17 @@ def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
             yield _saturation(share, limits.saturation)
         tilt = _tilt(measured)
         if tilt is not None:
-            yield _checked("tilt", tilt, "deg", limits.tilt_deg, "tilts by")
+            yield bounded("tilt", tilt, "deg", limits.tilt_deg)
 
 
 def tracking_check(measured: Measurements) -> Iterator[CheckResult]:
     """Check how far agents are off the slots that they track: of vehicles at every tick, of points at samples."""
     limit = measured.mission.limits.tracking_error
-    error = measured.worst("tracking_error", measured.extreme(measured.off_slot, agent))
-    if error is not None:
-        yield _checked("tracking_error", error, "m", limit, "is off its slot by")
-    elif limit is not None:
-        yield CheckResult("tracking_error", True, "no slots are tracked", None, limit, "m")
+    error = None
+    if measured.result.interpolation is None:  # the curves of others are their own slots
+        error = measured.worst("tracking_error", measured.extreme(measured.off_slot, agent))
+    if error is not None or limit is not None:
+        yield bounded("tracking_error", error, "m", limit, "" if error else "no slots are tracked")
 
 
 def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult]:
@@ -63,20 +60,16 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
     worst = float(force[k, i, j])
     found.append((worst / safe[i], worst, float(result.time[k]), int(i), int(j), name))
     share, worst, when, i, j, phase = max(found)
-    limit, who = float(limits[i]), f"agent {i + 1}"
+    limit, e = float(limits[i]), Extreme(worst, when, f"agent {i + 1}", phase, len(found) == 1)
     words = (
-        f"the {names[j]} rotor of {who} gives up to {value(worst, 'N')} at {when:.2f} s"
+        f"the {names[j]} rotor of {e.who} gives up to {value(worst, 'N')} at {when:.2f} s"
         f" (limit {value(limit, 'N')})"
     )
-    passed = share <= 1.0 + _SLACK
-    yield CheckResult(
-        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase, at_samples=len(found) == 1
-    )  # fmt: skip
+    yield bounded("rotor_force", e, "N", limit, words, passed=share <= 1.0 + SLACK)
 
 
 def _saturation(e: Extreme, limit: float) -> CheckResult:
     """Share of a phase in which a vehicle cannot give what is asked of it."""
-    passed = e.value <= limit + _SLACK
     words = (
         f"{e.who} cannot give what is asked of it for {percent(e.value)} of phase '{e.phase}'"
         f" (limit {percent(limit)})"
@@ -84,10 +77,7 @@ def _saturation(e: Extreme, limit: float) -> CheckResult:
     if e.value == 0.0:
         words = "no vehicle is asked for more than its rotors give"
         return CheckResult("saturation", True, words, 0.0, 100 * limit, "%")
-    share = 100 * e.value
-    return CheckResult(
-        "saturation", passed, words, share, 100 * limit, "%", when=e.when, who=e.who, phase=e.phase
-    )
+    return bounded("saturation", replace(e, value=100 * e.value), "%", 100 * limit, words)
 
 
 def _tilt(measured: Measurements) -> Extreme | None:
@@ -98,14 +88,3 @@ def _tilt(measured: Measurements) -> Extreme | None:
     angle = measured.of_left(np.arccos(np.clip(up, -1.0, 1.0)))
     e = measured.worst("tilt", measured.extreme(angle, agent))
     return None if e is None else replace(e, value=math.degrees(e.value))
-
-
-def _checked(check: str, e: Extreme, unit: str, limit: float | None, deed: str) -> CheckResult:
-    words = f"{e.who} {deed} up to {value(e.value, unit)} at {e.when:.2f} s"
-    words += "" if limit is None else f" (limit {limit:g} {unit})"
-    words += ", at samples" * e.at_samples
-    passed = limit is None or e.value <= limit * (1.0 + _SLACK)
-    return CheckResult(
-        check, passed, words, e.value, limit, unit, when=e.when, who=e.who, phase=e.phase,
-        judged=limit is not None, at_samples=e.at_samples,
-    )  # fmt: skip

@@ -22,6 +22,8 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
 
+from rigidfleet.errors import RigidfleetError
+
 #: Contents of a figure's files by format, from its name and its formats; to be sent to other processes.
 Draw = Callable[[str, Sequence[str]], dict[str, bytes]]
 #: Fewer figures are not worth a process, and more processes than this not their start.
@@ -40,6 +42,14 @@ def at_once() -> int:
     if "fork" not in multiprocessing.get_all_start_methods():
         return 1
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_width(width: float | None) -> None:
+    """Raise an error if figures cannot have this width [mm]."""
+    from rigidfleet.plotting import WIDTHS
+
+    if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise RigidfleetError("--width must be {:g} to {:g} [mm], not {:g}.".format(*WIDTHS, width))
 
 
 def prepare(*modules: str) -> None:

@@ -13,15 +13,7 @@ if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.run import (
-    Format,
-    check_width,
-    drawings,
-    list_files,
-    of_formats,
-    write_figures,
-    write_replay,
-)
+from rigidfleet.cli.run import Format, drawings, list_files, of_formats, write_figures, write_replay
 
 
 def report(
@@ -69,7 +61,7 @@ def report(
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 
-    check_width(width)
+    drawing.check_width(width)
     if not (no_figures or others):
         drawing.prepare()
     paths = [result, *others]

@@ -8,7 +8,7 @@ from collections.abc import Generator, Iterable
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -81,7 +81,7 @@ def run(
         raise RigidfleetError("--csv-rate and --flown say what --csv writes. Add --csv.")
     if csv_rate is not None and not csv_rate > 0.0:
         raise RigidfleetError(f"--csv-rate must be positive [Hz], not {csv_rate:g}.")
-    check_width(width)
+    drawing.check_width(width)
     if not no_figures:
         drawing.prepare()
     from rigidfleet.mission import load_mission
@@ -208,25 +208,10 @@ def of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> lis
     return [path for path in figures if path.suffix in kinds]
 
 
-def check_width(width: float | None) -> None:
-    """Raise an error if figures cannot have this width [mm]."""
-    from rigidfleet.plotting import WIDTHS
-
-    if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
-        raise RigidfleetError(
-            f"--width must be {WIDTHS[0]:g} to {WIDTHS[1]:g} [mm], not {width:g}."
-        )
-
-
 def drawings(
-    result: Result,
-    figures: Iterable[Path],
-    kinds: Iterable[Format] | None,
-    *,
-    titles: bool = True,
-    width: float | None = None,
+    result: Result, figures: Iterable[Path], kinds: Iterable[Format] | None, **look: Any
 ) -> drawing.Drawings:
-    """Begin to draw the figures that apply to the flight, each for the file of its name."""
+    """Begin to draw the figures that apply to the flight, each for the file of its name, with `plot`'s ``look``."""
     from rigidfleet.plotting import figure_names, rendered
 
     formats: dict[Path, list[str]] = {}
@@ -236,7 +221,7 @@ def drawings(
         for path in paths:
             if path.stem in names:
                 formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
-    draw = partial(rendered, result, titles=titles, width=width)
+    draw = partial(rendered, result, **look)
     return drawing.Drawings(formats, draw, alone=result.position.nbytes > _LARGEST)
 
 

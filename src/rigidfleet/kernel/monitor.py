@@ -332,15 +332,13 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     fastest, piece = 0.0, monitor.pieces[0]
     for k in range(5):
         size = 0.0
-        for q in range(low, high):
-            size += curve[k, q] * curve[k, q]
+        for q in range(3):
+            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
+            size += piece[3 * k + q] ** 2
         fastest = max(fastest, size)
     greatest = -monitor.worst[kind]  # -inf at first
     if fastest <= greatest * abs(greatest):
         return
-    for k in range(5):
-        for q in range(3):
-            piece[3 * k + q] = curve[k, q] if low <= q < high else 0.0
     square(piece, -1.0, monitor.work[0])
     _, at = lowest(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:

@@ -11,6 +11,12 @@ import numpy as np
 
 from rigidfleet.typing import Floats
 
+#: Sizes (...) of vectors (..., 3), by the direction in which they count; all are convex.
+SIZES: dict[str, Callable[[Floats], Floats]] = {
+    "": lambda x: np.linalg.norm(x, axis=-1),
+    "horizontal": lambda x: np.hypot(x[..., 0], x[..., 1]),
+    "vertical": lambda x: np.abs(x[..., 2]),
+}
 #: Relative accuracy of a greatest value, and the most halvings of a piece.
 _CLOSE, _HALVINGS = 1e-10, 50
 

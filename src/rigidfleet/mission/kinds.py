@@ -113,7 +113,9 @@ class AnyPhase(Part):
     @property
     def meets(self) -> tuple[str, ...]:
         """Which of position, velocity, attitude and rates are commanded at the arrival."""
-        return ()
+        if not self.goal_moves:
+            return ()
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
 
     @property
     def free(self) -> bool:
@@ -564,11 +566,6 @@ class Follow(AnyPhase):
         return joined([rows_to_curve(rows) for rows in self.trajectories or ()])
 
     @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity at the end, and the attitude if it turns."""
-        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
-
-    @property
     def turns_away(self) -> bool:
         """Whether the body turns as the file says."""
         return self.yaw == "file"
@@ -622,11 +619,6 @@ class Orbit(AnyPhase):
         description="duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
         "the limits",
     )
-
-    @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity on the circle, and the attitude if it turns."""
-        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
 
     @property
     def turns_away(self) -> bool:

@@ -237,13 +237,14 @@ class Network:
         """
         self.space, self.layers, self.changes = space, layers, changes
         self.radius, self.need = radius, need
-        self.lattices = []
-        for f, (frame, even) in enumerate(zip(frames, common, strict=True)):
-            keys = [(f, layer.formation, layer.angles) for layer in layers]
+        every = [
+            [(f, layer.formation, layer.angles) for layer in layers] for f in range(len(frames))
+        ]
+        for keys, frame, even in zip(every, frames, common, strict=True):
             for key, layer in zip(keys, layers, strict=True):
                 if key not in known:
                     known[key] = Lattice(space, layer, radius, need, frame, even)
-            self.lattices.append([known[key] for key in keys])
+        self.lattices = [[known[key] for key in keys] for keys in every]
         counts = [[len(x.points) for x in row] for row in self.lattices]
         starts = np.cumsum([0, *np.ravel(counts)])
         self.first = starts[:-1].reshape(len(frames), len(layers))

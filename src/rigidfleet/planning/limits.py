@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.problem import Motion, Reference
+from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
 from rigidfleet.planning.derivatives import slot_derivatives
@@ -67,16 +68,8 @@ def limits_of(
             return 0.0  # no flight is judged by its jerk
         return reserve[who] * np.linalg.norm(x[:, order + 1], axis=-1).max(axis=0)
 
-    def size(order: int) -> Callable[[Floats, Ints], Floats]:
-        return lambda x, who: np.linalg.norm(x[:, order], axis=-1) + more(order, x, who)
-
-    def level(order: int) -> Callable[[Floats, Ints], Floats]:
-        return lambda x, who: (
-            np.hypot(x[:, order, ..., 0], x[:, order, ..., 1]) + more(order, x, who)
-        )
-
-    def upright(order: int) -> Callable[[Floats, Ints], Floats]:
-        return lambda x, who: np.abs(x[:, order, ..., 2]) + more(order, x, who)
+    def of(order: int, way: str = "") -> Callable[[Floats, Ints], Floats]:
+        return lambda x, who: SIZES[way](x[:, order]) + more(order, x, who)
 
     def lifted(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
@@ -85,21 +78,26 @@ def limits_of(
 
     def tilt(x: Floats, who: Ints) -> Floats:
         f, off = lifted(x, who), more(2, x, who)
-        return np.rad2deg(np.arctan2(np.hypot(f[..., 0], f[..., 1]) + off, f[..., 2] - off))
+        return np.rad2deg(np.arctan2(SIZES["horizontal"](f) + off, f[..., 2] - off))
 
     def thrust(x: Floats, who: Ints) -> Floats:
-        return mass[who] * (np.linalg.norm(lifted(x, who), axis=-1) + more(2, x, who))
+        return mass[who] * (SIZES[""](lifted(x, who)) + more(2, x, who))
 
     found = [
         Limit(name, unit, np.full(n, most), quantity)
         for name, unit, most, quantity in (
-            ("speed", "m/s", given.speed, size(1)),
-            ("acceleration", "m/s^2", given.acceleration, size(2)),
-            ("horizontal speed", "m/s", given.horizontal_speed, level(1)),
-            ("vertical speed", "m/s", given.vertical_speed, upright(1)),
-            ("horizontal acceleration", "m/s^2", given.horizontal_acceleration, level(2)),
-            ("vertical acceleration", "m/s^2", given.vertical_acceleration, upright(2)),
-            ("jerk", "m/s^3", given.jerk, size(3)),
+            ("speed", "m/s", given.speed, of(1)),
+            ("acceleration", "m/s^2", given.acceleration, of(2)),
+            ("horizontal speed", "m/s", given.horizontal_speed, of(1, "horizontal")),
+            ("vertical speed", "m/s", given.vertical_speed, of(1, "vertical")),
+            (
+                "horizontal acceleration",
+                "m/s^2",
+                given.horizontal_acceleration,
+                of(2, "horizontal"),
+            ),
+            ("vertical acceleration", "m/s^2", given.vertical_acceleration, of(2, "vertical")),
+            ("jerk", "m/s^3", given.jerk, of(3)),
             ("tilt", "deg", given.tilt_deg, tilt),
         )
         if most is not None

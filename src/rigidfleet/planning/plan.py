@@ -157,13 +157,11 @@ class PhasePlan:
         if goal is None or phase.control == "open":
             return None
         later, stays = since > _LATER, "position" not in phase.meets
-        moved = stays or (later and not phase.free)
         kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
-        kept = later if "attitude" in phase.meets else kept
         found: dict[str, Any] = {"time": t}
-        if moved:
+        if stays or (later and not phase.free):
             found |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
-        if kept:
+        if later if "attitude" in phase.meets else kept:
             T = att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
             found |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
         return found if len(found) > 1 else None

@@ -95,9 +95,7 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
     return [
         Lag(delay=delay, rate=rate, point=True)
         if model.point
-        else Lag(
-            model.attitude_gains[0], model.attitude_gains[1], max(model.motor_time), delay, rate
-        )
+        else Lag(*model.attitude_gains, tau=max(model.motor_time), delay=delay, rate=rate)
         for model in models
     ]
 
@@ -109,16 +107,13 @@ def reserves(mission: Mission) -> Floats:
     acceleration.
     """
     found = np.zeros(mission.n_agents)
-    (k1, k2), c = mission.tracking_gains, mission.constraint
-    law = Feedback(c.alpha, c.beta, c.gamma, k1, k2, mission.tracking.integral)
-    models = mission.vehicle_models or []
-    for i, lag in enumerate(vehicle_lags(mission)):
-        model = models[i]
+    c, tracking, lags = mission.constraint, mission.tracking, vehicle_lags(mission)
+    law = Feedback(c.alpha, c.beta, c.gamma, *mission.tracking_gains, tracking.integral)
+    for i, model in enumerate(mission.vehicle_models or ()):
         if not model.point:
-            drag = model.linear_drag[0]
-            if mission.tracking.drag_feedforward:
-                drag = _LEFT * max(model.linear_drag)
-            found[i] = overshoot(lag, law, drag / model.mass)
+            left = _LEFT * max(model.linear_drag)
+            drag = left if tracking.drag_feedforward else model.linear_drag[0]
+            found[i] = overshoot(lags[i], law, drag / model.mass)
     return found
 
 
@@ -127,29 +122,24 @@ def air_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> F
     models = mission.vehicle_models
     if models is None:
         return mission.drag[who, None] * u
-    linear, body = (
+    linear, body, lift = (
         np.array([getattr(model, name) for model in models])[who]
-        for name in ("linear_drag", "body_drag")
+        for name in ("linear_drag", "body_drag", "rotor_lift")
     )
     force = (linear + body * np.linalg.norm(u, axis=-1, keepdims=True)) * u
-    force[..., 2] += (
-        4.0 * np.array([m.rotor_lift for m in models])[who] * (u[..., :2] ** 2).sum(axis=-1)
-    )
+    force[..., 2] += 4.0 * lift * (u[..., :2] ** 2).sum(axis=-1)
     return force
 
 
 def jets(mission: Mission, r: Floats) -> Floats:
     """Speed [m/s] of the air downwards at each vehicle due to each other one above, (K, N, N) at r (K, N, 3) [m]."""
     below = r[:, None] - r[:, :, None]
-    flow = np.zeros(below.shape[:3])
+    flow, s, beside = np.zeros(below.shape[:3]), below[..., 2], (below[..., :2] ** 2).sum(axis=-1)
     for j, model in enumerate(mission.vehicle_models or ()):
         if not model.point:
-            s, beside = below[:, :, j, 2], (below[:, :, j, :2] ** 2).sum(axis=-1)
-            weight, span = model.mass * mission.gravity, 2.0 * model.arm
-            speed = fleet.jet_speed(
-                weight, DENSITY, model.rotor_radius, span, np.maximum(s, 0.0), beside
-            )
-            flow[:, :, j] = np.where(s > 0.0, speed, 0.0)
+            hover = model.mass * mission.gravity, DENSITY, model.rotor_radius, 2.0 * model.arm
+            speed = fleet.jet_speed(*hover, np.maximum(s[..., j], 0.0), beside[..., j])
+            flow[..., j] = np.where(s[..., j] > 0.0, speed, 0.0)
     return flow
 
 

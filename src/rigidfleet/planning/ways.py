@@ -96,6 +96,7 @@ class _Search:
         self.reach = most + float(mission.fleet.radius.max())
         self.each = mission.n_agents <= _EACH
         self.radius = mission.fleet.radius if self.each else np.array([self.reach])
+        self._known: dict[Any, Lattice] = {}
 
     # -- what there is to choose from ------------------------------------------------------------------
 
@@ -143,15 +144,14 @@ class _Search:
         best: tuple[Network, Way] | None = None
         straight = float(np.linalg.norm(self.end - self.begin))
         stages = sorted({s.stage for s in self.shapes})
-        known: dict[Any, Lattice] = {}
         for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
             if more and (best is not None or len(self.shapes) > _FEW):
                 break
             shapes = [s for s in self.shapes if s.stage <= stage]
             report(
-                f"looking for a way of '{self.phase.name}' round obstacles (shapes: {len(shapes)})"
+                f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
-            network = self._network(shapes, need, known, more=more)
+            network = self._network(shapes, need, more=more)
             way = network.shortest((self.begin, 0), (self.end, self._last))
             if way is not None and (best is None or way.cost < best[1].cost):
                 best = network, way
@@ -161,9 +161,7 @@ class _Search:
             raise self._none(network)
         return best[0], best[0].shortened(best[1])
 
-    def _network(
-        self, shapes: list[layers.Shape], need: float, known: dict[Any, Lattice], *, more: bool
-    ) -> Network:
+    def _network(self, shapes: list[layers.Shape], need: float, *, more: bool) -> Network:
         frames = layers.frames(self._near())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -202,7 +200,7 @@ class _Search:
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = staying(found[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
-        return Network(space, found, changes, self.radius, need, frames, common, known)
+        return Network(space, found, changes, self.radius, need, frames, common, self._known)
 
     # -- from nodes to phases --------------------------------------------------------------------------
 

@@ -174,35 +174,28 @@ def plot(
     target = None if folder is None else as_path(folder)
     formats = _known("format", formats, FORMATS)
     names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
+    look: dict[str, Any] = {"titles": titles, "width": width}
     if target is None:
-        return Figures(_drawn(result, name, titles, width) for name in names)
+        return Figures(_drawn(result, name, **look) for name in names)
     paths = []
     for name in names:
-        drawn = rendered(result, name, formats, titles=titles, width=width)
-        paths += write_files(target / name, drawn)
+        paths += write_files(target / name, rendered(result, name, formats, **look))
     return paths
 
 
-def _drawn(result: Result, name: str, titles: bool, width: float | None) -> Figure:
+def _drawn(result: Result, name: str, *, titles: bool = True, width: float | None = None) -> Figure:
     if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
         raise ValueError(f"the width must be {WIDTHS[0]:g} to {WIDTHS[1]:g} mm, not {width:g}")
     with shape(titles=titles, width=width):
         return _FIGURES[name](result)
 
 
-def rendered(
-    result: Result,
-    name: str,
-    formats: Iterable[str],
-    *,
-    titles: bool = True,
-    width: float | None = None,
-) -> dict[str, bytes]:
+def rendered(result: Result, name: str, formats: Iterable[str], **look: Any) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
     with settings():
-        figure = _drawn(result, name, titles, width)
+        figure = _drawn(result, name, **look)
         keep_layout(figure)
-        return contents(figure, formats, close=not titles)
+        return contents(figure, formats, close=not look.get("titles", True))
 
 
 def contents(figure: Figure, formats: Iterable[str], *, close: bool = False) -> dict[str, bytes]:

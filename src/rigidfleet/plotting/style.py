@@ -66,8 +66,8 @@ Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
 #: Positions along the width of an axes, ends and middle first.
 _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 _places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
-_titled: ContextVar[bool] = ContextVar("titled", default=True)
-_width: ContextVar[float | None] = ContextVar("width", default=None)
+#: Whether figures have titles, and their width [mm]; None for the usual one.
+_shape: ContextVar[tuple[bool, float | None]] = ContextVar("shape", default=(True, None))
 
 _RC: dict[str, Any] = {
     "font.family": "sans-serif",
@@ -151,17 +151,17 @@ def styled(draw: Draw) -> Draw:
 @contextmanager
 def shape(*, titles: bool = True, width: float | None = None) -> Generator[None]:
     """Draw figures in this context with a title and the mission's name, or without both; of another width [mm]."""
-    before = _titled.set(titles), _width.set(None if width is None else width / 25.4)
+    before = _shape.set((titles, width))
     try:
         yield
     finally:
-        _titled.reset(before[0])
-        _width.reset(before[1])
+        _shape.reset(before)
 
 
 def width(usual: float) -> float:
     """Width of a figure [in]: the one that is wanted, or the usual one."""
-    return _width.get() or usual
+    wanted = _shape.get()[1]
+    return usual if wanted is None else wanted / 25.4
 
 
 def narrow() -> bool:
@@ -236,28 +236,21 @@ def head(fig: Figure, result: Result, title: str) -> None:
 def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
     """Title at the left, text at the right; without titles, only a warning text."""
     top = 1 - _PAD / fig.get_figheight()
-    if not _titled.get():
+    if not _shape.get()[0]:
         if colour == ALERT:
             look: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 9, "color": colour}
             warning = fig.suptitle(words, x=0.988, parse_math=False, **look)
             if fig.get_layout_engine() is None:
                 warning.set_y(top)
         return
+    title = textwrap.fill(title, int(9 * fig.get_figwidth()))
     title_text = fig.suptitle(
-        textwrap.fill(title, int(9 * fig.get_figwidth())),
-        x=0.012,
-        ha="left",
-        va="top",
-        fontsize=11,
-        fontweight="bold",
-        parse_math=False,
+        title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
     )
     if fig.get_layout_engine() is None:  # a layout engine places it itself, clear of the axes
         title_text.set_y(top)
-    if colour == ALERT or not narrow():
-        fig.text(
-            0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False
-        )
+    words = words if colour == ALERT or not narrow() else ""
+    fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
 
 
 def over_time(ax: Axes, result: Result) -> None:

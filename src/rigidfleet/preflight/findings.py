@@ -294,10 +294,8 @@ class Preflight:
         if self.margins is not None:
             yield from (("margins", text) for text in self.margins.describe())
         if self.separation is not None:
-            yield (
-                "separation",
-                f"minimum {self.separation[0]:.2f} m, {self.separation[2]} at {self.separation[1]:.2f} s",
-            )
+            apart, t, who = self.separation
+            yield "separation", f"minimum {apart:.2f} m, {who} at {t:.2f} s"
         yield from self._proved()
         if self.thrust is not None:
             force, t, who, limit = self.thrust

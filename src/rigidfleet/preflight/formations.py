@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -28,6 +29,8 @@ from rigidfleet.rigidity.realisations import lead
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
+#: Remarks on formations, by their text.
+_note, _fails = partial(Remark, "note", "formation"), partial(Remark, "fails", "formation")
 #: Maximum number of agents for which other shapes with the same distances are searched by default.
 SEARCHED = 12
 
@@ -83,7 +86,7 @@ def _formation(
         start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
         if held == "distances" and max(start, _spanned(slots)) == 2:
             space = 2  # which they do not leave
-        points = slots if space == 3 else flattened(slots, space)[0]
+        points = flattened(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
@@ -113,7 +116,8 @@ def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
         return None
     given = mission.formation_distances(name)
     error = np.abs(distance_geometry.distances(slots, edges) - given)
-    worst, most = int(error.argmax()), mission.formations[name].greatest_error(given.min())
+    worst = int(error.argmax())
+    most = mission.formations[name].greatest_error(given.min())
     return (worst, float(error[worst])) if error[worst] > most else None
 
 
@@ -121,10 +125,9 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
     """Remarks on formations that are not rigid, contradict themselves, or share their distances with other shapes."""
     exact = mission.constraint.solver == "exact"
     if skipped := [f.name for f in formations if f.skipped]:
-        text = f"to limit the time of the check, {some(skipped)} skipped"
-        yield Remark("note", "formation", text)
+        yield _note(f"to limit the time of the check, {some(skipped)} skipped")
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
-        yield Remark("note", "formation", f"{some(idle)} not used in any phase")
+        yield _note(f"{some(idle)} not used in any phase")
     yield from _confined(mission)
     soft = {
         f.name
@@ -132,7 +135,7 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.rigidity is not None and f.held_by == "distances"
         and (f.rigidity.rigidity_class is RigidityClass.FLEXIBLE or f.rigidity.space < 3)
     }  # fmt: skip
-    forecasts = _forecasts(mission, soft) if soft else {}
+    forecasts = _forecasts(mission, soft)
     for f in formations:
         if f.held_by == "nothing":
             continue
@@ -140,43 +143,40 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if (off := contradiction(mission, f.name)) is not None:
             i, j = mission.formation_edges(f.name)[off[0]] + 1
             given = mission.formation_distances(f.name)[off[0]]
-            text = (
+            yield _fails(
                 f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {given:.4g} m,"
                 f" which differs from that of their slots by {off[1]:.3g} m"
             )
-            yield Remark("fails", "formation", text)
         r = f.rigidity
         if f.spectrum is not None:
             if f.spectrum.free:
                 text = f"'{f.name}' is flexible to first order: at least {f.spectrum.free} motions are free"
                 held = ". Add edges, or track slots" if alone else "; slots hold it"
-                yield Remark("fails" if alone else "note", "formation", text + held)
+                yield (_fails if alone else _note)(text + held)
             continue
-        if r is None and alone and not len(mission.formation_edges(f.name)):
-            text = f"'{f.name}' has no edges: where no slots are tracked, only a force of your own (simulate) forms it"
-            yield Remark("note", "formation", text)
-        if r is None and mission.formation_slots(f.name) is not None:
-            continue  # too large to check
         if r is None:
-            if len(mission.formation_edges(f.name)):
+            if alone and not len(mission.formation_edges(f.name)):
+                yield _note(
+                    f"'{f.name}' has no edges: only slots or a force of your own (simulate) form it"
+                )
+            elif mission.formation_slots(f.name) is None:  # else it has no edges, or is too large
                 text = f"the distances of '{f.name}' do not determine positions: its rigidity is not checked"
-                yield Remark("note", "formation", text)
+                yield _note(text)
             continue
         if r.rigidity_class is RigidityClass.FLEXIBLE or f.name in soft:
             yield from _flexible(f.name, r, forecasts.get(f.name))
         elif r.rigidity_class is RigidityClass.UNDECIDED and alone:
-            yield Remark("note", "formation", f"'{f.name}' is undecided: {r.reason}")
+            yield _note(f"'{f.name}' is undecided: {r.reason}")
         elif r.rigidity_class is RigidityClass.PRESTRESS_STABLE and alone:
             where = "line" if r.dimension == 1 else "plane"
             across = f" across its {where}" if r.dimension < 3 else ""
             text = f"'{f.name}' is only prestress stable{across}; tracked slots hold it firmly"
-            yield Remark("note", "formation", text)
+            yield _note(text)
         if exact and alone and len(r.edges) > r.rank:
-            text = (
+            yield _fails(
                 f"solver 'exact' has no solution at '{f.name}': only {r.rank} of its {len(r.edges)} distances are"
                 " independent. Use solver = 'iterated'"
             )
-            yield Remark("fails", "formation", text)
         yield from _other_shapes(mission, f, alone=alone)
 
 
@@ -212,17 +212,17 @@ def _confined(mission: Mission) -> Iterator[Remark]:
         sure &= mission.disturbances is None and mission.vehicle_models is None
         text = f"all agents start on one {WHERE[start]}; forces between them cannot move them off it to '{name}'"
         text += f". Move one agent off the {WHERE[start]}, or use control = 'tracking' in '{phase.name}'"
-        yield Remark("fails" if sure else "note", "formation", text)
+        yield (_fails if sure else _note)(text)
         return
 
 
-def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, float]]:
+def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]:
     """What becomes of some formations that distances alone hold, if only forces along their edges move the agents.
 
-    By name: the greatest dimension of the space that the agents keep to, the greatest error of a pair at the end of a
-    phase, in tolerances, and the one above which it is sure to be missed.
+    By name: the greatest dimension of the space that the agents keep to, and the greatest error of a pair at the end of
+    a phase, as a share of the one from which on the shape is sure to be missed.
     """
-    out: dict[str, tuple[int, float, float]] = {}
+    out: dict[str, tuple[int, float]] = {}
     name, unequal = None, len(set(mission.agents.mass)) > 1
     r, v = mission.fleet.position, centred(mission.fleet.velocity)
     for phase in mission.phases:
@@ -238,44 +238,37 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float, 
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
             led = None if torn else lead(r, edges, lengths, 1e-6 * apart.min(), slots)
-            sure = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
-            off, before = np.inf, out.get(name, (0, 0.0, 0.0))
+            most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
+            most *= mission.formations[name].greatest_error(apart.min())
+            off, before = np.inf, out.get(name, (0, 0.0))
             if led is not None:
                 slots = led
-                off = np.abs(distance_geometry.distances(led, pairs) - apart).max()
-            worst = max(before[1], off / mission.formations[name].greatest_error(apart.min()))
-            out[name] = max(before[0], space), worst, max(before[2], sure)
+                off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / most
+            out[name] = max(before[0], space), max(before[1], off)
         r, v = slots, 0 * v
     return out
 
 
-def _flexible(
-    name: str, r: Rigidity, forecast: tuple[int, float, float] | None
-) -> Iterator[Remark]:
+def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Iterator[Remark]:
     """Remark on a formation that is flexible or in a plane; the forecast is None where slots hold it."""
     who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
     more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
     text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
     if not r.flexes:
         text = f"'{name}' has dimension = 2, but its agents leave their plane"
-    space, off, sure = forecast or (3, 0.0, 0.0)
-    kept = r.own.rigid and space <= r.own.space < 3
-    where = f"to within {off:.2g} tolerances of" if off <= sure else "past"
-    if kept:
-        text += (
-            f". It is rigid in its {WHERE[r.own.space]}, which forces between agents do not leave"
-        )
-    elif forecast is not None:
-        text += f". Distances lead it {where} its shape"
-    if forecast is None:
-        yield Remark("note", "formation", f"{text}; slots hold it")
-    elif not kept and off > sure:
-        yield Remark("fails", "formation", f"{text}. Add edges (rigidfleet design), or track slots")
-    elif not kept or r.space == 3:  # else it is as the mission says
-        text += (
-            "; nothing resists what else moves it (gusts, unequal weights, lags). Tracked slots do"
-        )
-        yield Remark("note", "formation", text)
+    level, held = "note", "; slots hold it"
+    if forecast is not None:
+        held = "; nothing but tracked slots resists gusts, unequal weights and lags"
+        if r.own.rigid and forecast[0] <= r.own.space < 3:
+            if r.space < 3:  # as the mission says
+                return
+            text += f". It is rigid in its {WHERE[r.own.space]}, which its forces do not leave"
+        elif forecast[1] <= 1.0:
+            text += ". Distances lead it to its shape"
+        else:
+            text += ". Distances lead it past its shape"
+            level, held = "fails", ". Add edges (rigidfleet design), or track slots"
+    yield Remark(level, "formation", text + held)
 
 
 def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterator[Remark]:
@@ -289,27 +282,23 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
         by = reference_kind(mission, first, start, slots)
     end = None if others.leads_to is None else others.found[others.leads_to].kind
     if by == "shape" and slots is not None and _flattens(start, slots):
-        text = (
+        yield _note(
             f"the agents start with the handedness of the mirror image of '{f.name}' and must pass through a plane,"
             " where distances alone may return them to the mirror image. Swap two slots or track slots"
         )
-        yield Remark("note", "formation", text)
     elif by in ("squares", "step") and end not in (None, Kind.SAME):
-        text = (
+        yield _note(
             f"from the start positions, the distances of '{f.name}' lead to another shape ({end})"
         )
-        yield Remark("note", "formation", text)
     elif not others.unique:
-        n = sum(r.kind not in (Kind.SAME, Kind.MIRRORED) for r in others.found)
-        share = sum(r.found for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED))
-        bent = sum(r.bends for r in others.found)
+        rest = [r for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED)]
+        n, share, bent = len(rest), sum(r.found for r in rest), sum(r.bends for r in others.found)
         families = f", {bent} as a family that bends" * (bent > 0)
         what = "1 other shape has" if n == 1 else f"{n} other shapes have"
-        text = (
+        yield _note(
             f"{what} the distances of '{f.name}'{families}; {share} of {others.starts} random starts reach"
             f" {'it' if n == 1 else 'them'}. Redundant edges or tracked slots prevent this"
         )
-        yield Remark("note", "formation", text)
 
 
 def _flattens(start: Floats, slots: Floats) -> bool:

@@ -59,19 +59,14 @@ def _drift(mission: Mission) -> Iterator[Remark]:
         yield Remark("note", "gains", text)
         return
     r, v = mission.fleet.position, mission.fleet.velocity
-    edges, d = (
-        mission.formation_edges(first.formation),
-        mission.formation_distances(first.formation),
-    )
-    i, j = edges.T
+    d = mission.formation_distances(first.formation)
+    i, j = mission.formation_edges(first.formation).T
     x = r[i] - r[j]
     L = np.linalg.norm(x, axis=1)
     c_dot = ((v[i] - v[j]) * x).sum(axis=1) / L
     end = phase_spans(mission)[0][1]
-    error = np.abs(L - d) if first.reference == "step" else np.abs(c_dot) * first.least_time / 2
-    error = np.abs(np.where(first.reference == "step", L - d + c_dot * end, error))
-    worst = error.max(initial=0.0)
-    form = mission.formations[first.formation]
-    fails = worst > form.greatest_error(d.min(initial=np.inf))
+    error = L - d + c_dot * end if first.reference == "step" else c_dot * first.least_time / 2
+    worst = np.abs(error).max(initial=0.0)
+    fails = worst > mission.formations[first.formation].greatest_error(d.min(initial=np.inf))
     text += f"; by {end:g} s they reach {worst:.2g} m"
     yield Remark("fails" if fails else "note", "gains", text)

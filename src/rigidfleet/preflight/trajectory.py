@@ -18,6 +18,7 @@ from rigidfleet.mission.disturbances import intensity
 from rigidfleet.planning import timing
 from rigidfleet.planning.certificate import straight
 from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
 from rigidfleet.planning.vehicles import air_force
@@ -25,6 +26,7 @@ from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Re
 from rigidfleet.rigidity import (
     jacobian,
 )
+from rigidfleet.typing import Floats
 
 #: Share by which a goal is planned to be missed by more than its tolerance, before it is said to be missed.
 _CLEARLY = 0.02
@@ -138,24 +140,30 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
 def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on planned thrust beyond a limit."""
     masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
-    weight = np.array([0.0, 0.0, mission.gravity])
-    best: tuple[float, float, str, float, str, bool] | None = None
-    for planned in found.planned_phases:
-        force = masses * np.linalg.norm(planned.acceleration + weight, axis=2)
-        over = force - limits if np.isfinite(limits).any() else force
-        k, i = np.unravel_index(int(over.argmax()), over.shape)
-        share = force[k, i] - (limits[i] if math.isfinite(limits[i]) else 0.0)
-        at = (float(force[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i]))
-        if best is None or share > best[0] - (best[3] if math.isfinite(best[3]) else 0.0):
-            best = (*at, planned.phase, planned.exact)
-    if best is not None:
-        found.thrust = best[:4]
-        force, t, who, limit, phase, exact = best
-        smooth = mission.smooth and exact  # judged with the other limits of the plan
+    weight, way = np.array([0.0, 0.0, mission.gravity]), found.planned_phases
+    if way:
+        needs = [masses * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
+        found.thrust, planned = _nearest_to_limit(way, needs, limits)
+        force, t, who, limit = found.thrust
+        smooth = mission.smooth and planned.exact  # judged with the other limits of the plan
         if force > limit * (1 + 1e-3) and not smooth:
-            text = f"{who} needs {force:.1f} N at {t:.2f} s in '{phase}' (limit {limit:g} N)"
-            yield Remark("fails" if exact else "note", "thrust", text)
+            text = f"{who} needs {force:.1f} N at {t:.2f} s in '{planned.phase}'"
+            text += f" (limit {limit:g} N)"
+            yield Remark("fails" if planned.exact else "note", "thrust", text)
     yield from _step_thrust(mission, found)
+
+
+def _nearest_to_limit(
+    way: list[PlannedPhase], needs: list[Floats], limits: Floats
+) -> tuple[tuple[float, float, str, float], PlannedPhase]:
+    """Of the forces (K, N) [N] of each phase, the one nearest to its limit (N,) [N], or the greatest if there is none.
+
+    Its value, time [s], agent and limit, and its phase.
+    """
+    room = limits if np.isfinite(limits).any() else 0.0
+    planned, need = max(zip(way, needs, strict=True), key=lambda pair: (pair[1] - room).max())
+    k, i = np.unravel_index(int((need - room).argmax()), need.shape)
+    return (float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])), planned
 
 
 def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
@@ -172,17 +180,12 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     noise = np.zeros(len(believed))
     if d.noise is not None:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
-    limits = mission.fleet.thrust_limit
-    worst, most = -math.inf, (0.0, 0.0, "", math.inf)
+    needs = []
     for planned in found.planned_phases:
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
-        need = np.linalg.norm(force, axis=2) + gusts + noise
-        over = need - np.where(np.isfinite(limits), limits, 0.0)
-        k, i = np.unravel_index(int(over.argmax()), over.shape)
-        if over[k, i] > worst:
-            worst = float(over[k, i])
-            most = float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])
+        needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
+    most, _ = _nearest_to_limit(found.planned_phases, needs, mission.fleet.thrust_limit)
     steady = air_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -318,10 +321,8 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
         out = np.maximum(low - planned.position, planned.position - high).max(axis=2)
         k, i = np.unravel_index(int(out.argmax()), out.shape)
         if out[k, i] > SLACK:
-            by, t = float(out[k, i]), float(planned.time[k])
-            text = (
-                f"agent {i + 1} leaves the geofence by {by:.2f} m at {t:.2f} s in '{planned.phase}'"
-            )
+            text = f"agent {i + 1} leaves the geofence by {out[k, i]:.2f} m"
+            text += f" at {planned.time[k]:.2f} s in '{planned.phase}'"
             yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
@@ -343,33 +344,16 @@ def _broken(mission: Mission, planned: PlannedPhase, hopeless: set[str]) -> Iter
 
 def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed and acceleration of samples beyond their limits."""
-    limits = mission.limits
-    for what, values, limit, unit in (
-        ("speed", planned.velocity, limits.speed, "m/s"),
-        ("acceleration", planned.acceleration, limits.acceleration, "m/s^2"),
-        ("horizontal speed", planned.velocity[..., :2], limits.horizontal_speed, "m/s"),
-        ("vertical speed", planned.velocity[..., 2:], limits.vertical_speed, "m/s"),
-        (
-            "horizontal acceleration",
-            planned.acceleration[..., :2],
-            limits.horizontal_acceleration,
-            "m/s^2",
-        ),
-        (
-            "vertical acceleration",
-            planned.acceleration[..., 2:],
-            limits.vertical_acceleration,
-            "m/s^2",
-        ),
-    ):
-        if limit is None:
+    x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
+    for limit in limits_of(mission):
+        if not limit.name.endswith(("speed", "acceleration")):
             continue
-        size = np.linalg.norm(values, axis=2)
-        of = f" of {what}" if " " in what else ""
+        size, most = limit.quantity(x, np.arange(mission.n_agents)), float(limit.most[0])
+        of = f" of {limit.name}" if " " in limit.name else ""
         k, i = np.unravel_index(int(size.argmax()), size.shape)
-        if size[k, i] > limit * (1 + 1e-3):
+        if size[k, i] > most * (1 + 1e-3):
             text = (
-                f"agent {i + 1} reaches {size[k, i]:.3g} {unit}{of} at {planned.time[k]:.2f} s in '{planned.phase}'"
-                f" (limit {limit:g} {unit})"
+                f"agent {i + 1} reaches {size[k, i]:.3g} {limit.unit}{of} at {planned.time[k]:.2f} s in"
+                f" '{planned.phase}' (limit {most:g} {limit.unit})"
             )
-            yield Remark("fails" if planned.exact else "note", what, text)
+            yield Remark("fails" if planned.exact else "note", limit.name, text)

@@ -282,7 +282,7 @@ def _safety_cell(row: Safety | None) -> dict[str, Any]:
         return {"state": "free", "worst": "", "nothing": "flown by points"}
     margin, used = row.margin, row.used
     state = "free" if row.limit is None else "ok" if row.passed else "failed"
-    left = ""
+    left, alone = "", ", at samples" if row.worst and row.worst.at_samples else ""
     if margin is not None:
         left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
     nothing = {
@@ -298,9 +298,7 @@ def _safety_cell(row: Safety | None) -> dict[str, Any]:
         "nothing": nothing.get(row.quantity, "nothing to measure") if row.worst is None else "",
         "left": left,
         "used": None if used is None else min(max(used, 0.0), 1.0),
-        "when": ""
-        if row.worst is None
-        else f"{row.worst.when:.2f} s" + ", at samples" * row.worst.at_samples,
+        "when": "" if row.worst is None else f"{row.worst.when:.2f} s{alone}",
         "who": "" if row.worst is None else row.worst.who,
         "phase": "" if row.worst is None else row.worst.phase,
     }

@@ -156,10 +156,8 @@ def realisations(
         end = lead(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
     first = groups.families(e)
-    found = {}
-    for k in set(first):
-        count = sum(seen for (_, seen), j in zip(groups.shapes, first, strict=True) if j == k)
-        found[k] = _describe(groups.shapes[k][0], p, e, count, size, axes)
+    counts = np.bincount(first, [seen for _, seen in groups.shapes]).astype(int).tolist()
+    found = {k: _describe(groups.shapes[k][0], p, e, counts[k], size, axes) for k in set(first)}
     rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
     order = sorted(found, key=lambda k: (rank.get(found[k].kind, 2), -found[k].found, k))
     return Realisations(
@@ -181,11 +179,9 @@ class _Groups:
     def add(self, p: Floats, count: int) -> int:
         """Count a shape; return its number."""
         pairs = _pairs(p)
-        for k in range(len(self.shapes)):
-            q, seen = self.shapes[k]
-            if np.abs(self._pairs[k] - pairs).max() <= self._tol and (
-                np.abs(self._pairs[0] - pairs).max() > self._tol or self._fits(p, q)
-            ):
+        alike = [np.abs(known - pairs).max() <= self._tol for known in self._pairs]
+        for k, (q, seen) in enumerate(self.shapes):
+            if alike[k] and (not alike[0] or self._fits(p, q)):
                 self.shapes[k] = (q, seen + count)
                 return k
         self._pairs.append(pairs)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,8 +64,8 @@ _NAMES = {
     "constraint": records.CONSTRAINT,
     **dict(zip(DIRECTIONS, range(records.HORIZONTAL_SPEED, records.QUANTITIES), strict=True)),
 }
-#: What a monitor writes beside the worst values.
-_WRITTEN = "when", "who", "standing", "low", "flags"
+#: What a monitor writes.
+_WRITTEN = "worst", "when", "who", "standing", "low", "flags"
 #: First contacts of a flight by name, each with the quantity that then falls below zero.
 _CONTACTS = {f"{name}_first": _NAMES[name] for name in ("separation", "lost", "clearance")}
 #: Extremes of a sampled flight by its column, the monitor's quantity, and its sign there.
@@ -268,7 +268,7 @@ class Extremes:
         new = range(int(flags[3]), steps)
         listed = int(flags[records.LISTED])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, new, self.monitor)
+        self._take_solids(problem, state, new)
         flags[:3] = flags[3], steps, 2 if last else 1
         if self.n > _FEW:
             for step in new:
@@ -313,7 +313,7 @@ class Extremes:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
         steps, flags = int(state.count[4]), self.monitor.monitor.flags
-        self._take_solids(problem, state, range(steps), self.monitor)
+        self._take_solids(problem, state, range(steps))
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
@@ -332,15 +332,15 @@ class Extremes:
         for name, kind in _CONTACTS.items():
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
+            deepest = partial(self._deepest, kind, problem, work, state)
             clock, points = state.trail.clock[rows], state.trail.points[rows]
             while clock[-1].sum() - clock[0, 0] > _INSTANT:
                 if len(clock) == 1:
                     clock, points = _halves(*clock[0], points[0])
                 half = len(clock) // 2
-                first = self._deepest(kind, problem, work, state, clock[:half], points[:half])
-                part = slice(half) if first is not None else slice(half, None)
+                part = slice(half) if deepest(clock[:half], points[:half]) else slice(half, None)
                 clock, points = clock[part], points[part]
-            if (found := self._deepest(kind, problem, work, state, clock, points)) is not None:
+            if (found := deepest(clock, points)) is not None:
                 self.touched[name] = found
 
     def _deepest(
@@ -349,31 +349,28 @@ class Extremes:
         """The deepest contact of a kind in steps (S, 2), (S, 5, n) of an integrator; None if there is none."""
         trail = records.Trail(*steps, *state.trail[2:])
         state = state._replace(trail=trail, count=np.zeros_like(state.count))
-        found = self.monitor.monitor
-        own = {name: getattr(found, name).copy() for name in _WRITTEN}
-        own["flags"][:] = 0, len(steps[0]), 0, 0, records.ANY_STEP, records.ANY_STEP
-        worst = np.full_like(self.worst, -np.inf)  # nothing else is searched for
-        worst[kind] = -_TOUCH
-        watch = native.Watch(found._replace(worst=worst, **own))
-        self._take_solids(problem, state, range(len(steps[0])), watch)
-        watch(problem, work, state)
-        if not worst[kind] < -_TOUCH:
-            return None
-        return Extremum(float(worst[kind]), float(own["when"][kind]), *map(int, own["who"][kind]))
+        arrays = [getattr(self.monitor.monitor, name) for name in _WRITTEN]
+        before = [array.copy() for array in arrays]
+        self.worst.fill(-np.inf)  # nothing else is searched for
+        self.worst[kind] = -_TOUCH
+        arrays[-1][:] = 0, len(steps[0]), 0, 0, records.ANY_STEP, records.ANY_STEP
+        self._take_solids(problem, state, range(len(steps[0])))
+        self.monitor(problem, work, state)
+        found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
+        for array, own in zip(arrays, before, strict=True):
+            array[...] = own
+        return found
 
-    def _take_solids(
-        self, problem: Problem, state: records.IntegratorState, steps: range, watch: native.Watch
-    ) -> None:
+    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: range) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is None:
             return
         from rigidfleet.kernel import obstacles  # loads the compiler
 
         trail, body = state.trail, bool(problem.body_formulation)
-        rows = _rows(state, steps).tolist()
         laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
-        watched = obstacles.monitor_of(watch.monitor)
-        for row in rows:
+        watched = obstacles.monitor_of(self.monitor.monitor)
+        for row in _rows(state, steps):
             obstacles.watch(trail.points[row], trail.clock[row], laid, self.solids, watched)
 
     def take_vehicles(

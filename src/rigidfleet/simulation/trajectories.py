@@ -8,7 +8,7 @@ degree: pieces of a higher one are cut so short that they are within a micrometr
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from rigidfleet.interchange.curves import Curve
 from rigidfleet.kernel import records
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import proximity, series, splines
-from rigidfleet.math.bernstein import bernstein, greatest
+from rigidfleet.math.bernstein import SIZES, bernstein, greatest
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
@@ -310,9 +310,8 @@ def of_pieces(
     mission = judged_as(first[0, 0], span, **judged)
     time, state, yaw = _samples(pieces, first, last)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    smooth = pieces.position.shape[-1] > 2  # lines turn at once at samples
     _put_extremes(record, mission, pieces)
-    if not smooth:
+    if pieces.position.shape[-1] < 3:  # lines turn at once at samples
         state[2:] = np.nan
     return _result(mission, record, time, state, yaw, interpolation, names)
 
@@ -462,14 +461,6 @@ def _parts(c: Floats, h: Floats) -> list[int]:
         parts[wide] *= 2
 
 
-#: Sizes (...) of vectors (..., 3) by the name of the greatest acceleration.
-_SIZES: dict[str, Callable[[Floats], Floats]] = {
-    "acceleration": lambda x: np.linalg.norm(x, axis=-1),
-    "horizontal_acceleration": lambda x: np.hypot(x[..., 0], x[..., 1]),
-    "vertical_acceleration": lambda x: np.abs(x[..., 2]),
-}
-
-
 def _accelerations(
     best: dict[str, Extremum], c: Floats, t: Floats, h: Floats, *, directed: bool
 ) -> None:
@@ -480,8 +471,9 @@ def _accelerations(
     power = np.arange(2, c.shape[-1])
     a = (c[..., 2:] * (power * (power - 1))).reshape(len(c) * n, 3, -1)
     points = bernstein(a, np.repeat(h, n))
-    for name, size in list(_SIZES.items())[: None if directed else 1]:
-        found, known = greatest(points, size), best.get(name)
+    for way in SIZES if directed else ("",):
+        name = f"{way}_acceleration".lstrip("_")
+        found, known = greatest(points, SIZES[way]), best.get(name)
         if known is None or found.value > known.value:
             k, i = divmod(found.curve, n)
             best[name] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)

@@ -78,9 +78,8 @@ class Search(NamedTuple):
     pairs: Ints  # (P, 2) of agents
     boxes: LaneArray  # (B, 6) obstacles [m]
     limit: LaneArray  # (N,) of thrust [N]
-    forces: (
-        LaneArray  # (2, 3N + 2m or 5N + 2m) sizes of the forces at the ends of the last two steps
-    )
+    # (2, 3N + 2m or 5N + 2m) sizes of the forces at the ends of the last two steps
+    forces: LaneArray
     moments: Floats  # (2,) when these were [s]
     # (4, 8) addresses of each flight's control points, forces, forces at the start, and times of steps
     trails: Ints
@@ -268,9 +267,8 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
     unpack(s.nearest)[:] = _FAR
     # Where an agent stands, lands or takes off, what is stored depends on every step; there are no bounds by direction.
     directed = [x.worst[HORIZONTAL_SPEED] > -math.inf for x in monitors]
-    landed = [
-        near <= x.pad + _MARGIN or _landing(x) for near, x in zip(nearest, monitors, strict=True)
-    ]
+    pairs = zip(nearest, monitors, strict=True)
+    landed = [near <= x.pad + _MARGIN or _landing(x) for near, x in pairs]
     every = np.array([np.logical_or(landed, directed), directed]).T
     _list(
         s, first, steps.start, steps.stop, every, limits, margins, unpack(margins), found, count,

@@ -276,10 +276,8 @@ def _event(name: str, data: str) -> bytes:
 
 
 def _number(value: Any, most: float) -> float:
-    whole = isinstance(value, int) and not isinstance(
-        value, bool
-    )  # of any size: it may exceed every float
-    if not (whole or (isinstance(value, float) and math.isfinite(value))):
+    # A whole number may exceed every float.
+    if type(value) is not int and not (isinstance(value, float) and math.isfinite(value)):
         raise ValueError("the value must be a finite number")
     return float(min(max(value, -most), most))
 
