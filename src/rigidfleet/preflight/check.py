@@ -15,6 +15,7 @@ from rigidfleet.mission import Mission, as_mission
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import timed
 from rigidfleet.preflight.assignment import assignment_remarks
+from rigidfleet.preflight.avoidance import braking_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_gains, gain_remarks
@@ -76,6 +77,7 @@ def check(
         *assignment_remarks(mission, found),
         *thrust_remarks(mission, found),
         *vehicle_remarks(mission, found),
+        *braking_remarks(mission),
         *disturbance_remarks(mission, found),
         *obstacle_remarks(mission, found),
         *limit_remarks(mission, found),
