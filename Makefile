@@ -47,6 +47,7 @@ avoidance: .venv/.crowds  ## Plan transitions and published problems, with proof
 	@$(BIN)/python benchmarks/gaps.py
 	@$(BIN)/python benchmarks/crowds.py
 	@$(BIN)/python benchmarks/reciprocal.py
+	@$(BIN)/python benchmarks/encounters.py
 
 replays: .venv/.dev  ## Measure replays in Chromium without a graphics card
 	@$(BIN)/python benchmarks/replay.py

@@ -162,7 +162,7 @@ def desired_attitude(k, i, flight, state, F):
     vehicles, tables, work = flight.vehicles, flight.tables, state.work
     m, row = vehicles.m[i], k - tables.first
     yaw, F_dot, F_ddot = work.x[1], work.x[2], work.x[3]
-    limited = limit_tilt(F, vehicles.tilt[i], m * vehicles.g)
+    limited = limit_tilt(F, vehicles.tilt[i], m * vehicles.g) or state.layers[i] != 0
     for q in range(3):
         yaw[q] = tables.yaw[row, i, q] if tables.yaw.shape[0] > 0 else 0.0
         # At the limit of tilt, the force does not follow the reference's jerk

@@ -101,6 +101,13 @@ class Avoidance(NamedTuple):
     g: float  # [m/s^2]
     coast: Floats  # (N, 3) of the drag k per mass over a period T: e^-kT, (1 - e^-kT)/k, (T - (1 - e^-kT)/k)/k
     lag: Floats  # (N,) time until a command acts [s]
+    ahead: Floats  # (N, 3, 3) lags of each axis: a1 [s], a2 [s^2], of the guard's commands [s]; 0 of points
+    lead: Floats  # (N, 3) by which the point that obeys at once is ahead [s]
+    asked: Floats  # (N, 3) acceleration that the laws ask for [m/s^2]
+    given: Floats  # (N, 3) acceleration last commanded [m/s^2]
+    led: Ints  # (N,) 1 if that was not what the laws asked for
+    soft: Floats  # (N,) speed below which braking fades [m/s]
+    tilt: Floats  # (N,) greatest tilt of the thrust [rad]
     spare: Floats  # (N,) by which D and R are widened [m]
     room: Floats  # (N,) radius, and half of the separation to keep [m]
     reach: Floats  # (N,) radius, and the clearance to keep [m]
@@ -121,7 +128,8 @@ class Avoidance(NamedTuple):
     shift: Floats  # (N, 3) by which barriers change it [m/s^2]
     chosen: Floats  # (N, 3) acceleration given [m/s^2]
     rise: Floats  # (N, 3) acceleration at the start of the tick, with drag [m/s^2]
-    ways: Floats  # (N, 4, 3) present choice: position, after the tick, stop point; stop point without a tick
+    ways: Floats  # (N, 6, 3) present choice: point led, after the tick, stop point; stop point without a tick; behind
+    behind: Floats  # (N,) how far the place is from the position [m]
     far: Floats  # (N,) distance from its position that a vehicle cannot leave in the tick and by braking after it [m]
     walls: Floats  # (N, B) distance of the stop segment from an obstacle to keep [m]
     threat: Ints  # (N,) a known obstacle that moves, the one that leaves the least room; -1 if none
@@ -170,6 +178,8 @@ def avoidance(
     clearance: float = 0.0,
     drag: ArrayLike = 0.0,
     lag: ArrayLike = 0.0,
+    ahead: ArrayLike = 0.0,
+    tilt: ArrayLike = math.inf,
     spare: ArrayLike = 0.0,
     rate: float = 3.0,
     share: float = 0.9,
@@ -188,18 +198,22 @@ def avoidance(
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     radius = np.asarray(radius, dtype=float)
+    lags: Floats = np.ascontiguousarray(np.broadcast_to(np.asarray(ahead, dtype=float), (n, 3, 3)))
     return Avoidance(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
         inverse=1.0 / _each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
+        ahead=lags, lead=lags[:, :, 0] + lags[:, :, 2], soft=np.where(lags[:, 0, 0] > 0.0, b * np.asarray(lag), 0.0),
+        tilt=_each(tilt, n), asked=np.zeros((n, 3)), given=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
+        led=np.zeros(n, dtype=np.int64),
         room=radius + 0.5 * separation, reach=radius + clearance,
         solids=solids, sight=sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
-        chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 4, 3)),
-        far=np.zeros(n), threat=np.full(n, -1),
+        chosen=np.zeros((n, 3)), rise=np.zeros((n, 3)), ways=np.zeros((n, 6, 3)),
+        behind=np.zeros(n), far=np.zeros(n), threat=np.full(n, -1),
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
@@ -248,14 +262,15 @@ def _record(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def needed_rate(gap, s, across, B, rate):
+def needed_rate(gap, s, across, B, rate, soft=0.0):
     """Least second derivative of a distance by a barrier, see `barriers`; ``across``: the part that motion gives.
 
-    For numbers and arrays: the gap to what is to be kept [m], its rate s, and the braking B to reckon with.
+    For numbers and arrays: the gap to what is to be kept [m], its rate s, the braking B to reckon with, and the speed
+    below which it fades.
     """
-    safe = np.maximum(gap, _NEAREST)
-    root = np.sqrt(2.0 * B * safe)
-    return -rate * (root + s) - B * s / root - across
+    safe = np.maximum(gap, _NEAREST - 0.5 * soft * soft / B)
+    root = np.sqrt(2.0 * B * safe + soft * soft)
+    return -rate * (root - soft + s) - B * s / root - across
 
 
 def _each(x: ArrayLike, n: int) -> Floats:

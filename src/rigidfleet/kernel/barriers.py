@@ -24,6 +24,7 @@ makes the problem solvable where barriers contradict each other. Edges let go wh
 
 import math
 
+from rigidfleet.kernel.attitude_control import limit_tilt
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
 from rigidfleet.kernel.compiler.jit import compiled, inlined
@@ -108,7 +109,7 @@ def needed_beside(i, o, r, v, a):
     """
     x, p, q, bound = a.sight.track[o], a.shifted[0], a.shifted[2], a.sight.bound[o]
     for k in range(3):
-        p[k] = r[k] - x[k]
+        p[k] = r[k] - x[k] - a.lead[i, k] * x[3 + k]
         q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
     keep = a.reach[i] + a.spare[i] + bound[0]
     most = keep + _AHEAD * bound[1]
@@ -146,9 +147,13 @@ def list_barriers(r, v, lost, a):
             s, d = n[0] * X + n[1] * Y + n[2] * Z, a.wanted[j]
             both = a.b[i] + a.b[j]
             gap = L - a.room[i] - a.room[j] - a.spare[i] - a.spare[j]
-            gap -= max(0.0, -s) * max(a.lag[i], a.lag[j])
+            soft = a.share * (a.soft[i] + a.soft[j])
             across = (X * X + Y * Y + Z * Z - s * s) * inverse
-            needed = needed_rate(gap, s, across, a.share * both, a.rate)
+            if soft == 0.0:
+                gap -= max(0.0, -s) * max(a.lag[i], a.lag[j])
+                needed = needed_rate(gap, s, across, a.share * both, a.rate)
+            else:
+                needed = needed_rate(gap, s, across, a.share * both, a.rate, soft)
             have = n[0] * (c[0] - d[0]) + n[1] * (c[1] - d[1]) + n[2] * (c[2] - d[2])
             if needed > have - both:
                 violated = violated or needed > have
@@ -161,14 +166,20 @@ def list_barriers(r, v, lost, a):
                 s = n[0] * v[i, 0] + n[1] * v[i, 1] + n[2] * v[i, 2]
             elif a.sight.known[o] == KNOWN:
                 x, bound, B = a.sight.track[o], a.sight.bound[o], braking_beside(i, o, a)
-                away = from_solid(r[i, 0] - x[0], r[i, 1] - x[1], r[i, 2] - x[2], o, a.solids, n)
+                for q in range(3):
+                    n[q] = r[i, q] - x[q] - a.lead[i, q] * x[3 + q]
+                away = from_solid(n[0], n[1], n[2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i] - bound[0]
                 s = n[0] * (v[i, 0] - x[3]) + n[1] * (v[i, 1] - x[4]) + n[2] * (v[i, 2] - x[5])
                 s -= bound[1]
             else:
                 continue
-            gap -= max(0.0, -s) * a.lag[i]
-            needed = needed_rate(gap, s, 0.0, a.share * B, a.rate)
+            if a.soft[i] == 0.0:
+                gap -= max(0.0, -s) * a.lag[i]
+                needed = needed_rate(gap, s, 0.0, a.share * B, a.rate)
+            else:
+                soft = a.share * B * a.soft[i] / a.b[i]
+                needed = needed_rate(gap, s, 0.0, a.share * B, a.rate, soft)
             entry = walls + 2 * (i * a.solids.kind.shape[0] + o)
             count, worse = add_obstacle(count, i, entry, needed, a)
             violated = violated or worse
@@ -358,6 +369,10 @@ def limit(i, a):
     if size > a.lift[i]:
         share = a.lift[i] / size
         c[0], c[1], c[2] = share * c[0], share * c[1], share * (c[2] + a.g) - a.g
+    if a.tilt[i] < math.inf:
+        c[2] += a.g
+        limit_tilt(c, a.tilt[i], a.g)
+        c[2] -= a.g
 
 
 @compiled

@@ -7,6 +7,9 @@ after the other then takes what it wants, if its motion over the tick and its st
 from what the others do at present; else the nearest of some fixed accelerations that does; else it brakes. The proof is
 in docs/avoidance.md.
 
+A quadrotor is led by a point ahead of it that obeys at once (`foresee`), and keeps its distances with the hull of this
+point, its stop point and what comes behind: while it brakes, this hull only shrinks, too.
+
 Vehicles or obstacles that are nearer than they should be must not come nearer still.
 
 Beside an obstacle that moves, the stop segment is that of the relative velocity: braking relative to it keeps it, and
@@ -27,8 +30,9 @@ from rigidfleet.kernel.avoidance import (
     TICKS,
 )
 from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
+from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.moving import (
     brake_beside,
     braking_beside,
@@ -41,14 +45,23 @@ from rigidfleet.kernel.moving import (
     stop_beside,
     way_to_rest,
 )
+from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import path_at
-from rigidfleet.kernel.segments import between_segments, from_obstacle, from_solid, least_along
+from rigidfleet.kernel.segments import (
+    between_hulls,
+    between_segments,
+    from_obstacle,
+    from_solid,
+    least_along,
+)
 
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
 #: distance, or this way [m].
 _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
 #: Shortfall of a distance from which a vehicle evades what moves as well as it can, and that counts as rounding [m].
 _LATE, _ROUNDING = 0.05, 1e-9
+
+_curve = inlined(thrust_of)
 
 
 # -- what a vehicle does -------------------------------------------------------------------------------
@@ -80,14 +93,15 @@ def predict(i, r, v, c, a, out):
     stop = stop_distance(end, i, a)
     for q in range(3):
         out[2, q] = out[1, q] + stop / max(end, 1e-12) * out[2, q]
-    return a.period * (speed + 0.5 * a.period * math.sqrt(rise)) + stop
+    return max(a.behind[i], a.period * (speed + 0.5 * a.period * math.sqrt(rise)) + stop)
 
 
 @compiled
 def brake(i, v, a, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,): by b, or to rest within the tick, with drag."""
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    size = min(a.b[i], speed * a.coast[i, 0] / a.coast[i, 1]) / max(speed, 1e-12)
+    most = a.b[i] * speed / max(speed + a.soft[i], 1e-12) if a.soft[i] > 0.0 else a.b[i]
+    size = min(most, speed * a.coast[i, 0] / a.coast[i, 1]) / max(speed, 1e-12)
     for q in range(3):
         out[q] = -size * v[q]
 
@@ -111,6 +125,8 @@ def keeps(i, v, j, s, floor, a):
     the nearest point of the chord.
     """
     mine, other, rise = a.trial, a.ways[j], a.rise[j]
+    if a.soft[i] + a.soft[j] > 0.0:
+        return between_hulls(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
     if between_segments(mine[1], mine[2], other[1], other[2]) < floor:
         return False
     x, y, z = mine[0, 0] - other[0, 0], mine[0, 1] - other[0, 1], mine[0, 2] - other[0, 2]
@@ -144,7 +160,8 @@ def clears(i, v, far, a):
         floor = a.walls[i, o]
         if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
-        bound, _, _ = from_obstacle(way[1], way[2], o, a.solids, floor, normal)
+        after = a.ways[i, 4] if a.soft[i] > 0.0 else way[1]
+        bound, _, _ = from_obstacle(after, way[2], o, a.solids, floor, normal)
         if bound < floor:
             return False
         bound, value, x = from_obstacle(way[0], way[1], o, a.solids, floor, normal)
@@ -171,19 +188,20 @@ def interaction_range(u, c, a):
     A barrier asks for nothing while rate h + B s/sqrt(2 B (L - D)) is above the greatest relative acceleration, twice
     that asked for, c [m/s^2]; s is at least -2 u.
     """
-    room = stop = strongest = lift = lag = 0.0
+    room = stop = strongest = lift = lag = behind = soft = 0.0
     weakest = math.inf
     for i in range(a.b.shape[0]):
         room, lag = max(room, a.room[i] + a.spare[i]), max(lag, a.lag[i])
+        behind, soft = max(behind, a.lead[i, 0] * u), max(soft, a.soft[i])
         stop, lift = max(stop, stop_distance(u, i, a)), max(lift, a.lift[i])
         weakest, strongest = min(weakest, a.b[i]), max(strongest, a.b[i])
     meet = 2.0 * (stop + a.period * (u + a.period * (lift + a.g)))
     barrier = 0.0
     if a.filtered:
-        half, B = a.rate * u + c, 2.0 * a.share * strongest
+        half, B = a.rate * (u + a.share * soft) + c, 2.0 * a.share * strongest
         root = (half + math.sqrt(half * half + 2.0 * a.rate * B * u)) / a.rate
         barrier = root * root / (4.0 * a.share * weakest) + 2.0 * u * lag
-    return 2.0 * room + max(meet, barrier)
+    return 2.0 * (room + behind) + max(meet, barrier)
 
 
 @compiled
@@ -348,7 +366,13 @@ def set_floors(t, r, v, lost, a):
             apart = math.sqrt(x * x + y * y + z * z) - a.far[i] - a.far[j]
             a.floor[e] = need
             if apart < need or apart - need < a.margin[PAIR, 0]:
-                found = between_segments(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
+                if a.soft[i] + a.soft[j] > 0.0:
+                    mine, other = a.ways[i], a.ways[j]
+                    found = between_hulls(
+                        mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal
+                    )
+                else:
+                    found = between_segments(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
                 a.floor[e] = min(need, found)
                 if i < j:
                     note(PAIR, found - a.room[i] - a.room[j], t, i, j, a)
@@ -362,7 +386,8 @@ def set_floors(t, r, v, lost, a):
             apart = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
             a.walls[i, o] = need
             if apart < need or apart - need < a.margin[OBSTACLE, 0]:
-                found, _, _ = from_obstacle(r[i], a.ways[i, 3], o, a.solids, need, a.normal)
+                way = a.ways[i]
+                found, _, _ = from_obstacle(way[4], way[3], o, a.solids, need, a.normal)
                 a.walls[i, o] = min(need, found)
                 note(OBSTACLE, found - a.reach[i], t, i, o, a)
 
@@ -380,11 +405,21 @@ def safe(i, r, v, far, a):
 
 
 @compiled
+def pushed(i, a):
+    """Whether barriers push vehicle i."""
+    push = a.known[2, i]
+    return push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0
+
+
+@compiled
 def propose(i, k, v, a, c):
     """Candidate k of vehicle i into c (3,): what it wants, fixed ones, then braking relative to its threat."""
     last = a.candidates.shape[0] + 1
     if k == 0:
         c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
+        if a.soft[i] > 0.0 and a.led[i] == 0 and not pushed(i, a):
+            for q in range(3):
+                c[q] = at_once(i, q, a)
     elif k < last:
         for q in range(3):
             c[q] = a.b[i] * a.candidates[k - 1, q]
@@ -451,9 +486,11 @@ def tally(kind, i, t, a):
 
 @compiled
 def command(i, state, a):
-    """Give vehicle i the force of the acceleration chosen for it."""
+    """Give vehicle i the force of the acceleration chosen for it; a quadrotor's follows it with a lag."""
+    c, u = a.chosen[i], a.given[i]
     for q in range(3):
-        state.force[i, q] = a.weight[i] * (a.chosen[i, q] + (a.g if q == 2 else 0.0))
+        u[q] = c[q] - a.ahead[i, q, 2] / (a.period + a.ahead[i, q, 2]) * (c[q] - u[q])
+        state.force[i, q] = a.weight[i] * (u[q] + (a.g if q == 2 else 0.0))
 
 
 @compiled
@@ -464,6 +501,50 @@ def want(i, state, a):
     share = min(1.0, a.lift[i] * a.weight[i] / max(size, 1e-300))
     for q in range(3):
         a.wanted[i, q] = share * force[q] / a.weight[i] - (a.g if q == 2 else 0.0)
+    if a.soft[i] > 0.0:
+        limit(i, a)
+        off = 0.0
+        for q in range(3):
+            a.asked[i, q] = a.wanted[i, q]
+            if not a.given[i, q] < math.inf:
+                a.given[i, q] = a.asked[i, q]
+            a.wanted[i, q] = at_once(i, q, a)
+        limit(i, a)
+        for q in range(3):
+            off = max(off, abs(a.wanted[i, q] - at_once(i, q, a)))
+        if off < _ROUNDING:
+            a.led[i] = 0
+
+
+@compiled
+def at_once(i, q, a):
+    """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
+    return a.given[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (a.asked[i, q] - a.given[i, q])
+
+
+@compiled
+def foresee(i, vehicles, state, r, v, a):
+    """Lead r and v (3,) of vehicle i to the point that obeys the guard at once; keeps the points behind it.
+
+    From a command u to the acceleration, attitude and motors act as u = a + a1 da/dt + a2 d2a/dt2 + ..., so that
+    x = r + a1 v + a2 a + ... has the second derivative u. Commands follow the guard's choice c with the lag s, so that
+    x + s dx/dt (and a part of a period) has the second derivative c.
+    """
+    T, S, away = state.work.T, state.S[i], 0.0
+    attitude_matrix(S[6:10], T)
+    lift, k = 0.0, vehicles.thrust[i]
+    for j in range(4):
+        lift += _curve(S[13 + j], k[0], k[1], k[2]) / a.weight[i]
+    for q in range(3):
+        a1, a2, late, u = a.ahead[i, q, 0], a.ahead[i, q, 1], a.ahead[i, q, 2], a.given[i, q]
+        rise = lift * T[2, q] - (a.g if q == 2 else 0.0)
+        a.ways[i, 4, q] = r[q]
+        a.ways[i, 5, q] = r[q] + a1 * v[q] + a2 * rise
+        v[q] += a1 * rise + a2 * lift * (S[11] * T[0, q] - S[10] * T[1, q])
+        r[q] = a.ways[i, 5, q] + late * (v[q] - 0.5 * a.period * u)
+        v[q] += late * u
+        away += (r[q] - a.ways[i, 4, q]) ** 2
+    a.behind[i] = math.sqrt(away)
 
 
 @compiled
@@ -478,8 +559,13 @@ def avoid(p, w, flight, state, a):
             r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
             v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
         want(i, state, a)
+        if a.soft[i] > 0.0:
+            foresee(i, flight.vehicles, state, r[i], v[i], a)
+        else:
+            for q in range(3):
+                a.ways[i, 4, q] = a.ways[i, 5, q] = r[i, q]
         state.layers[i] = 0
-    look(t, r, lost, a)
+    look(t, a.ways[:, 4], lost, a)
     led = False
     if a.flow:
         for i in range(n):
@@ -494,8 +580,7 @@ def avoid(p, w, flight, state, a):
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
-        push = a.known[2, i]
-        if changed and push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0:
+        if changed and pushed(i, a):
             state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue
@@ -510,6 +595,15 @@ def avoid(p, w, flight, state, a):
         if how > 1:
             tally(BRAKE, i, t, a)
             state.layers[i] |= ACTS[BRAKE]
-        if how > 0 or changed or led:
+        if a.soft[i] > 0.0:
+            if how + state.layers[i] + a.led[i] == 0:
+                for q in range(3):
+                    a.given[i, q] = a.asked[i, q]
+                continue
+            a.led[i] = 1
+            if state.layers[i] == 0:
+                state.layers[i] = ACTS[GUARD]
+            command(i, state, a)
+        elif how > 0 or changed or led:
             command(i, state, a)
     return 1

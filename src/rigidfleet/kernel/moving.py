@@ -192,7 +192,7 @@ def stop_beside(i, o, r, v, a):
     x, out = a.sight.track[o], a.shifted
     speed = 0.0
     for q in range(3):
-        out[0, q], out[3, q] = r[q] - x[q], v[q] - x[3 + q]
+        out[0, q], out[3, q] = r[q] - x[q] - a.lead[i, q] * x[3 + q], v[q] - x[3 + q]
         speed += out[3, q] * out[3, q]
     speed = math.sqrt(speed)
     stop = way_to_rest(speed, braking_beside(i, o, a), a.lag[i], a.period)
@@ -216,8 +216,8 @@ def room_beside(i, v, a):
         before = after = rise = 0.0
         for q in range(3):
             end = v[q] * E + way[3, q] * first - x[3 + q]
-            out[0, q] = way[0, q] - x[q]
-            out[1, q] = way[1, q] - x[q] - T * x[3 + q]
+            out[0, q] = way[0, q] - x[q] - a.lead[i, q] * x[3 + q]
+            out[1, q] = way[1, q] - x[q] - (a.lead[i, q] + T) * x[3 + q]
             out[2, q], out[3, q] = end, v[q] - x[3 + q]
             before += out[3, q] * out[3, q]
             after += end * end

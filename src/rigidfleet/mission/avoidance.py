@@ -17,6 +17,8 @@ from rigidfleet.typing import Floats
 _TABLE = "avoidance"
 #: Standard deviations of gusts and noise that are reckoned with.
 _SIGMAS = 3.0
+#: What tilts of 45 degrees, the bounds of rotors and drag make of the motion that quadrotors are expected to have [m].
+_LEFT_OUT = 0.02
 
 
 def braking(
@@ -73,12 +75,37 @@ def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | 
     return delay + np.array(own)
 
 
-def widening(given: Avoidance, disturbances: Disturbances | None) -> float:
-    """By how much each vehicle is taken to be larger [m]."""
-    if given.margin is not None:
-        return given.margin
+def foresight(
+    models: Sequence[VehicleModel], disturbances: Disturbances | None, gravity: float
+) -> Floats:
+    """Lags (N, 3, 3) of `Avoidance.ahead`; 0 of points.
+
+    Commands take the time in which the torques of hovering rotors turn the tilt from one limit to the other, so that
+    attitude follows them linearly, and no thrust is lost to torques.
+    """
     noise = None if disturbances is None else disturbances.noise
-    return 0.0 if noise is None else _SIGMAS * noise.position
+    delay = 0.0 if noise is None else noise.delay
+    found = np.zeros((len(models), 3, 3))
+    for i, model in enumerate(models):
+        if not model.point:
+            k_R, k_omega = model.attitude_gains
+            motor, turn = max(model.motor_time), k_omega / k_R
+            spin = model.mass * gravity * model.arm / math.sqrt(2.0) / max(model.inertia[:2])
+            smooth = max(2.0 * motor, 2.0 * math.radians(model.tilt_limit_deg) / (spin * turn))
+            found[i, :2] = delay + turn, 1.0 / k_R, smooth
+            found[i, 2] = delay + motor, 0.0, smooth + turn - motor
+    return found
+
+
+def widening(
+    given: Avoidance, models: Sequence[VehicleModel], disturbances: Disturbances | None
+) -> Floats:
+    """By how much each vehicle is taken to be larger (N,) [m]: by noise, and by what lags leave out."""
+    if given.margin is not None:
+        return np.full(len(models), given.margin)
+    noise = None if disturbances is None else disturbances.noise
+    own = np.array([0.0 if model.point else _LEFT_OUT for model in models])
+    return own + (0.0 if noise is None else _SIGMAS * noise.position)
 
 
 def unproved(

@@ -220,7 +220,8 @@ class Avoidance(Part):
     )
     margin: LengthOrZero | None = Field(
         None,
-        description="by which each agent is taken to be larger [m]; default: 0, or three times the noise of positions",
+        description="by which each agent is taken to be larger [m]; default: three times the noise of positions, and "
+        "0.02 m for a quadrotor",
     )
     rate: Annotated[float, Strict(), Field(gt=0, le=100)] = Field(
         3.0,

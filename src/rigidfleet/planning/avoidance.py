@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
-from rigidfleet.mission.avoidance import braking, reaction_times, widening
+from rigidfleet.mission.avoidance import braking, foresight, reaction_times, widening
 from rigidfleet.solids.records import joined
 
 
@@ -38,7 +38,11 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
         clearance=given.clearance,
         drag=drag,
         lag=reaction_times(models, mission.disturbances),
-        spare=widening(given, mission.disturbances),
+        ahead=foresight(models, mission.disturbances, mission.gravity),
+        tilt=np.array(
+            [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
+        ),
+        spare=widening(given, models, mission.disturbances),
         rate=given.rate,
         share=given.share,
         release=given.release,

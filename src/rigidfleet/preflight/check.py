@@ -16,6 +16,7 @@ from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_pha
 from rigidfleet.planning.timing import timed
 from rigidfleet.planning.vehicles import reserves, vehicle_lags
 from rigidfleet.preflight.assignment import assignment_remarks
+from rigidfleet.preflight.avoidance import braking_remarks
 from rigidfleet.preflight.findings import Preflight, Remark
 from rigidfleet.preflight.formations import SEARCHED, check_formations, formation_remarks
 from rigidfleet.preflight.gains import check_gains, gain_remarks
@@ -79,6 +80,7 @@ def check(
         *assignment_remarks(mission, found),
         *thrust_remarks(mission, found),
         *vehicle_remarks(mission, found),
+        *braking_remarks(mission),
         *disturbance_remarks(mission, found),
         *offset_remarks(mission, found),
         *obstacle_remarks(mission, found),

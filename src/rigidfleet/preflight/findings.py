@@ -40,8 +40,9 @@ class Remark:
     Attributes
     ----------
     level : "fails" or "note"
-    topic : formation, gains, margins, collision, downwash, assignment, thrust, disturbances, obstacle, geofence, speed,
-        acceleration, waypoint, attitude, tracking error, settle or paths (that were not checked, or are estimates)
+    topic : formation, gains, margins, collision, avoidance, downwash, assignment, thrust, disturbances, obstacle,
+        geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (that were not checked, or are
+        estimates)
     text : the problem or note in words
     """
 
