@@ -41,8 +41,8 @@ class Remark:
     ----------
     level : "fails" or "note"
     topic : formation, gains, margins, collision, avoidance, downwash, assignment, thrust, disturbances, obstacle,
-        geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (that were not checked, or are
-        estimates)
+        geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (not checked, or
+        estimated)
     text : the problem or note in words
     """
 
