@@ -129,18 +129,18 @@ def summarise(table: Table) -> Summary:
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
     by_value, worded = {}, _worded(table)
     for k, column in enumerate(table.sweep.columns):
-        if column.name not in worded:
-            continue
-        values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
-        if not all(map(is_number, values)):
-            words = np.array([str(value) for value in values])
+        if column.name in worded:
+            words = np.array([str(column.variation.value(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
                 word: rate(table.passed[words == word]) for word in dict.fromkeys(words.tolist())
             }
+    sweep = table.sweep
+    seeded = any(column.keys[-1] == "seed" for column in sweep.columns)
+    numbers = "varied" if seeded else sweep.header.random_numbers
     return Summary(
-        table.sweep.name,
-        table.sweep.mission.name,
-        table.sweep.runs,
+        sweep.name,
+        sweep.mission.name,
+        sweep.runs,
         len(table.run),
         rate(table.passed),
         failures(table),
@@ -148,14 +148,8 @@ def summarise(table: Table) -> Summary:
         percentiles,
         drivers(table),
         by_value,
-        _random_numbers(table),
+        numbers if sweep.random else "none",
     )
-
-
-def _random_numbers(table: Table) -> str:
-    seeded = any(column.keys[-1] == "seed" for column in table.sweep.columns)
-    word = "varied" if seeded else table.sweep.header.random_numbers
-    return word if table.sweep.random else "none"
 
 
 def failures(table: Table) -> dict[str, int]:
