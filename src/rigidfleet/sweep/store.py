@@ -20,6 +20,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from rigidfleet._common.files import unwritable
 from rigidfleet.errors import ResultError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
@@ -240,10 +241,7 @@ def _explained(path: Path) -> Generator[None]:
             " another folder."
         ) from error
     except OSError as error:
-        why = (error.strerror or str(error)).lower()
-        raise ResultError(
-            f"{path.parent}: cannot be written ({why}). Choose another folder by --out."
-        ) from error
+        raise unwritable(path.parent, error) from error
 
 
 def _difference(there: dict[str, str], identity: str) -> str:
