@@ -104,6 +104,26 @@ def write_file(path: Path, data: bytes) -> None:
         raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder, and those above it, if it does not exist.
+
+    Raises
+    ------
+    ResultError
+        The folder cannot be created.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+
+
+def unwritable(path: Path, error: OSError) -> ResultError:
+    """Error about a folder that cannot be written."""
+    why = (error.strerror or str(error)).lower()
+    return ResultError(f"{path}: cannot be written ({why}). Choose another folder by --out.")
+
+
 def why_not(error: OSError, done: str, path: Path) -> str:
     """Cause and remedy of a file that cannot be ``done`` ("read", "written")."""
     match error:

@@ -7,6 +7,12 @@ from collections.abc import Generator
 from contextlib import contextmanager
 
 
+def cores() -> int:
+    """Number of cores that this process may use."""
+    usable = getattr(os, "sched_getaffinity", None)
+    return len(usable(0)) if usable is not None else os.cpu_count() or 1
+
+
 @contextmanager
 def safe_path() -> Generator[None]:
     """Keep the current folder off the module path of Python processes that are started in this context."""

@@ -82,11 +82,8 @@ def main(tokens: Sequence[str] | None = None) -> int:
     try:
         with run.heeding_interrupts() if tokens is None else nullcontext():
             return app(tokens, console=console.out(), error_console=console.err()) or PASSED
-    except CycloptsError as error:
-        console.complain(_usage(error))
-        return BAD_INPUT
-    except RigidfleetError as error:
-        console.complain(error)
+    except (CycloptsError, RigidfleetError) as error:
+        console.complain(_usage(error) if isinstance(error, CycloptsError) else error)
         return BAD_INPUT
     except BrokenPipeError:
         console.hang_up(sys.stdout)
@@ -117,11 +114,9 @@ def main(tokens: Sequence[str] | None = None) -> int:
 def _own_fault(error: Exception) -> str:
     """Message for an unexpected error."""
     *_, at = traceback.extract_tb(error.__traceback__)
-    text = f"{type(error).__name__} in {Path(at.filename).name}, line {at.lineno}: {error}".rstrip(
-        ": "
-    )
+    text = f"{type(error).__name__} in {Path(at.filename).name}, line {at.lineno}: {error}"
     return (
-        f"{text}\n    this is a bug in rigidfleet: please report it with the input file"
+        f"{text.rstrip(': ')}\n    this is a bug in rigidfleet: please report it with the input file"
         " (python -X dev -m rigidfleet ... shows the traceback)"
     )
 

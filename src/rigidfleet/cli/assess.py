@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from rigidfleet.cli import console, drawing
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.outputs import Files, taken
+from rigidfleet.cli.outputs import Files, keep_existing
 from rigidfleet.errors import RigidfleetError
-
-if TYPE_CHECKING:
-    from rigidfleet.result import Result
 
 
 def assess(
@@ -55,7 +52,7 @@ def assess(
     json : bool
         Print the verdict as JSON.
     """
-    from rigidfleet._common.files import write_file
+    from rigidfleet._common.files import make_folder, write_file
     from rigidfleet.assessment import assess as judge
 
     if not files:
@@ -66,25 +63,34 @@ def assess(
         "mission": mission, "separation": separation, "limits": limits, "radius": radius, "ground": ground,
         "interpolation": interpolation,
     }  # fmt: skip
-    chosen = [f"--{key}" for key, value in given.items() if value is not None]
+    chosen = [key for key, value in given.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
         from rigidfleet.result import Result
 
         if chosen:
-            told = f"{chosen[0]}: no effect on a result, which has its own mission; remove it"
+            told = f"--{chosen[0]}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(told)
         result = Result.load(files[0])
     else:
-        result = _of_others(
-            files, mission, separation, limits or [], radius, ground, interpolation or "cubic"
-        )
+        from rigidfleet.foreign.files import read_trajectories
+        from rigidfleet.simulation.trajectories import of_curves
+
+        own = [key for key in ("separation", "radius", "ground", "limits") if key in chosen]
+        if mission is not None and own:
+            told = f"--{own[0]}: no effect with --mission, which has its own; remove one"
+            raise RigidfleetError(told)
+        read = read_trajectories(files, interpolation or "cubic")
+        result = of_curves(
+            read.curves, read.assumed, names=read.names, mission=mission, separation=separation,
+            limits=_limits(limits or []), radius=radius or 0.0, ground=ground, name=_name(files[0]),
+        )  # fmt: skip
+        result.statistics["notes"] = list(read.notes)
     verdict = judge(result)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
         made.try_out()
-        for path in (made.result, made.verdict, made.report, made.replay, *made.figures):
-            if path.exists() and not force:
-                raise taken(path)
+        written = made.result, made.verdict, made.report, made.replay, *made.figures
+        keep_existing(*written, force=force)
     if json:
         console.print_json(verdict.to_dict())
     else:
@@ -93,7 +99,7 @@ def assess(
         from rigidfleet.cli.report import write_report
         from rigidfleet.cli.run import drawings, list_files, write_figures, write_replay
 
-        made.make_folder()
+        make_folder(made.folder)
         with drawings(result, made.figures, None) as pictures:
             result.save(made.result)
             write_file(made.verdict, (verdict.json() + "\n").encode())
@@ -106,25 +112,14 @@ def assess(
     return PASSED if verdict.passed else FAILED
 
 
-def _of_others(
-    files: tuple[Path, ...],
-    mission: str | None,
-    separation: float | None,
-    limits: list[str],
-    radius: float | None,
-    ground: float | None,
-    interpolation: Literal["cubic", "linear"],
-) -> Result:
-    """The trajectories of files as a result.
+def _limits(limits: list[str]) -> dict[str, float]:
+    """Limits of the command line by key.
 
     Raises
     ------
     RigidfleetError
-        A file or a limit cannot be read, or an option has no effect.
+        One cannot be read.
     """
-    from rigidfleet.foreign.files import read_trajectories
-    from rigidfleet.simulation.trajectories import of_curves
-
     found: dict[str, float] = {}
     for told in limits:
         for part in told.split(","):
@@ -135,24 +130,7 @@ def _of_others(
                 equals = ""
             if not equals:
                 raise RigidfleetError(f"--limits {part}: give KEY=VALUE, such as speed=3")
-    if mission is not None:
-        own = {
-            "--separation": separation,
-            "--radius": radius,
-            "--ground": ground,
-            "--limits": found or None,
-        }
-        if unused := [key for key, value in own.items() if value is not None]:
-            raise RigidfleetError(
-                f"{unused[0]}: no effect with --mission, which has its own; remove one"
-            )
-    read = read_trajectories(files, interpolation)
-    result = of_curves(
-        read.curves, read.assumed, names=read.names, mission=mission, separation=separation, limits=found,
-        radius=radius or 0.0, ground=ground, name=_name(files[0]),
-    )  # fmt: skip
-    result.statistics["notes"] = list(read.notes)
-    return result
+    return found
 
 
 def _name(file: Path) -> str:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.errors import MissionError, ResultError
+from rigidfleet.cli.outputs import keep_existing
+from rigidfleet.errors import MissionError
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
@@ -54,10 +55,7 @@ def check(
     from rigidfleet.mission.files import digests
     from rigidfleet.planning.timing import spelled_out, timed
 
-    if expand is not None and expand.exists() and not force:
-        raise ResultError(
-            f"{expand}: already exists; use --force to overwrite or give another path."
-        )
+    keep_existing(expand, force=force, other="give another path")
     watch = console.CheckWatch(mission)
     try:
         with watch, watched_by(watch.update):

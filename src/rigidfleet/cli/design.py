@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import exact, parse_whole
 from rigidfleet.cli.codes import PASSED
+from rigidfleet.cli.outputs import keep_existing
 from rigidfleet.errors import RigidfleetError
 
 #: Maximum number of agents for which a design is compared with all pairs.
@@ -78,16 +79,14 @@ def design(
     from rigidfleet.formation.point_files import to_csv
     from rigidfleet.rigidity import design as designs
 
-    if out is not None and out.exists() and not force:
-        raise RigidfleetError(f"{out}: already exists; use --force to overwrite.")
+    keep_existing(out, force=force)
     try:
         name, (slots, colours) = points_of(shape, agents, size, spacing, font)
-        if edges == "none":
+        kinds: dict[str, Any] = {}
+        if edges is not None:
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
-            kinds = {}
-        elif edges is not None:
-            _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
-            kinds = {edges: designs.GRAPHS[edges](slots, REACH if reach is None else reach)}
+            if edges != "none":
+                kinds[edges] = designs.GRAPHS[edges](slots, REACH if reach is None else reach)
         else:
             if reach is not None:
                 raise ValueError("--reach has no effect without --edges neighbours; remove it")
@@ -177,12 +176,8 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ..
     cells = (f"{ends.index:.3g}", f"{ends.condition:.3g}", longest)
     data = {"edges": len(edges), "index": ends.index, "w": ends.w, "free": ends.free}
     data["condition"] = ends.condition if ends.w > 0 else None
-    return data | {"rigidity_class": rigidity_class}, (
-        f"{len(edges):,}",
-        rank,
-        *cells,
-        rigidity_class,
-    )
+    data["rigidity_class"] = rigidity_class
+    return data, (f"{len(edges):,}", rank, *cells, rigidity_class)
 
 
 def points_of(

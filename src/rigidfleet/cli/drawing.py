@@ -22,6 +22,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from threading import Thread
 
+from rigidfleet._common.processes import cores
 from rigidfleet.errors import RigidfleetError
 
 #: Contents of a figure's files by format, from its name and its formats; to be sent to other processes.
@@ -41,7 +42,7 @@ def at_once() -> int:
     """How many figures can be drawn at the same time."""
     if "fork" not in multiprocessing.get_all_start_methods():
         return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return cores()
 
 
 def check_width(width: float | None) -> None:

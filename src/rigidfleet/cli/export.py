@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.outputs import taken
+from rigidfleet.cli.outputs import keep_existing
 from rigidfleet.errors import ResultError, RigidfleetError
 
 #: Names of `rigidfleet.interchange.FORMATS`, whose module loads slowly.
@@ -68,8 +68,7 @@ def export(
     chosen = FORMATS[format]
     name = f"{result.stem}-{format}" if chosen.each else f"{result.stem}.{chosen.suffix}"
     path = out or result.parent / name  # a path such as "." has no name to change
-    if path.exists() and not force:
-        raise taken(path)
+    keep_existing(path, force=force)
     try:
         made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)
     except ValueError as error:

@@ -13,6 +13,7 @@ from rigidfleet.cli import console
 from rigidfleet.cli.arguments import exact, parse_number, parse_whole
 from rigidfleet.cli.check import facts
 from rigidfleet.cli.codes import PASSED
+from rigidfleet.cli.outputs import keep_existing
 from rigidfleet.errors import RigidfleetError
 
 
@@ -84,8 +85,7 @@ def new(
     if not file.name:
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
-    if file.exists() and not force:
-        raise RigidfleetError(f"{file}: already exists; use --force to overwrite.")
+    keep_existing(file, force=force, other="give another name")
     try:
         if show:
             text = _show(
@@ -125,15 +125,9 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
     from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
 
-    unused = [
-        f"--{key.replace('waypoints', 'to')}"
-        for key in ("shape", "size", "waypoints")
-        if key in asked
-    ]
-    if unused:
-        raise ValueError(
-            f"{' and '.join(unused)}: no effect on a show; use --formations and --spacing"
-        )
+    options = {"shape": "--shape", "size": "--size", "waypoints": "--to"}
+    if unused := " and ".join(option for key, option in options.items() if key in asked):
+        raise ValueError(f"{unused}: no effect on a show; use --formations and --spacing")
     agents, scenes = asked.pop("agents", None), []
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
@@ -150,14 +144,11 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
             name, points = points_of(word, count, spacing=spacing)
         except ValueError as error:
             raise ValueError(f"{word}: {error}") from None
-        folder = file.parent.resolve()
-        inside = path.suffix.lower() in _POINTS and path.resolve().is_relative_to(folder)
-        source = word
-        by_name = own is not None and inside and len(own.slots) == count
-        if own is not None and by_name and proximity.nearest(own.slots).min() >= spacing:
-            source, points = path.resolve().relative_to(folder).as_posix(), own
-        else:
-            by_name = False
+        folder, there = file.parent.resolve(), path.resolve()
+        source, by_name = word, False
+        whole = own is not None and len(own.slots) == count and there.is_relative_to(folder)
+        if own is not None and whole and proximity.nearest(own.slots).min() >= spacing:
+            source, points, by_name = there.relative_to(folder).as_posix(), own, True
         scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked

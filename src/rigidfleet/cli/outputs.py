@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 
+from rigidfleet._common.files import unwritable
 from rigidfleet.errors import ResultError
 
 
-@dataclass(frozen=True)
 class Files:
-    """Paths of the files of a flight."""
+    """Paths of the files of a flight.
 
-    folder: Path
-    name: str
+    Attributes
+    ----------
+    result, table : result, netCDF, and table of the samples, CSV; they have the name of the flight
+    verdict, report, replay : verdict, JSON; report and replay, HTML
+    """
 
-    @property
-    def result(self) -> Path:
-        """Result of the flight, netCDF."""
-        return self.folder / f"{self.name}.nc"
-
-    @property
-    def verdict(self) -> Path:
-        """Verdict, JSON."""
-        return self.folder / "verdict.json"
-
-    @property
-    def table(self) -> Path:
-        """Table of the samples, CSV."""
-        return self.folder / f"{self.name}.csv"
+    def __init__(self, folder: Path, name: str) -> None:
+        self.folder, self.name = folder, name
+        self.result, self.table = folder / f"{name}.nc", folder / f"{name}.csv"
+        self.verdict = folder / "verdict.json"
+        self.report, self.replay = folder / "report.html", folder / "replay.html"
 
     @property
     def figures(self) -> list[Path]:
@@ -42,16 +35,6 @@ class Files:
             for name in figure_names()
             for kind in FORMATS
         ]
-
-    @property
-    def report(self) -> Path:
-        """Report, HTML."""
-        return self.folder / "report.html"
-
-    @property
-    def replay(self) -> Path:
-        """Replay, HTML."""
-        return self.folder / "replay.html"
 
     @property
     def derived(self) -> list[Path]:
@@ -66,9 +49,7 @@ class Files:
         ResultError
             Files exist and must not be overwritten, or the folder cannot be written.
         """
-        there = [path for path in (self.result, *self.derived) if path.exists()]
-        if there and not replace:
-            raise taken(there[0])
+        keep_existing(self.result, *self.derived, force=replace)
         self.try_out()
 
     def try_out(self) -> None:
@@ -84,19 +65,6 @@ class Files:
             folder = folder.parent
         try:
             TemporaryFile(dir=folder).close()
-        except OSError as error:
-            raise unwritable(self.folder, error) from error
-
-    def make_folder(self) -> None:
-        """Create the folder if it does not exist.
-
-        Raises
-        ------
-        ResultError
-            The folder cannot be created.
-        """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise unwritable(self.folder, error) from error
 
@@ -127,14 +95,16 @@ class Files:
             path.unlink(missing_ok=True)
 
 
-def taken(path: Path) -> ResultError:
-    """Error about a file that exists and must not be overwritten."""
-    return ResultError(
-        f"{path}: already exists; use --force to overwrite or --out to choose another place."
-    )
+def keep_existing(
+    *paths: Path | None, force: bool, other: str = "--out to choose another place"
+) -> None:
+    """Refuse to overwrite files that exist, except with ``force``; ``other`` is the other remedy.
 
-
-def unwritable(path: Path, error: OSError) -> ResultError:
-    """Error about a folder that cannot be written."""
-    why = (error.strerror or str(error)).lower()
-    return ResultError(f"{path}: cannot be written ({why}). Choose another folder by --out.")
+    Raises
+    ------
+    ResultError
+        One of them exists.
+    """
+    for path in paths:
+        if path is not None and path.exists() and not force:
+            raise ResultError(f"{path}: already exists; use --force to overwrite or {other}.")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rigidfleet.cli import console, drawing
-from rigidfleet.cli.outputs import Files, taken
+from rigidfleet.cli.outputs import Files, keep_existing
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
@@ -57,7 +57,7 @@ def report(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    from rigidfleet._common.files import write_file
+    from rigidfleet._common.files import make_folder, write_file
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 
@@ -68,15 +68,14 @@ def report(
     records = [Result.load(path) for path in paths]
     if others:
         page = (out or Path()) / "comparison.html"
-        if page.exists() and not force:
-            raise taken(page)
+        keep_existing(page, force=force)
     files = Files(out or (Path() if others else result.parent), records[0].mission.name)
     files.try_out()
     verdicts = [assess(record) for record in records]
     if json:
         found = [verdict.to_dict() for verdict in verdicts]
         console.print_json(found if others else found[0])
-    files.make_folder()
+    make_folder(files.folder)
     if others:
         labels = labels_of(paths, records)
         if not (json or quiet):
@@ -124,8 +123,7 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
 
     record = Result.load(result)
     page = out or Files(result.parent, record.mission.name).replay
-    if page.exists() and not force:
-        raise taken(page)
+    keep_existing(page, force=force)
     write_replay(record, page)
     console.out().print(f"Replay   {page}", soft_wrap=True)
     return PASSED

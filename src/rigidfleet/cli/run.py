@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
@@ -89,14 +89,13 @@ def run(
     asked = load_mission(mission)
     files = Files(out or Path("flights", asked.name), asked.name)
     files.claim(replace=force)
-    watch = None if quiet else console.FlightWatch()
-    with watch or nullcontext():
-        result, interrupted = fly(asked, watch)
+    with watching(None if quiet else console.FlightWatch()) as progress:
+        result, interrupted = fly(asked, progress)
 
-    from rigidfleet._common.files import write_file
+    from rigidfleet._common.files import make_folder, write_file
     from rigidfleet.assessment import assess
 
-    files.make_folder()
+    make_folder(files.folder)
     drawn = [] if interrupted or no_figures else files.figures
     with drawings(result, drawn, format, titles=not no_titles, width=width) as pictures:
         result.save(files.result)
@@ -112,11 +111,8 @@ def run(
             console.print_exactly(verdict.json() + "\n")
         elif not quiet:
             console.out().print(verdict)
-        what = (
-            "the flight so far is saved, marked incomplete,"
-            if interrupted
-            else "the complete flight is saved"
-        )
+        so_far = "the flight so far is saved, marked incomplete,"
+        what = so_far if interrupted else "the complete flight is saved"
         if not interrupted:
             try:
                 if replay:
@@ -166,19 +162,27 @@ def missions(
     return PASSED
 
 
-def fly(mission: Mission, watch: console.FlightWatch | None) -> tuple[Result, bool]:
+def fly(mission: Mission, progress: Callable[..., None] | None) -> tuple[Result, bool]:
     """Fly a mission; return its result and whether the flight was interrupted."""
-    from rigidfleet.kernel.engine.native import is_compiled
-
-    if watch is not None and not is_compiled():
-        watch.compiling()
     from rigidfleet.simulation.flight import FlightInterrupted, simulate
 
     try:
-        with heeding_interrupts():
-            return simulate(mission, progress=None if watch is None else watch.update), False
+        return simulate(mission, progress=progress), False
     except FlightInterrupted as stop:
         return stop.result, True
+
+
+@contextmanager
+def watching(
+    watch: console.FlightWatch | console.SweepWatch | None,
+) -> Generator[Callable[..., None] | None]:
+    """Show what is computed in this context, and heed interrupts; what is entered receives the progress."""
+    from rigidfleet.kernel.engine.native import is_compiled
+
+    with watch or nullcontext(), heeding_interrupts():
+        if watch is not None and not is_compiled():
+            watch.compiling()
+        yield None if watch is None else watch.update
 
 
 @contextmanager

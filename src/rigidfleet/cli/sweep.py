@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -13,7 +12,7 @@ from cyclopts import Parameter
 from rigidfleet.cli import console, drawing
 from rigidfleet.cli.arguments import check_workers, exact
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
-from rigidfleet.cli.run import DRAWN, Format, heeding_interrupts, write_figures
+from rigidfleet.cli.run import DRAWN, Format, watching, write_figures
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
@@ -99,7 +98,6 @@ def sweep(
     if not no_figures:
         drawing.prepare("rigidfleet.sweep.figures")
     from rigidfleet._common.files import write_file
-    from rigidfleet.kernel.engine.native import is_compiled
     from rigidfleet.sweep import figures, fly, store
     from rigidfleet.sweep.record import UNJUDGED, called
     from rigidfleet.sweep.summary import summarise
@@ -113,12 +111,8 @@ def sweep(
             "controller": controller, "rate": rate,
         }  # fmt: skip
         asked, folder = _asked(mission, vary or [], runs, out, keys)
-        watch = None if quiet else console.SweepWatch()
         try:
-            with watch or nullcontext(), heeding_interrupts():
-                if watch is not None and not is_compiled():
-                    watch.compiling()
-                progress = None if watch is None else watch.update
+            with watching(None if quiet else console.SweepWatch()) as progress:
                 table = fly(
                     asked,
                     folder,

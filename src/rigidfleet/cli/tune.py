@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,7 +11,7 @@ from cyclopts import Parameter
 from rigidfleet.cli import console
 from rigidfleet.cli.arguments import check_workers, exact
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
-from rigidfleet.cli.run import heeding_interrupts
+from rigidfleet.cli.run import watching
 from rigidfleet.errors import RigidfleetError
 
 
@@ -69,22 +68,18 @@ def tune(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    from rigidfleet.kernel.engine.native import is_compiled
     from rigidfleet.mission import load_mission
     from rigidfleet.tuning import tune as study
 
     check_workers(workers)
     found = load_mission(mission)
     folder = out or Path("tunes", found.name)
-    watch = None if quiet else console.SweepWatch()
     try:
-        with watch or nullcontext(), heeding_interrupts():
-            if watch is not None and not is_compiled():
-                watch.compiling()
+        with watching(None if quiet else console.SweepWatch()) as progress:
             tuned = study(
                 found, folder, objective=objective, budget=budget, seeds=seeds, validation=validation,
                 seed=seed, margin_share=margin_share, assume=_assumed(assume or []),
-                workers=workers, replace=force, progress=None if watch is None else watch.update,
+                workers=workers, replace=force, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
         words = f"Interrupted: finished flights are saved in {folder}"

@@ -245,8 +245,7 @@ def _with_rotors(result: Result) -> list[list[str]]:
 
 def _versions(result: Result) -> list[tuple[str, str]]:
     known = result.statistics
-    found = [(name, version) for name, version in result.versions.items()]
-    found.append(("platform", result.platform))
+    found = [*result.versions.items(), ("platform", result.platform)]
     for name, key, form in (
         ("integrator steps", "steps", "{}"),
         ("rejected steps", "rejected", "{}"),
@@ -280,9 +279,9 @@ def _safety_table(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> lis
 def _safety_cell(row: Safety | None) -> dict[str, Any]:
     if row is None:
         return {"state": "free", "worst": "", "nothing": "flown by points"}
-    margin, used = row.margin, row.used
+    margin, used, worst = row.margin, row.used, row.worst
     state = "free" if row.limit is None else "ok" if row.passed else "failed"
-    left, alone = "", ", at samples" if row.worst and row.worst.at_samples else ""
+    left = ""
     if margin is not None:
         left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
     nothing = {
@@ -294,13 +293,13 @@ def _safety_cell(row: Safety | None) -> dict[str, Any]:
         "state": state,
         "sign": "≤" if not row.at_least else "≥" if row.limit else ">",
         "limit": "" if row.limit is None else value(row.limit, row.unit),
-        "worst": "" if row.worst is None else value(row.worst.value, row.unit),
-        "nothing": nothing.get(row.quantity, "nothing to measure") if row.worst is None else "",
+        "worst": "" if worst is None else value(worst.value, row.unit),
+        "nothing": nothing.get(row.quantity, "nothing to measure") if worst is None else "",
         "left": left,
         "used": None if used is None else min(max(used, 0.0), 1.0),
-        "when": "" if row.worst is None else f"{row.worst.when:.2f} s{alone}",
-        "who": "" if row.worst is None else row.worst.who,
-        "phase": "" if row.worst is None else row.worst.phase,
+        "when": "" if worst is None else f"{worst.when:.2f} s" + ", at samples" * worst.at_samples,
+        "who": "" if worst is None else worst.who,
+        "phase": "" if worst is None else worst.phase,
     }
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet.plotting import contents
 from rigidfleet.plotting import style as st
 from rigidfleet.reporting import gains
 
@@ -143,6 +143,4 @@ def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
 
 
 def _svg(fig: Figure) -> bytes:
-    buffer = io.BytesIO()
-    fig.savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()
+    return contents(fig, ["svg"])["svg"]

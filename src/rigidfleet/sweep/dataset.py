@@ -38,13 +38,12 @@ def load(folder: str | Path) -> xarray.Dataset:
         unit, text = explained(sweep, column)
         values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
         variables[column.name] = ("run", values, {"units": unit, "long_name": text})
-    variables["passed"] = (
-        "run",
-        table.passed,
-        {"long_name": "whether the flight passed its verdict"},
-    )
-    variables["reason"] = ("run", table.reason.astype(str), {"long_name": "checks that failed"})
-    variables["detail"] = ("run", table.detail.astype(str), {"long_name": "first failure in words"})
+    for name, values, text in (
+        ("passed", table.passed, "whether the flight passed its verdict"),
+        ("reason", table.reason.astype(str), "checks that failed"),
+        ("detail", table.detail.astype(str), "first failure in words"),
+    ):
+        variables[name] = ("run", values, {"long_name": text})
     for name, metric in METRICS.items():
         about = {"units": metric.unit, "long_name": metric.text}
         variables[name] = ("run", table.metrics[name], about)

@@ -31,7 +31,6 @@ from rigidfleet.mission.values import Part
 from rigidfleet.sweep import controllers, keypaths
 from rigidfleet.sweep.variation import (
     KINDS,
-    Drawn,
     Gridded,
     Variation,
     WrongLine,
@@ -278,7 +277,6 @@ class Sweep:
             point, places[axis] = divmod(point, size)
         for k, column in reversed([*enumerate(self.columns)]):
             if column.grid is None:
-                assert isinstance(column.variation, Drawn)
                 found.append(column.variation.quantile(fractions.pop()))
             else:
                 found.append(column.grid[places[_axis(column, k)]])
@@ -364,18 +362,11 @@ def apply(
     document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
 ) -> None:
     """Apply a value of a column to a document; all numbers at its place change alike."""
-    integral = all(
-        isinstance(x, int) for x in keypaths.numbers(keypaths.look_up(whole, column.keys))
-    )
+    there = keypaths.numbers(keypaths.look_up(whole, column.keys))
+    integral = all(isinstance(x, int) for x in there)
 
     def changed(there: Any) -> Any:
-        match column.variation.change:
-            case "add":
-                new = there + value
-            case "scale":
-                new = there * value
-            case _:
-                new = value
+        new = column.variation.changed(there, value)
         return round(new) if integral and math.isfinite(new) else new
 
     def replaced(there: Any) -> Any:
@@ -434,11 +425,8 @@ def _checked(
         collector.add(("rate",), "is that of a controller", "give a controller, or remove rate")
     _same_length(collector, variations)
     if "vary" not in data or data["vary"] == []:
-        collector.add(
-            ("vary",),
-            "nothing varies",
-            'for example, give --vary "agents.mass.* *= normal(1, 0.05)"',
-        )
+        remedy = 'for example, give --vary "agents.mass.* *= normal(1, 0.05)"'
+        collector.add(("vary",), "nothing varies", remedy)
     gridded = any(isinstance(v, Gridded) for v in variations)
     if "runs" not in data and variations and not gridded:
         collector.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
@@ -452,13 +440,10 @@ def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | N
     before = len(collector.findings)
     model = kind(collector, entry, ("vary", k), KINDS)
     found = None if model is None else collector.validate(model, entry, ("vary", k))
-    if found is None or len(collector.findings) > before:
-        return None
-    if (problem := found.wrong()) is not None:
+    if found is not None and len(collector.findings) == before and (problem := found.wrong()):
         key, *words = problem
         collector.add(("vary", k, key), *words, getattr(found, key))
-        return None
-    return found
+    return found if len(collector.findings) == before else None
 
 
 def _fits(
@@ -495,10 +480,8 @@ def _fits(
         table = next((x for x in leaves if isinstance(x, dict)), None)
         words = [x for x in leaves if not is_number(x)]
         if table is not None:
-            problem, remedy = (
-                "is a table",
-                f"continue the path with one of its keys: {', '.join(table)}",
-            )
+            problem = "is a table"
+            remedy = f"continue the path with one of its keys: {', '.join(table)}"
         elif absent and v.change != "set":
             problem = f"the mission has no value to {v.change} to"
             remedy = "set the value by =, or write one in the mission"
@@ -537,9 +520,7 @@ def _taken(
     document = mission.to_dict()
     for _, column in lacked:
         v = column.variation
-        value = (
-            v.quantile(0.5) if isinstance(v, Drawn) else v.grid[0] if isinstance(v, Gridded) else 0
-        )
+        value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
         apply(document, whole, column, value)
     try:
         Mission.from_dict(document)

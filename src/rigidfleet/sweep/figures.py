@@ -284,9 +284,8 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     fig.colorbar(image, ax=ax, label=unit, pad=0.02)
     ax.grid(visible=False)
     ax.set(xlabel=_axis_label(table, over[0]), ylabel=_axis_label(table, over[1]))
-    for axis, scale, name in (
-        (ax.xaxis, ax.set_xscale, over[0]),
-        (ax.yaxis, ax.set_yscale, over[1]),
+    for axis, scale, name in zip(
+        (ax.xaxis, ax.yaxis), (ax.set_xscale, ax.set_yscale), over, strict=True
     ):
         distinct = np.unique(numbers[name])
         if len(distinct) <= _VALUES:
@@ -301,10 +300,8 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
 
 
 def _head(fig: Figure, table: Table, title: str) -> None:
-    n = len(table.run)
-    words = f"{table.sweep.name}: {n} runs" if table.complete else (
-        f"{table.sweep.name}: {n} of {table.sweep.runs} runs"
-    )  # fmt: skip
+    of = "" if table.complete else f" of {table.sweep.runs}"
+    words = f"{table.sweep.name}: {len(table.run)}{of} runs"
     st.heading(fig, title, words, st.GREY if table.complete else st.ALERT)
 
 
@@ -378,10 +375,8 @@ def _ticks(ax: Axes, scale: str) -> None:
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     if scale == "log":
-        ax.xaxis.set_major_locator(LogLocator(numticks=4))
         ax.minorticks_off()
-    else:
-        ax.xaxis.set_major_locator(MaxNLocator(3))
+    ax.xaxis.set_major_locator(LogLocator(numticks=4) if scale == "log" else MaxNLocator(3))
     ax.yaxis.set_major_locator(MaxNLocator(3, integer=True))
 
 
@@ -404,8 +399,7 @@ def _cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
     """Edges of cells along an axis, and the cell of each run. Few distinct values have a cell each."""
     distinct = np.unique(x)
     if len(distinct) <= _VALUES:
-        edges = np.arange(len(distinct) + 1, dtype=np.float64) - 0.5
-        return np.asarray(edges, dtype=np.float64), np.searchsorted(distinct, x)
+        return np.arange(len(distinct) + 1.0) - 0.5, np.searchsorted(distinct, x)
     space = np.geomspace if scale == "log" else np.linspace
     edges = space(distinct[0], distinct[-1], _CELLS + 1)
     return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _CELLS - 1)
@@ -421,8 +415,7 @@ def _running(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         parts = [y[x == v] for v in distinct]
         centres = distinct
     else:
-        order = np.argsort(x)
-        stretches = np.array_split(order, min(_ENVELOPE, max(1, len(x) // 5)))
+        stretches = np.array_split(np.argsort(x), min(_ENVELOPE, max(1, len(x) // 5)))
         parts = [y[s] for s in stretches]
         centres = np.array([np.median(x[s]) for s in stretches])
     low, middle, high = np.array([np.percentile(part, (5, 50, 95)) for part in parts]).T

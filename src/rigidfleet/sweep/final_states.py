@@ -76,22 +76,14 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
     """Start positions and velocities (B, N, 3) [m, m/s] of runs with given values of the columns (B, D)."""
     agents, count = sweep.mission.agents, len(values)
-    found = {
-        "position": np.tile(np.array(agents.position, dtype=float), (count, 1, 1)),
-        "velocity": np.tile(np.array(agents.velocity, dtype=float), (count, 1, 1)),
-    }
+    own = {"position": agents.position, "velocity": agents.velocity}
+    found = {name: np.tile(np.array(x, dtype=float), (count, 1, 1)) for name, x in own.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # `_refused` finds them
         for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
             _, name, *inner = column.keys
             place = found[str(name)][(slice(None), *map(int, inner))]
             by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
-            match column.variation.change:
-                case "add":
-                    place += by
-                case "scale":
-                    place *= by
-                case _:
-                    place[:] = by
+            place[:] = column.variation.changed(place, by)
     return found["position"], found["velocity"]
 
 

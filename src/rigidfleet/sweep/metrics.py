@@ -106,28 +106,17 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
         found[f"waypoint_{name}"] = _greatest(misses)
-    checked = {f.check: f.worst for f in verdict.checks if f.worst is not None}
     worst = {name: extreme.value for name, extreme in verdict.worst.items()}
-    worst |= {
-        name: checked[name]
-        for name in ("separation_below", "geofence", "thrust", *DIRECTIONS)
-        if name in checked
-    }
-    worst |= _of_rotors(verdict)
+    for f in verdict.checks:
+        if f.worst is None:
+            continue
+        if f.check in ("separation_below", "geofence", "thrust", "tilt", *DIRECTIONS):
+            worst[f.check] = f.worst
+        elif f.check == "rotor_force" and f.limit is not None:
+            worst["rotor_share"] = f.worst / f.limit
+        elif f.check == "saturation":
+            worst["saturation"] = f.worst / 100.0
     return {name: float((worst | found).get(name, math.nan)) for name in METRICS}
-
-
-def _of_rotors(verdict: Verdict) -> dict[str, float]:
-    """What the checks of vehicles with rotors found; nothing of points."""
-    found = {f.check: (f.worst, f.limit) for f in verdict.checks if f.worst is not None}
-    if "rotor_force" not in found:
-        return {}
-    force, limit = found["rotor_force"]
-    assert limit is not None
-    shares = {"rotor_share": force / limit, "tilt": found["tilt"][0]}
-    if "saturation" in found:
-        shares["saturation"] = found["saturation"][0] / 100.0
-    return shares
 
 
 def _greatest(values: Iterable[float | None]) -> float:

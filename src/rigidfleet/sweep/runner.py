@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
@@ -13,6 +12,7 @@ from time import perf_counter
 
 import numpy as np
 
+from rigidfleet._common.processes import cores
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
@@ -107,7 +107,10 @@ def fly(
                 except BrokenExecutor as error:
                     deaths = 1 if flight.flown > before else deaths + 1
                     if deaths >= _DEATHS:
-                        raise _dying() from error
+                        raise RigidfleetError(
+                            "the workers keep dying. Finished runs are saved. If memory is short, use fewer --workers;"
+                            " in a script, check for a missing `if __name__ == '__main__':`."
+                        ) from error
     return read(folder)
 
 
@@ -172,21 +175,6 @@ class _Sweeping:
     def report(self, workers: int) -> None:
         """Tell the progress."""
         if self.progress is not None:
-            wall = perf_counter() - self.begun
-            done = int(self.there.sum())
-            self.progress(
-                SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, workers)
-            )
-
-
-def cores() -> int:
-    """Number of cores that this process may use."""
-    usable = getattr(os, "sched_getaffinity", None)
-    return len(usable(0)) if usable is not None else os.cpu_count() or 1
-
-
-def _dying() -> RigidfleetError:
-    return RigidfleetError(
-        "the workers keep dying. Finished runs are saved. If memory is short, use fewer --workers; in a script,"
-        " check for a missing `if __name__ == '__main__':`."
-    )
+            done, wall = int(self.there.sum()), perf_counter() - self.begun
+            now = SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, workers)
+            self.progress(now)

@@ -12,15 +12,15 @@ import math
 import shutil
 import sqlite3
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rigidfleet._common.files import unwritable
 from rigidfleet.errors import ResultError
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
@@ -35,6 +35,7 @@ _FORMAT = 3
 #: Space on a disk that SQLite needs to work, and reports as errors of all kinds if it has less [bytes].
 _ROOM = 1 << 20
 _COLUMNS = ("passed", "reason", "detail", "wall", "codes", *METRICS)
+_KINDS = {"passed": "INTEGER", "reason": "TEXT", "detail": "TEXT", "codes": "BLOB"}
 #: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")
 
@@ -80,35 +81,23 @@ class Store:
 
     def __init__(self, folder: Path, sweep: Sweep, *, replace: bool = False) -> None:
         self.path = folder / FILE
-        with _explained(self.path):
+        with _explained(self.path), ExitStack() as opened:
             folder.mkdir(parents=True, exist_ok=True)
-            self.lock = sqlite3.connect(folder / _LOCK, timeout=0.0, isolation_level=None)
-            try:
-                self.lock.execute("BEGIN EXCLUSIVE")
-                if replace:
-                    for end in ("-wal", "-shm", ""):
-                        self.path.with_name(FILE + end).unlink(missing_ok=True)
-                self.db = sqlite3.connect(self.path, isolation_level=None)
-                try:
-                    self._open(sweep)
-                except BaseException:
-                    self.db.close()
-                    raise
-            except BaseException:
-                self.lock.close()
-                raise
+            lock = sqlite3.connect(folder / _LOCK, timeout=0.0, isolation_level=None)
+            opened.enter_context(closing(lock)).execute("BEGIN EXCLUSIVE")
+            if replace:
+                for end in ("-wal", "-shm", ""):
+                    self.path.with_name(FILE + end).unlink(missing_ok=True)
+            self.db = sqlite3.connect(self.path, isolation_level=None)
+            opened.enter_context(closing(self.db))
+            self._open(sweep)
+            self._close = opened.pop_all().close
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        at: TracebackType | None,
-    ) -> None:
-        self.db.close()
-        self.lock.close()
+    def __exit__(self, *_: object) -> None:
+        self._close()
 
     def add(self, rows: Iterable[RunRecord]) -> None:
         """Store records, all of them or none. A record replaces an earlier one of the same run."""
@@ -121,7 +110,8 @@ class Store:
             for row in rows
         ]  # fmt: skip
         marks = ", ".join("?" * (len(_COLUMNS) + 1))
-        with _explained(self.path), self._transaction():
+        with _explained(self.path), self.db:
+            self.db.execute("BEGIN IMMEDIATE")
             self.db.executemany(f"INSERT OR REPLACE INTO runs VALUES ({marks})", entries)
 
     def there(self) -> Bools:
@@ -137,33 +127,24 @@ class Store:
         self.db.execute("PRAGMA journal_mode = WAL")
         self.db.execute("PRAGMA synchronous = NORMAL")
         identity = json.dumps(sweep.identity, ensure_ascii=False, sort_keys=True)
-        with self._transaction():
+        with self.db:
+            self.db.execute("BEGIN IMMEDIATE")
             _readable(self.db, self.path.parent)
             self.db.execute(f"PRAGMA user_version = {_FORMAT}")
             self.db.execute("CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT)")
-            self.db.execute(f"CREATE TABLE IF NOT EXISTS runs ({_schema()})")
+            columns = ", ".join(f'"{name}" {_KINDS.get(name, "REAL")}' for name in _COLUMNS)
+            schema = f"run INTEGER PRIMARY KEY, {columns}"
+            self.db.execute(f"CREATE TABLE IF NOT EXISTS runs ({schema})")
             there = dict(self.db.execute("SELECT key, value FROM sweep"))
             if there and there.get("identity") != identity:
                 raise ResultError(f"{self.path.parent}: {_difference(there, identity)}")
-            if there and json.loads(there["sweep"])["runs"] > sweep.runs:
-                n = json.loads(there["sweep"])["runs"]
+            if there and (n := json.loads(there["sweep"])["runs"]) > sweep.runs:
                 raise ResultError(
                     f"{self.path.parent}: has this sweep with {n} runs, more than {sweep.runs}. Use --runs {n} or more,"
                     " --force to overwrite, or --out to choose another folder."
                 )
             entries = {"identity": identity, "sweep": sweep.json()}
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
-
-    @contextmanager
-    def _transaction(self) -> Generator[None]:
-        self.db.execute("BEGIN IMMEDIATE")
-        try:
-            yield
-            self.db.execute("COMMIT")
-        except BaseException:
-            if self.db.in_transaction:  # SQLite has rolled back where the disk is full
-                self.db.execute("ROLLBACK")
-            raise
 
 
 def is_store(folder: Path) -> bool:
@@ -217,13 +198,9 @@ def _reading(folder: Path) -> Generator[sqlite3.Connection]:
     path = folder / FILE
     if not path.is_file():
         raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
-    with _explained(path):
-        db = sqlite3.connect(path)
-        try:
-            _readable(db, folder)
-            yield db
-        finally:
-            db.close()
+    with _explained(path), closing(sqlite3.connect(path)) as db:
+        _readable(db, folder)
+        yield db
 
 
 def _readable(db: sqlite3.Connection, folder: Path) -> None:
@@ -264,16 +241,7 @@ def _explained(path: Path) -> Generator[None]:
             " another folder."
         ) from error
     except OSError as error:
-        why = (error.strerror or str(error)).lower()
-        raise ResultError(
-            f"{path.parent}: cannot be written ({why}). Choose another folder by --out."
-        ) from error
-
-
-def _schema() -> str:
-    kinds = {"passed": "INTEGER", "reason": "TEXT", "detail": "TEXT", "codes": "BLOB"}
-    columns = (f'"{name}" {kinds.get(name, "REAL")}' for name in _COLUMNS)
-    return f"run INTEGER PRIMARY KEY, {', '.join(columns)}"
+        raise unwritable(path.parent, error) from error
 
 
 def _difference(there: dict[str, str], identity: str) -> str:

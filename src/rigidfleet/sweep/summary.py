@@ -129,18 +129,18 @@ def summarise(table: Table) -> Summary:
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
     by_value, worded = {}, _worded(table)
     for k, column in enumerate(table.sweep.columns):
-        if column.name not in worded:
-            continue
-        values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
-        if not all(map(is_number, values)):
-            words = np.array([str(value) for value in values])
+        if column.name in worded:
+            words = np.array([str(column.variation.value(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
                 word: rate(table.passed[words == word]) for word in dict.fromkeys(words.tolist())
             }
+    sweep = table.sweep
+    seeded = any(column.keys[-1] == "seed" for column in sweep.columns)
+    numbers = "varied" if seeded else sweep.header.random_numbers
     return Summary(
-        table.sweep.name,
-        table.sweep.mission.name,
-        table.sweep.runs,
+        sweep.name,
+        sweep.mission.name,
+        sweep.runs,
         len(table.run),
         rate(table.passed),
         failures(table),
@@ -148,14 +148,8 @@ def summarise(table: Table) -> Summary:
         percentiles,
         drivers(table),
         by_value,
-        _random_numbers(table),
+        numbers if sweep.random else "none",
     )
-
-
-def _random_numbers(table: Table) -> str:
-    seeded = any(column.keys[-1] == "seed" for column in table.sweep.columns)
-    word = "varied" if seeded else table.sweep.header.random_numbers
-    return word if table.sweep.random else "none"
 
 
 def failures(table: Table) -> dict[str, int]:
@@ -300,7 +294,7 @@ def _short(x: float) -> str:
     return f"{x:.0f}" if size >= 999.5 else f"{x:.3g}"
 
 
-def _grid(*columns: str, words: Sequence[str] = (), space: int = 1) -> Grid:
+def grid(*columns: str, words: Sequence[str] = (), space: int = 1) -> Grid:
     """An empty table. If it is too wide, its first column and the columns in ``words`` are wrapped, never numbers."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table as Grid
@@ -323,7 +317,7 @@ class _Percentiles:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         unbound = options.update_width(_UNBOUND)
         for space, shown in _CHOICES:
-            table = _grid("metric", "unit", *(_HEADS[p] for p in shown), space=space)
+            table = grid("metric", "unit", *(_HEADS[p] for p in shown), space=space)
             for name, values in self.summary.percentiles.items():
                 cells = (_short(x) for p, x in zip(PERCENTILES, values, strict=True) if p in shown)
                 table.add_row(name, readable(METRICS[name].unit), *cells)
@@ -340,7 +334,7 @@ def _rendered(summary: Summary) -> RenderableType:
     head = Text.assemble((summary.name, "bold"), f"  {summary.flown} of {summary.runs} runs")
     shown: list[RenderableType] = [head, _Percentiles(summary)]
     if summary.reasons:
-        reasons = _grid("failed check", "runs", "of all", "for example", words=("for example",))
+        reasons = grid("failed check", "runs", "of all", "for example", words=("for example",))
         for reason, count in summary.reasons.items():
             example = summary.examples[reason]
             words = Text(f"run {example.run}{': ' if example.detail else ''}{example.detail}")
@@ -349,7 +343,7 @@ def _rendered(summary: Summary) -> RenderableType:
     strong = [d for d in summary.drivers if d.adjusted < _CHANCE]
     failing = [d for d in strong if d.outcome == "success"]
     if strong:
-        rank = _grid("varied number", "outcome", "rank correlation")
+        rank = grid("varied number", "outcome", "rank correlation")
         for d in (failing + [d for d in strong if d not in failing])[:_SHOWN]:
             rank.add_row(d.varied, d.outcome, f"{d.correlation:+.2f}")
         shown.append(rank)
@@ -362,7 +356,7 @@ def _rendered(summary: Summary) -> RenderableType:
             Text(f"Random numbers: {words.get(summary.random_numbers, 'by varied seeds')}.")
         )
     for name, rates in summary.by_value.items():
-        values = _grid(name, "passed", "95 % interval")
+        values = grid(name, "passed", "95 % interval")
         for word, r in rates.items():
             values.add_row(
                 word, f"{100 * r.rate:.3g} %", f"{100 * r.low:.3g} to {100 * r.high:.3g} %"

@@ -44,6 +44,19 @@ class Variation(Part):
         description="set: replaces the value in the mission; add: is added to it; scale: multiplies it",
     )
 
+    def changed(self, there: Any, value: Any) -> Any:
+        """What is in the place of a number, or of an array, for a value of the variation."""
+        match self.change:
+            case "add":
+                return there + value
+            case "scale":
+                return there * value
+        return value
+
+    def quantile(self, u: float) -> Any:
+        """Value at the fraction u of a distribution, in (0, 1)."""
+        raise NotImplementedError
+
     def code(self, value: Any) -> float:
         """Encode a value as a number: the value itself, or its index in a list that is not numeric."""
         return float(value)
@@ -55,14 +68,6 @@ class Variation(Part):
     def wrong(self) -> tuple[str, str, str] | None:
         """Key, problem and remedy of an error that involves several keys; None if there is none."""
         return None
-
-
-class Drawn(Variation):
-    """A distribution."""
-
-    @abstractmethod
-    def quantile(self, u: float) -> Any:
-        """Value at the fraction u of the distribution, in (0, 1)."""
 
 
 class Gridded(Variation):
@@ -80,7 +85,7 @@ class Gridded(Variation):
         """The values."""
 
 
-class Normal(Drawn):
+class Normal(Variation):
     """A normal distribution."""
 
     kind: Literal["normal"] = Field(description="normal distribution")
@@ -92,7 +97,7 @@ class Normal(Drawn):
         return NormalDist(self.mean, self.sd).inv_cdf(u)
 
 
-class Uniform(Drawn):
+class Uniform(Variation):
     """A uniform distribution."""
 
     kind: Literal["uniform"] = Field(description="uniform distribution")
@@ -108,7 +113,7 @@ class Uniform(Drawn):
         return _ordered(self.low, self.high)
 
 
-class LogUniform(Drawn):
+class LogUniform(Variation):
     """A distribution whose logarithm is uniform."""
 
     kind: Literal["log-uniform"] = Field(description="distribution whose logarithm is uniform")
@@ -145,11 +150,8 @@ class _Listed(Variation):
             words = "finite numbers, words, true or false, or lists of these"
             return "values", f"must be {words}", "correct the value"
         if self.change != "set" and not self._numeric:
-            return (
-                "values",
-                f"must be numbers to {self.change}",
-                "give numbers or use change = 'set'",
-            )
+            problem = f"must be numbers to {self.change}"
+            return "values", problem, "give numbers or use change = 'set'"
         return None
 
     @cached_property
@@ -157,7 +159,7 @@ class _Listed(Variation):
         return all(map(is_number, self.values))
 
 
-class Choice(_Listed, Drawn):
+class Choice(_Listed):
     """One of several values with equal probability."""
 
     kind: Literal["choice"] = Field(description="one of several values with equal probability")

@@ -62,13 +62,9 @@ def processes(count: int) -> Generator[Pool]:
     before = set(multiprocessing.active_children())
     forked = _has_one_thread()
     context: Any = _forks() if forked else _Context()
+    own = None if forked else bequeath()
     with safe_path():  # for multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(
-            count,
-            mp_context=context,
-            initializer=_begin,
-            initargs=(None if forked else bequeath(),),
-        )
+        pool = ProcessPoolExecutor(count, context, _begin, (own,))
     try:
         yield pool, lambda: count
     finally:
@@ -101,11 +97,9 @@ def _forks() -> Any:
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    class Context(ForkContext):
-        pass
-
-    Context.Process = Process
-    return Context()
+    context: Any = ForkContext()
+    context.Process = Process
+    return context
 
 
 class _Process(SpawnProcess):

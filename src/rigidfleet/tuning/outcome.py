@@ -13,6 +13,7 @@ from rigidfleet._common import markup
 from rigidfleet._common.plain import plain
 from rigidfleet.math.margins import Margins
 from rigidfleet.sweep.record import called
+from rigidfleet.sweep.summary import grid
 from rigidfleet.tuning.gains import Gains
 
 if TYPE_CHECKING:
@@ -153,12 +154,7 @@ class Tuned:
         return markup.shown(self.mission, "tuned", heads, self.rows(), self.conclusion)
 
     def __rich__(self) -> RenderableType:
-        from rich.box import SIMPLE_HEAD
-        from rich.table import Table
-
-        table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-        for name in ("", "before", "after", "change"):
-            table.add_column(name, justify="right" if name else "left")
+        table = grid("", "before", "after", "change")
         for row in self.rows():
             table.add_row(*row)
         return table

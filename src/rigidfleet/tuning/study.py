@@ -16,7 +16,6 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,14 +23,14 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.files import write_file
+from rigidfleet._common.files import make_folder, write_file
+from rigidfleet._common.processes import cores
 from rigidfleet._version import __version__
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
-from rigidfleet.sweep.runner import cores
 from rigidfleet.sweep.workers import Pool, processes
 from rigidfleet.tuning.gains import Gains, Screen, Space, feasible_points, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown, Tuned
@@ -111,8 +110,8 @@ def tune(
     """
     given = as_mission(mission)
     flown = given.rewritten(_merged(given.to_dict(), assume or {}))
-    paths, random = _seed_paths(flown)
-    seeds, validation = (seeds, validation) if random else (1, 0)
+    paths = _seed_paths(flown)
+    seeds, validation = (seeds, validation) if paths else (1, 0)
     if objective == "shape" and True not in _tracks(flown):
         objective = "shape-forces"
     options = {
@@ -123,12 +122,12 @@ def tune(
     folder = as_path(folder)
     claim = _Claim(folder, {"version": __version__, "mission": flown.text, **options}, given.name)
     claim.take(replace=replace)
-    study = _Study(flown, folder, objective, budget, margin_share, seed, progress)
-    with study.flights.processes(cores() if workers is None else workers):
-        found = study.search(_Seeds(paths, range(seed, seed + seeds)))
-        after = _Seeds(paths, range(seed + seeds, seed + seeds + validation))
-        if random:
-            study.validate(found, after)
+    count = cores() if workers is None else workers
+    flights = _Flights(paths, budget, count, progress)
+    study = _Study(flown, folder, objective, budget, margin_share, seed, flights)
+    with flights.stack:
+        found = study.search(range(seed, seed + seeds))
+        study.validate(found, range(seed + seeds, seed + seeds + validation))
         chosen = found.before if found.worse else found.after
         found.text = with_gains(given.text, chosen.gains)
     claim.write(found)
@@ -185,50 +184,41 @@ def _merged(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, An
     return found
 
 
-def _seed_paths(mission: Mission) -> tuple[list[str], bool]:
-    """Paths of the seeds of a mission, and whether any random number acts on its flight."""
+def _seed_paths(mission: Mission) -> list[str]:
+    """Paths of the seeds of the random numbers that act on a mission's flight."""
     d = mission.disturbances
     if d is None:
-        return [], False
+        return []
     noise, gusts, links = d.noise, d.gusts, d.links
     acting = {
         "noise": noise is not None and bool(noise.position or noise.velocity or noise.dropped),
         "gusts": gusts is not None,
         "links": links is not None and bool(links.dropped),
     }
-    paths = [f"disturbances.{name}.seed" for name, acts in acting.items() if acts]
-    return paths, bool(paths)
-
-
-@dataclass(frozen=True)
-class _Seeds:
-    """Seeds of flights, the same for noise, gusts and links: each draws its own numbers from them."""
-
-    paths: Sequence[str]
-    numbers: range
-
-    @property
-    def count(self) -> int:
-        return len(self.numbers)
+    return [f"disturbances.{name}.seed" for name, acts in acting.items() if acts]
 
 
 class _Flights:
-    """Sweeps of a study, one after the other, by processes that are kept for all of them."""
+    """Sweeps of a study, one after the other, by at most ``count`` processes, which end with the context ``stack``.
 
-    def __init__(self, total: int, progress: Callable[[SweepProgress], None] | None) -> None:
-        self.total, self.progress = total, progress
+    Seeds are the same for noise, gusts and links, at their ``paths``: each draws its own numbers from them.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[str],
+        total: int,
+        count: int,
+        progress: Callable[[SweepProgress], None] | None,
+    ) -> None:
+        self.paths, self.total, self.count, self.progress = paths, total, count, progress
         self.begun = perf_counter()
         self.done = self.flown = self.failed = 0
-        self.count, self.first = 1, True
+        self.first = True
         self.stack, self.pool = ExitStack(), None
 
-    def processes(self, count: int) -> ExitStack:
-        """Allow a number of processes, which end with the context that is returned."""
-        self.count = count
-        return self.stack
-
     def fly(
-        self, mission: Mission, candidates: Sequence[Gains], seeds: _Seeds, folder: Path
+        self, mission: Mission, candidates: Sequence[Gains], seeds: range, folder: Path
     ) -> list[Flown]:
         """Fly every candidate on every seed, as a sweep in a folder, and return what was measured of each."""
         vary = [
@@ -236,8 +226,8 @@ class _Flights:
             for path in candidates[0]
         ]  # fmt: skip
         vary += [
-            {"path": path, "kind": "grid", "values": list(seeds.numbers), "group": "seeds"}
-            for path in seeds.paths
+            {"path": path, "kind": "grid", "values": list(seeds), "group": "seeds"}
+            for path in self.paths
         ]
         sweep = Sweep.of(mission, vary, name=folder.name, origin="rigidfleet tune")
         last = SweepProgress(0, sweep.runs, 0, 0, 0.0, 1)
@@ -258,7 +248,7 @@ class _Flights:
         )  # fmt: skip
         if first and np.median(table.wall) * self.total < _WORTH:
             self.count = 1
-        return _measured(table, candidates, seeds.count)
+        return _measured(table, candidates, len(seeds))
 
     def _processes(self) -> Pool:
         if self.pool is None:
@@ -301,19 +291,18 @@ class _Study:
         budget: int,
         margin_share: float,
         seed: int,
-        progress: Callable[[SweepProgress], None] | None,
+        flights: _Flights,
     ) -> None:
         self.mission, self.folder, self.objective = mission, folder, objective
-        self.budget, self.seed = budget, seed
+        self.budget, self.seed, self.flights = budget, seed, flights
         self.screen = Screen(mission, margin_share)
         self.space = Space(self.screen.gains)
-        self.flights = _Flights(budget, progress)
         #: Candidates that were flown, and slack of the margins of all that were proposed.
         self.flown: dict[tuple[float, ...], Flown] = {}
         self.slacks: dict[tuple[float, ...], float] = {}
         self.rounds = 0
 
-    def search(self, seeds: _Seeds) -> Tuned:
+    def search(self, seeds: range) -> Tuned:
         """Search for the best gains on some seeds."""
         from scipy.optimize import NonlinearConstraint, differential_evolution
 
@@ -340,16 +329,16 @@ class _Study:
         refused = sum(slack < 0 for slack in self.slacks.values())
         return Tuned(
             self.mission.name, self.objective, OBJECTIVES[self.objective], before, best, margins,
-            len(self.flown) * seeds.count, len(self.flown), refused,
+            len(self.flown) * len(seeds), len(self.flown), refused,
         )  # fmt: skip
 
-    def validate(self, found: Tuned, seeds: _Seeds) -> None:
+    def validate(self, found: Tuned, seeds: range) -> None:
         """Fly the mission's own gains and the best ones on seeds that the search has not seen."""
-        if not seeds.count:
+        if not seeds:
             return
         every, judged = list(self.flown), []
         pair = {_key(f.gains): f.gains for f in (found.before, found.after)}
-        self.flights.total = self.flights.done + len(pair) * seeds.count
+        self.flights.total = self.flights.done + len(pair) * len(seeds)
         for key, gains in pair.items():
             folder = self.folder / _VALIDATION / f"{every.index(key):04}"
             judged += self.flights.fly(self.mission, [gains], seeds, folder)
@@ -365,17 +354,17 @@ class _Study:
             self.slacks[key] = self.screen.slack(gains)
         return self.slacks[key]
 
-    def _costs(self, points: Iterable[Floats], seeds: _Seeds) -> list[float]:
+    def _costs(self, points: Iterable[Floats], seeds: range) -> list[float]:
         """Costs of a generation."""
         every = [self.space.gains(x) for x in points]
         new = {_key(g): g for g in every if _key(g) not in self.flown}
-        if (len(self.flown) + len(new)) * seeds.count > self.budget:
+        if (len(self.flown) + len(new)) * len(seeds) > self.budget:
             raise _SpentError
         if new:
             self._fly(list(new.values()), seeds)
         return [self._cost(self.flown[_key(g)]) for g in every]
 
-    def _fly(self, candidates: list[Gains], seeds: _Seeds) -> list[Flown]:
+    def _fly(self, candidates: list[Gains], seeds: range) -> list[Flown]:
         """Fly new candidates as the next round."""
         folder = self.folder / _ROUNDS / f"{self.rounds:03}"
         found = self.flights.fly(self.mission, candidates, seeds, folder)
@@ -424,13 +413,7 @@ class _Claim:
             raise ResultError(
                 f"{self.tuned}: is not what a study wrote; use --force to overwrite or --out to choose another place."
             )
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            why = (error.strerror or str(error)).lower()
-            raise ResultError(
-                f"{self.folder}: cannot be written ({why}). Choose another folder by --out."
-            ) from error
+        make_folder(self.folder)
         if not before:
             self._write({"definition": self.definition})
 
