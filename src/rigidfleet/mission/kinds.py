@@ -147,8 +147,9 @@ class AnyPhase(Part):
 
     @property
     def least_time(self) -> float:
-        """Duration of its motion [s], nan while it is automatic. The phase should not end before."""
-        return 0.0
+        """Duration of its travel or blend [s], nan while it is automatic. The phase should not end before."""
+        own = self.__dict__.get
+        return seconds(own("travel") or own("blend") or 0.0)
 
     @property
     def leads_to(self) -> str:
@@ -156,8 +157,9 @@ class AnyPhase(Part):
         return ""
 
     def ended(self, length: float) -> dict[str, Any]:
-        """Keys that change if the pilot ends the phase after another duration [s]."""
-        return {}
+        """Keys that change if the pilot ends the phase after another duration [s]: no motion is longer than it."""
+        own = ((key, self.__dict__.get(key)) for key in ("travel", "blend"))
+        return {key: min(seconds(time), length) for key, time in own if time is not None}
 
 
 class Attitude(Part):
@@ -216,11 +218,6 @@ class Shaping(AnyPhase):
         return () if self.position is None else ("position", "velocity")
 
     @property
-    def least_time(self) -> float:
-        """Duration of the blend [s]."""
-        return seconds(self.blend)
-
-    @property
     def aligned(self) -> bool:
         """Whether the slots are rotated during the blend, so that they move least."""
         return True
@@ -233,9 +230,8 @@ class Shaping(AnyPhase):
 
     def ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
-        told = {"formation": self.formation}
-        return (
-            told if self.reference == "step" else told | {"blend": min(seconds(self.blend), length)}
+        return {"formation": self.formation} | (
+            {} if self.reference == "step" else super().ended(length)
         )
 
 
@@ -320,19 +316,10 @@ class Steering(Attitude, AnyPhase):
         return () if self.attitude_deg is None else ("attitude", "rates")
 
     @property
-    def least_time(self) -> float:
-        """Time to the arrival [s]."""
-        return seconds(self.travel or 0.0)
-
-    @property
     def leads_to(self) -> str:
         """The commanded angles and rates."""
         rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
         return ", ".join([*self.angles, *rates])
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A travel time that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(seconds(self.travel), length)}
 
 
 class Through(Part):
@@ -426,15 +413,6 @@ class Arriving(AnyPhase):
         None, description="time from the start to the arrival [s]; default: the whole phase"
     )
 
-    @property
-    def least_time(self) -> float:
-        """Time to the arrival [s]."""
-        return self.travel or 0.0
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A time to the arrival that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(self.travel, length)}
-
 
 class Brake(Arriving):
     """Come to rest where braking leads, in position and attitude, with the least snap."""
@@ -514,13 +492,23 @@ class Land(Vertical):
         return "the ground"
 
 
-class Follow(AnyPhase):
-    """Follow trajectories that another program made: the virtual body, or each vehicle its own."""
+class Cruising(AnyPhase):
+    """A phase on a course of its own, which it leaves with the velocity, and perhaps the attitude, there."""
 
     moves: ClassVar[bool] = True
     goal_moves: ClassVar[bool] = True
-    led: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity at the end of the course, and the attitude if it turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+
+class Follow(Cruising):
+    """Follow trajectories that another program made: the virtual body, or each vehicle its own."""
+
+    led: ClassVar[bool] = True
 
     kind: Literal["follow"] = Field(description="follow trajectories of a file")
     file: str | None = Field(
@@ -564,19 +552,9 @@ class Follow(AnyPhase):
         return joined([rows_to_curve(rows) for rows in self.trajectories or ()])
 
     @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity at the end, and the attitude if it turns."""
-        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
-
-    @property
     def turns_away(self) -> bool:
         """Whether the body turns as the file says."""
         return self.yaw == "file"
-
-    @property
-    def least_time(self) -> float:
-        """Time to the end of the trajectories [s]."""
-        return self.travel or 0.0
 
     @property
     def leads_to(self) -> str:
@@ -599,12 +577,8 @@ def _time_of(trajectories: Any) -> float:
         return 1.0
 
 
-class Orbit(AnyPhase):
+class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
-
-    moves: ClassVar[bool] = True
-    goal_moves: ClassVar[bool] = True
-    body_control: ClassVar[str] = "tracking"
 
     kind: Literal["orbit"] = Field(description="circle a point")
     centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
@@ -624,28 +598,14 @@ class Orbit(AnyPhase):
     )
 
     @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity on the circle, and the attitude if it turns."""
-        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
-
-    @property
     def turns_away(self) -> bool:
         """Whether the body turns with the orbit."""
         return self.yaw == "along"
 
     @property
-    def least_time(self) -> float:
-        """Duration of the entry [s]."""
-        return seconds(self.blend)
-
-    @property
     def leads_to(self) -> str:
         """The circle."""
         return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """An entry that is not longer than the phase."""
-        return {"blend": min(seconds(self.blend), length)}
 
 
 def seconds(time: float | Literal["auto"]) -> float:
