@@ -87,17 +87,17 @@ class AnyPhase(Part):
     @property
     def shaping(self) -> Shaping | None:
         """The phase if it takes a formation, else None."""
-        return None
+        return self if isinstance(self, Shaping) else None
 
     @property
     def establishing(self) -> Establish | None:
         """The phase if it also attaches the body frame to its formation, else None."""
-        return None
+        return self if isinstance(self, Establish) else None
 
     @property
     def steering(self) -> Steering | None:
         """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
-        return None
+        return self if isinstance(self, Steering) else None
 
     @property
     def attitude_deg(self) -> tuple[float, float, float] | None:
@@ -128,7 +128,7 @@ class AnyPhase(Part):
     @property
     def vertical(self) -> Vertical | None:
         """The phase if it leads vehicles straight up or down, else None."""
-        return None
+        return self if isinstance(self, Vertical) else None
 
     @property
     def spelled(self) -> bool:
@@ -208,11 +208,6 @@ class Shaping(AnyPhase):
     )
 
     @property
-    def shaping(self) -> Shaping:
-        """The phase itself."""
-        return self
-
-    @property
     def meets(self) -> tuple[str, ...]:
         """Position and velocity, if a place is commanded."""
         return () if self.position is None else ("position", "velocity")
@@ -247,11 +242,6 @@ class Establish(Attitude, Shaping):
         "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
         "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
     )
-
-    @property
-    def establishing(self) -> Establish:
-        """The phase itself."""
-        return self
 
 
 class Reshape(Shaping):
@@ -304,11 +294,6 @@ class Steering(Attitude, AnyPhase):
     rates_deg_s: Rates = Field(
         (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
     )
-
-    @property
-    def steering(self) -> Steering:
-        """The phase itself."""
-        return self
 
     @property
     def meets(self) -> tuple[str, ...]:
@@ -438,11 +423,6 @@ class Vertical(Arriving):
         description="groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
         "in the order of their numbers",
     )
-
-    @property
-    def vertical(self) -> Vertical:
-        """The phase itself."""
-        return self
 
     @property
     def spelled(self) -> bool:
