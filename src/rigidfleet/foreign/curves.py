@@ -73,11 +73,15 @@ def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Curve:
             return np.stack([x[0][:-1], slope], axis=-1)
         return splines.hermite(h, x[:, :-1], x[:, 1:])
 
-    position = between(states)
     angle = np.full((len(time) - 1, 1, 1), np.nan) if yaw is None else between(yaw[..., None])
-    powers = max(position.shape[2], angle.shape[2])
-    parts = [np.pad(x, ((0, 0), (0, 0), (0, powers - x.shape[2]))) for x in (position, angle)]
-    return Curve(time, np.concatenate(parts, axis=1))
+    return Curve(time, with_yaw(between(states), angle))
+
+
+def with_yaw(position: Floats, yaw: Floats) -> Floats:
+    """Pieces (n, 4, P) of positions (n, 3, Q) and yaws (n, 1, R)."""
+    powers = max(position.shape[2], yaw.shape[2])
+    parts = [np.pad(x, ((0, 0), (0, 0), (0, powers - x.shape[2]))) for x in (position, yaw)]
+    return np.concatenate(parts, axis=1)
 
 
 def with_headings(curve: Curve, times: Floats, yaws: Floats) -> Curve:

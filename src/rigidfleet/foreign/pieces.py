@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rigidfleet.foreign.curves import Curve
 from rigidfleet.math import series
@@ -17,7 +18,7 @@ CHANNELS = 4
 _SAME, _MOST = 1e-9, 10_000_000
 
 
-def rows_to_curve(rows: Sequence[Sequence[float]]) -> Curve:
+def rows_to_curve(rows: ArrayLike) -> Curve:
     """The curve of rows of one length: a duration [s], and the coefficients of x, y, z and yaw."""
     found = np.array(rows, dtype=np.float64)
     time = np.concatenate([[0.0], np.cumsum(found[:, 0])])

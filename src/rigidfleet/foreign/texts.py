@@ -9,6 +9,7 @@ import numpy as np
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.columns import numbers, read_columns, read_lines
 from rigidfleet.foreign.curves import NAMES, Curve, through
+from rigidfleet.foreign.pieces import rows_to_curve
 from rigidfleet.foreign.samples import ASSUMED, sampled
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
@@ -59,8 +60,7 @@ def read_pieces(data: bytes, name: str) -> Curve:
         raise TrajectoryError(
             f"{name}: line {lines[k]}: the duration is {found[k, 0]:g} s. Give a positive one."
         )
-    time = np.concatenate([[0.0], np.cumsum(found[:, 0])])
-    return Curve(time, found[:, 1:].reshape(len(found), 4, POWERS))
+    return rows_to_curve(found)
 
 
 def read_setpoints(
@@ -97,9 +97,8 @@ def read_setpoints(
         curves.append(curve)
         if all(f"v{axis}" in given.values for axis in "xyz"):
             stated = np.column_stack([given.values[f"v{axis}"][k] for axis in "xyz"])
-            between = curve.pieces[
-                1:, :3, 1
-            ]  # at the inner samples; lines have two velocities there
+            # At the inner samples, where lines have two velocities.
+            between = curve.pieces[1:, :3, 1]
             if interpolation == "cubic" and len(between):
                 off = max(off, float(np.linalg.norm(stated[1:-1] - between, axis=1).max()))
                 fastest = max(fastest, float(np.linalg.norm(between, axis=1).max()))

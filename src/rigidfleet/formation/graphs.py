@@ -135,7 +135,8 @@ def henneberg_multilevel(points: ArrayLike) -> Ints:
 
     p = np.asarray(points, dtype=np.float64)
     n = len(p)
-    first = _far_apart(p, min(n, 12))
+    away = np.linalg.norm(p - p.mean(axis=0), axis=1)
+    first = farthest(p, min(n, 12), int(away.argmax()))
     order = _halves(p)
     order = _spanning_first(p, np.concatenate([first, order[~np.isin(order, first)]]))
     edges, soft, done = [_triangle_of(order)], np.zeros(n), 3
@@ -194,11 +195,10 @@ def _edges_to(some: Ints, at: Ints, triple: Ints) -> Ints:
     return np.column_stack([np.repeat(some, 3), np.take_along_axis(at, triple, 1).ravel()])
 
 
-def _far_apart(p: Floats, count: int) -> Ints:
-    """``count`` points, each the farthest from all before it; the first is the farthest from the centre."""
-    away = np.linalg.norm(p - p.mean(axis=0), axis=1)
-    found = [int(away.argmax())]
-    away = np.linalg.norm(p - p[found[0]], axis=1)
+def farthest(p: Floats, count: int, first: int = 0) -> Ints:
+    """Indices (count,) of points (N, d): a first one, and each of the others the farthest from all before it."""
+    found = [first]
+    away = np.linalg.norm(p - p[first], axis=1)
     while len(found) < count:
         found.append(int(away.argmax()))
         away = np.minimum(away, np.linalg.norm(p - p[found[-1]], axis=1))

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from rigidfleet.errors import RigidfleetError
+from rigidfleet.formation.graphs import farthest
 from rigidfleet.formation.point_files import read_bytes
 from rigidfleet.math import proximity
 from rigidfleet.typing import Floats, Ints
@@ -131,7 +132,7 @@ def spread(points: Floats, count: int) -> Ints:
         raise ValueError(f"{len(points):,} points cannot place {count:,} agents; use fewer agents")
     tree = KDTree(points)
     best, most = np.arange(count), -1.0
-    for start in (np.arange(count) * len(points) // count, _farthest(points, count)):
+    for start in (np.arange(count) * len(points) // count, farthest(points, count)):
         chosen = start
         for _ in range(_ROUNDS):
             least = float(proximity.nearest(points[chosen]).min()) if count > 1 else 0.0
@@ -145,16 +146,6 @@ def spread(points: Floats, count: int) -> Ints:
                 break
             chosen = moved
     return np.sort(best)
-
-
-def _farthest(points: Floats, count: int) -> Ints:
-    """Indices (count,) of points, each the farthest from all before."""
-    chosen = np.zeros(count, dtype=np.int64)
-    away = np.linalg.norm(points - points[0], axis=1)
-    for k in range(1, count):
-        chosen[k] = int(away.argmax())
-        away = np.minimum(away, np.linalg.norm(points - points[chosen[k]], axis=1))
-    return chosen
 
 
 def _along(outlines: list[Floats], count: int) -> Floats:

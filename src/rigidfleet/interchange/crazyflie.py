@@ -14,6 +14,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import NAMES, Curve
+from rigidfleet.foreign.pieces import curve_to_rows, rows_to_curve
 from rigidfleet.interchange.curves import Knots, Motion
 from rigidfleet.math.bernstein import bernstein, of_bernstein
 from rigidfleet.math.splines import POWERS
@@ -39,8 +40,8 @@ _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 20
 def write_polynomial(motion: Motion, tolerance: float) -> Iterator[bytes]:
     """One table a vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
     for agent in range(motion.n_agents):
-        rows = _rows(motion.knots(agent).fitted(tolerance))
-        lines = [",".join(f"{x:.9g}" for x in row) for row in rows.tolist()]
+        rows = curve_to_rows(motion.knots(agent).fitted(tolerance))
+        lines = [",".join(f"{x:.9g}" for x in row) for row in rows]
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
 
@@ -63,13 +64,13 @@ def write_poly4d(motion: Motion, tolerance: float) -> Iterator[bytes]:
                 tolerance,
                 lambda x, knots=knots: len(knots.fitted(x).pieces) <= PIECES,
             )
-        yield np.roll(_rows(curve), -1, axis=1).astype("<f4").tobytes()
+        yield np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
 
 
 def read_poly4d(data: bytes) -> list[Curve]:
     """The way in an image of `write_poly4d`, from time zero on."""
-    rows = np.frombuffer(data, "<f4").reshape(-1, 4 * POWERS + 1).astype(float)
-    return [_curve(rows[:, -1], rows[:, :-1])]
+    rows = np.frombuffer(data, "<f4").reshape(-1, 4 * POWERS + 1)
+    return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
 def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
@@ -144,7 +145,7 @@ def read_compressed(data: bytes) -> list[Curve]:
     """The way in an image of `write_compressed`, from time zero on."""
     units = [_MM, _MM, _MM, _TENTH]
     at = [x * unit for x, unit in zip(struct.unpack_from("<4h", data), units, strict=True)]
-    place, durations, pieces = 8, [], []
+    place, rows = 8, []
     while (head := _PIECE.unpack_from(data, place))[1]:
         kinds, milliseconds = head
         place += _PIECE.size
@@ -156,9 +157,8 @@ def read_compressed(data: bytes) -> list[Curve]:
             points = np.array([at[axis], *(x * unit for x in due)])
             piece[axis, : count + 1] = of_bernstein(points, milliseconds * _MS)
             at[axis] = points[-1]
-        durations.append(milliseconds * _MS)
-        pieces.append(piece)
-    return [_curve(np.array(durations), np.array(pieces))]
+        rows.append([milliseconds * _MS, *piece.ravel()])
+    return [rows_to_curve(rows)]
 
 
 def _too_long(
@@ -173,13 +173,3 @@ def _too_long(
         f"the flight of agent {agent + 1} needs {needed}. {remedy[0].upper()}{remedy[1:]}; at "
         f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
     )
-
-
-def _rows(curve: Curve) -> Floats:
-    """Duration and coefficients (n, 33) of the pieces of a way."""
-    return np.column_stack([np.diff(curve.time), curve.pieces.reshape(len(curve.pieces), -1)])
-
-
-def _curve(duration: Floats, coefficients: Floats) -> Curve:
-    time = np.concatenate([[0.0], np.cumsum(duration)])
-    return Curve(time, coefficients.reshape(len(duration), 4, POWERS))

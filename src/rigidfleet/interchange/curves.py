@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import Curve, values
+from rigidfleet.foreign.curves import Curve, values, with_yaw
 from rigidfleet.math import series, splines
 from rigidfleet.result import Result
 from rigidfleet.setpoints import Setpoints, at_rate
@@ -87,7 +87,7 @@ class Knots(NamedTuple):
     def curve(self) -> Curve:
         """The way between all samples: of degree 7 (yaw: 3)."""
         position = splines.hermite(np.diff(self.time), self.begin, self.end)
-        return Curve(self.time, _with_yaw(position, self._yaw(slice(None), slice(None))))
+        return Curve(self.time, with_yaw(position, self._yaw(slice(None), slice(None))))
 
     def _yaw(self, first: slice, last: slice) -> Floats:
         h = self.time[1:][last] - self.time[:-1][first]
@@ -134,7 +134,7 @@ class Knots(NamedTuple):
             first, last = slice(i, i + 1), slice(j - 1, j)
             h = self.time[j : j + 1] - self.time[i : i + 1]
             piece = splines.hermite(h, self.begin[:orders, first], self.end[:orders, last])
-            piece = _with_yaw(piece, self._yaw(first, last))
+            piece = with_yaw(piece, self._yaw(first, last))
             after = (t[i:j] - self.time[i]).ravel()
             off = values(piece, after) - wanted[i:j].reshape(-1, 4)
             far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
@@ -163,12 +163,6 @@ class Knots(NamedTuple):
             pieces.append(best)
             length = good - i
         return Curve(self.time[ends], np.concatenate(pieces))
-
-
-def _with_yaw(position: Floats, yaw: Floats) -> Floats:
-    """Pieces (n, 4, P) of positions (n, 3, P) and yaws (n, 1, 4)."""
-    powers = position.shape[2]
-    return np.concatenate([position, np.pad(yaw, ((0, 0), (0, 0), (0, powers - 4)))], axis=1)
 
 
 def headings(curve: Curve) -> tuple[Floats, Floats]:

@@ -52,12 +52,8 @@ def fades(result: Result, start: float, end: float) -> list[Fade]:
     return changes
 
 
-def program(changes: list[Fade], agent: int, end: int) -> bytes:
-    """Light program of one vehicle, that lasts until a frame."""
-    return bytes(_commands(changes, agent, end))
-
-
-def _commands(changes: list[Fade], agent: int, end: int) -> Iterator[int]:
+def program(changes: list[Fade], agent: int, end: int) -> Iterator[int]:
+    """Bytes of the light program of one vehicle, that lasts until a frame."""
     for change, until in zip(changes, [*(c.begin for c in changes[1:]), end], strict=True):
         rgb = bytes.fromhex(change.colours[agent][1:])
         if change.end > change.begin:

@@ -59,7 +59,7 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
         times, yaws = headings(curve)
         setpoints = np.column_stack([times.round(6), np.degrees(yaws).round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
-        light = base64.b64encode(program(changes, agent, last)).decode()
+        light = base64.b64encode(bytes(program(changes, agent, last))).decode()
         files[f"{folder}/lights.json"] = {"version": 1, "data": light}
         settings = {
             "name": name,

@@ -11,7 +11,7 @@ import numpy as np
 from rigidfleet.mission.disturbances import intensity
 from rigidfleet.mission.findings import FindingCollector
 from rigidfleet.mission.schema import Avoidance, Disturbances
-from rigidfleet.mission.vehicles import VehicleModel, flies_vehicles, resolve
+from rigidfleet.mission.vehicles import NOT_SAMPLED, VehicleModel, flies_vehicles, resolve
 from rigidfleet.typing import Floats
 
 _TABLE = "avoidance"
@@ -135,9 +135,7 @@ def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
     if given is None:
         return
     if not flies_vehicles(collector):
-        remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
-        problem = "needs sampled control, which only vehicles have"
-        collector.add((_TABLE,), problem, remedy, None)
+        collector.add((_TABLE,), *NOT_SAMPLED, None)
         return
     if not (given.guard or given.barrier or given.reference == "flow"):
         problem = "has neither guard nor barrier nor flow"

@@ -25,20 +25,22 @@ from rigidfleet.mission import (
     vehicles,
 )
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import FindingCollector, Keys, Shared, near_shape
+from rigidfleet.mission.findings import (
+    FindingCollector,
+    Keys,
+    Shared,
+    look_up,
+    model_of,
+    near_shape,
+)
 from rigidfleet.mission.obstacles import Box, Obstacle
 from rigidfleet.mission.schema import (
     Agents,
     Allocation,
-    Autopilot,
-    Avoidance,
-    BodyFrame,
     Constraint,
     Contents,
     Disturbances,
-    GeodeticOrigin,
     Geofence,
-    IntegratorOptions,
     Limits,
     Lqr,
     MissionHeader,
@@ -47,22 +49,12 @@ from rigidfleet.mission.schema import (
     Tracking,
     VehicleYaw,
 )
-from rigidfleet.mission.values import Part
 
-_TABLES: dict[str, type[Part]] = {
-    "agents": Agents,
-    "constraint": Constraint,
-    "lqr": Lqr,
-    "tracking": Tracking,
-    "allocation": Allocation,
-    "integrator": IntegratorOptions,
-    "body_frame": BodyFrame,
-    "limits": Limits,
-    "autopilot": Autopilot,
-    "avoidance": Avoidance,
-    "yaw": VehicleYaw,
-    "geodetic_origin": GeodeticOrigin,
-    "disturbances": Disturbances,
+#: Models of the single tables. Obstacles and phases are arrays of tables, whose kinds have models.
+_TABLES = {
+    key: model
+    for key, field in Contents.model_fields.items()
+    if (model := model_of(field.annotation)) is not None and key not in ("obstacles", "phases")
 }
 
 
@@ -209,11 +201,8 @@ def _agents(collector: FindingCollector, parts: dict[str, Any]) -> None:
         collector.add(("agents", "mass"), problem, "give all masses in kg")
     above = [limit for limit in agents.thrust_limit if bounds.FORCE.most < limit < math.inf]
     if above:
-        collector.add(
-            ("agents", "thrust_limit"),
-            f"must be <= {bounds.FORCE.most:g}",
-            "omit it for no limit",
-        )
+        problem = f"must be <= {bounds.FORCE.most:g}"
+        collector.add(("agents", "thrust_limit"), problem, "omit it for no limit")
     written = collector.data["agents"].get("thrust_limit", 0.0)
     if math.inf in (written if isinstance(written, list) else [written]):
         collector.add(("agents", "thrust_limit"), "is not finite", "omit it for no limit")
@@ -289,9 +278,11 @@ _FREE = 1e-15
 
 def _regulators(collector: FindingCollector, parts: dict[str, Any]) -> None:
     lqr: Lqr = parts.get("lqr", Lqr())
-    _regulator(collector, lqr, "lqr")
-    _regulator(collector, lqr.attitude, "lqr", "attitude")
-    _free_input(collector, lqr)
+    for weights, path in ((lqr, ("lqr",)), (lqr.attitude, ("lqr", "attitude"))):
+        _regulator(collector, weights, *path)
+        if collector.right(("lqr",), "R") and collector.right(path, "R"):
+            inherited = look_up(collector.data, (*path, "R")) is None
+            _unbounded(collector, weights, ("lqr",) if inherited else path, ".".join(path))
 
 
 def _regulator(collector: FindingCollector, weights: Regulator, *path: str) -> None:
@@ -306,26 +297,14 @@ def _regulator(collector: FindingCollector, weights: Regulator, *path: str) -> N
         collector.add((*path, "S"), problem, "for example, give S = [1e3, 1e2]", weights.S)
 
 
-def _free_input(collector: FindingCollector, lqr: Lqr) -> None:
-    for weights, name in ((lqr, "lqr"), (lqr.attitude, "lqr.attitude")):
-        path, most = tuple(name.split(".")), max(*weights.Q, *weights.S)
-        if (
-            _FREE * most > weights.R
-            and collector.right(("lqr",), "R")
-            and collector.right(path, "R")
-        ):
-            inherited = name != "lqr" and "R" not in collector.data["lqr"].get("attitude", {})
-            _unbounded(collector, weights.R, most, ("lqr",) if inherited else path, name)
-
-
 def _unbounded(
-    collector: FindingCollector, R: float, most: float, where: tuple[str, ...], name: str
+    collector: FindingCollector, weights: Regulator | Tracking, where: Keys, name: str
 ) -> None:
-    problem = (
-        f"is less than {_FREE:g} times the largest weight of {name}, {most:g}:"
-        " the gains would be unbounded"
-    )
-    collector.add((*where, "R"), problem, f"raise R or lower the weights of {name}", R)
+    most = max(*weights.Q, *getattr(weights, "S", ()))
+    if _FREE * most > weights.R:
+        problem = f"is less than {_FREE:g} times the largest weight of {name}, {most:g}: the gains would be unbounded"
+        remedy = f"raise R or lower the weights of {name}"
+        collector.add((*where, "R"), problem, remedy, weights.R)
 
 
 def _tracking(collector: FindingCollector, parts: dict[str, Any]) -> None:
@@ -335,8 +314,8 @@ def _tracking(collector: FindingCollector, parts: dict[str, Any]) -> None:
     if tracking.Q[0] < _NO_WEIGHT:
         problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
         collector.add(("tracking", "Q"), problem, "for example, give Q = [4.0, 4.0]")
-    if _FREE * max(tracking.Q) > tracking.R and collector.right(("tracking",), "R"):
-        _unbounded(collector, tracking.R, max(tracking.Q), ("tracking",), "tracking")
+    if collector.right(("tracking",), "R"):
+        _unbounded(collector, tracking, ("tracking",), "tracking")
 
 
 def _allocation(collector: FindingCollector, parts: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from rigidfleet.mission import losses
 from rigidfleet.mission.findings import FindingCollector
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import Disturbances, Gusts
-from rigidfleet.mission.vehicles import flies_vehicles
+from rigidfleet.mission.vehicles import NOT_SAMPLED, flies_vehicles
 from rigidfleet.typing import Floats
 
 _TABLE = "disturbances"
@@ -86,16 +86,14 @@ def _noise(collector: FindingCollector, found: Disturbances) -> None:
         collector.add(where, "is zero", "give position [m] or velocity [m/s] > 0")
     if flies_vehicles(collector):
         return
-    remedy = "give the agents a vehicle; model = 'point' flies points with sampled control"
     for key in ("downwash", "ground_effect"):
         if getattr(found, key):
             collector.add((_TABLE, key), "acts on vehicles with rotors alone", "name a vehicle")
-    late = [] if noise is None else [k for k in ("delay", "dropped") if getattr(noise, k)]
-    for key in late:
-        collector.add((*where, key), "needs sampled control, which only vehicles have", remedy)
+    for key in ("delay", "dropped"):
+        if noise is not None and getattr(noise, key):
+            collector.add((*where, key), *NOT_SAMPLED)
     if found.links is not None:
-        problem = "needs sampled control, which only vehicles have"
-        collector.add((_TABLE, "links"), problem, remedy, None)
+        collector.add((_TABLE, "links"), *NOT_SAMPLED, None)
 
 
 def _gusts(collector: FindingCollector, gusts: Gusts, wind: float, n: int | None) -> None:
@@ -105,6 +103,7 @@ def _gusts(collector: FindingCollector, gusts: Gusts, wind: float, n: int | None
 
     if not collector.right(_GUSTS, "model"):
         return
+    spread = "add the standard deviation of the gusts [m/s]"
     if gusts.model == "first-order":
         if gusts.time_scale is None:
             wrong("time_scale", "is missing", "add the correlation time of the gusts [s]")
@@ -113,21 +112,21 @@ def _gusts(collector: FindingCollector, gusts: Gusts, wind: float, n: int | None
                 remedy = "remove it or use model = 'dryden'"
                 wrong(key, "has no effect with model 'first-order'", remedy)
         if gusts.intensity is None:
-            wrong("intensity", "is missing", "add the standard deviation of the gusts [m/s]")
+            wrong("intensity", "is missing", spread)
     else:
         if gusts.time_scale is not None:
             remedy = "give length or altitude instead, or use model = 'first-order'"
             wrong("time_scale", "has no effect with model 'dryden'", remedy)
         if gusts.length is not None and gusts.altitude is not None:
             wrong("length", "is given together with altitude", "give one of them")
-        if gusts.length is None and gusts.altitude is None:
+        if gusts.length is gusts.altitude is None:
             wrong("length", "is missing", "add length [m], or altitude [m] to derive it")
         if gusts.airspeed is None and wind == 0 and collector.right((_TABLE,), "wind"):
             problem = "is missing, and there is no wind to replace it"
             wrong("airspeed", problem, "add airspeed [m/s] or wind")
         if gusts.intensity is None and (gusts.altitude is None or wind == 0):
             problem = "is missing; it can be derived only from altitude and wind together"
-            wrong("intensity", problem, "add the standard deviation of the gusts [m/s]")
+            wrong("intensity", problem, spread)
     if gusts.correlation is not None and gusts.correlation_length is not None:
         wrong("correlation", "is given together with correlation_length", "give one of them")
     if gusts.correlation_length is not None and n is not None and n > _MOST_BY_DISTANCE:
@@ -140,13 +139,11 @@ def _size(
     collector: FindingCollector, found: Disturbances, wind: float, n: int, end: float
 ) -> None:
     """Find gusts and noise whose tables would not fit into memory."""
-    if found.gusts is not None and 6 * n * end / gust_step(found.gusts, wind) > _MOST_NUMBERS:
-        problem = f"would need too much memory for {n} agents over {end:g} s"
+    longest = _MOST_NUMBERS / (6 * n)  # of a table with one sample a second
+    problem = f"would need too much memory for {n} agents over {end:g} s"
+    if found.gusts is not None and end / (step := gust_step(found.gusts, wind)) > longest:
         remedy = "increase the scales (time_scale, length) or shorten the flight"
-        collector.add(
-            _GUSTS, problem, remedy, f"{gust_step(found.gusts, wind):.3g} s between samples"
-        )
-    if found.noise is not None and 6 * n * end * found.noise.rate > _MOST_NUMBERS:
-        problem = f"would need too much memory for {n} agents over {end:g} s"
+        collector.add(_GUSTS, problem, remedy, f"{step:.3g} s between samples")
+    if found.noise is not None and end * found.noise.rate > longest:
         remedy = "lower the rate or shorten the flight"
         collector.add((_TABLE, "noise", "rate"), problem, remedy, found.noise.rate)

@@ -28,6 +28,7 @@ from rigidfleet.foreign.pieces import curve_to_rows, smoothed
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.formation.point_files import parse_points, read_bytes
 from rigidfleet.mission import bounds
+from rigidfleet.mission.text import unread
 
 #: What stands before the digest of a file.
 _DIGEST = "SHA-256 "
@@ -146,28 +147,24 @@ def _named(data: dict[str, Any]) -> Iterator[_Named]:
     forms, agents, things, phases = (
         data.get(key) for key in ("formations", "agents", "obstacles", "phases")
     )
-    for k, phase in enumerate(phases if isinstance(phases, list) else (), start=1):
-        if (
-            isinstance(phase, dict)
-            and phase.get("kind") == "follow"
-            and isinstance(phase.get("file"), str)
-            and "trajectories" not in phase
-        ):
-            read = partial(_trajectories, yaw=phase.get("yaw") == "file")
-            yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
+    for k, phase in _with_file(phases, "follow", "trajectories"):
+        read = partial(_trajectories, yaw=phase.get("yaw") == "file")
+        yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
             yield _Named(form, "slots", "slots", f"formations.{name}.slots", _points)
     if isinstance(agents, dict) and isinstance(agents.get("position"), str):
         yield _Named(agents, "position", "position", "agents.position", _points)
-    for k, thing in enumerate(things if isinstance(things, list) else (), start=1):
-        if (
-            isinstance(thing, dict)
-            and thing.get("kind") == "heights"
-            and isinstance(thing.get("file"), str)
-            and "heights" not in thing
-        ):
-            yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _heights)
+    for k, thing in _with_file(things, "heights", "heights"):
+        yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _heights)
+
+
+def _with_file(tables: Any, kind: str, becomes: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Numbers, from 1, and tables of a kind that name a file instead of giving its numbers."""
+    for k, table in enumerate(tables if isinstance(tables, list) else (), start=1):
+        own = table if isinstance(table, dict) and table.get("kind") == kind else {}
+        if becomes not in own and isinstance(own.get("file"), str):
+            yield k, own
 
 
 def _inside(path: Path, where: str, name: str) -> Path:
@@ -208,17 +205,12 @@ def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
     if found.assumed in ASSUMED.values():
         curves = [smoothed(curve) for curve in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
-        problem, remedy = "has no yaw", "remove yaw = 'file', or give a file with a yaw"
-        raise MissionError([Finding(name, "", None, problem, remedy)])
+        raise unread(name, "has no yaw", "remove yaw = 'file', or give a file with a yaw")
     return Content([curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves])
 
 
 def _heights(data: bytes, name: str) -> Content:
     """Numbers of a CSV or NPY file, row by row."""
-
-    def refused(problem: str, remedy: str) -> MissionError:
-        return MissionError([Finding(name, "", None, problem, remedy)])
-
     try:
         if name.lower().endswith(".npy"):
             found = np.load(io.BytesIO(data), allow_pickle=False)
@@ -227,14 +219,12 @@ def _heights(data: bytes, name: str) -> Content:
             found = np.array([row for row in rows if any(x.strip() for x in row)], dtype=float)
         found = np.asarray(found, dtype=float)
     except (ValueError, EOFError, OSError):
-        raise refused(
-            "is not a table of numbers",
-            "give rows of equal length, separated by commas, or an NPY array",
-        ) from None
+        remedy = "give rows of equal length, separated by commas, or an NPY array"
+        raise unread(name, "is not a table of numbers", remedy) from None
     if found.ndim != 2 or not found.size or not np.isfinite(found).all():
-        raise refused("is not a table of finite numbers", "give two or more rows of heights [m]")
+        remedy = "give two or more rows of heights [m]"
+        raise unread(name, "is not a table of finite numbers", remedy)
     if found.size > bounds.HEIGHTS:
-        raise refused(
-            f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}", "use a coarser grid"
-        )
+        problem = f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
+        raise unread(name, problem, "use a coarser grid")
     return Content(found.tolist())

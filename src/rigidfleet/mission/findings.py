@@ -35,27 +35,19 @@ class Shared:
 
     Attributes
     ----------
+    models : of tables without errors, by their `key`
     sound : what the phases of the last mission were checked by, if they had no findings
     """
 
     def __init__(self, data: Mapping[str, Any]) -> None:
         # Alive, so that no other table gets the number of one of them.
         self._tables = {id(table): table for table in _tables(data)}
-        self._models: dict[tuple[Any, ...], Part] = {}
+        self.models: dict[Any, Any] = {}
         self.sound: tuple[Any, ...] | None = None
 
     def key(self, kind: type[Part], data: object, defaults: Mapping[str, Any]) -> Any:
         """What a model of a table is found by; None if the table is none of these."""
         return (id(data), kind, *defaults.values()) if id(data) in self._tables else None
-
-    def model(self, key: Any) -> Any:
-        """The model of a table; None if it has not been validated."""
-        return self._models.get(key)
-
-    def keep(self, key: Any, model: Part) -> None:
-        """Keep the model of a table without errors."""
-        if key is not None:
-            self._models[key] = model
 
 
 def _tables(data: Any) -> Iterator[dict[str, Any]]:
@@ -129,7 +121,7 @@ class FindingCollector:
         Keys with errors are left out, so that later checks can use the others. None if that leaves no valid model.
         """
         key = self.shared.key(kind, data, defaults)
-        if (found := self.shared.model(key)) is not None:
+        if (found := self.shared.models.get(key)) is not None:
             return found
         if not isinstance(data, dict):
             self.add(path, "must be a table", f"write [{_key(path)}] with its keys below it")
@@ -140,7 +132,8 @@ class FindingCollector:
         except ValidationError as error:
             errors = error.errors(include_url=False)
         else:
-            self.shared.keep(key, model)
+            if key is not None:
+                self.shared.models[key] = model
             return model
         for error in errors:
             self._structural(error, kind, path)

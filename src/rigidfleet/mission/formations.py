@@ -188,7 +188,7 @@ def _formation(collector: FindingCollector, form: Formation, n: int | None, path
         _edges(collector, form, n, (*path, "edges"))
     if form.distances is not None and collector.right(path, "edges", "distances"):
         _distances(collector, form, form.distances, n, (*path, "distances"))
-    if (form.dimension or collector.data.get("dimension")) == 2 and collector.right(path):
+    if (form.dimension or collector.data.get("dimension")) == 2 and sound(collector, str(path[1])):
         slots = form.slot_array(n)
         if slots is not None and distance_geometry.dimension(slots) > 2:
             problem = "the slots do not lie in a plane, but the dimension is 2"

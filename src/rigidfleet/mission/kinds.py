@@ -87,17 +87,17 @@ class AnyPhase(Part):
     @property
     def shaping(self) -> Shaping | None:
         """The phase if it takes a formation, else None."""
-        return None
+        return self if isinstance(self, Shaping) else None
 
     @property
     def establishing(self) -> Establish | None:
         """The phase if it also attaches the body frame to its formation, else None."""
-        return None
+        return self if isinstance(self, Establish) else None
 
     @property
     def steering(self) -> Steering | None:
         """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
-        return None
+        return self if isinstance(self, Steering) else None
 
     @property
     def attitude_deg(self) -> tuple[float, float, float] | None:
@@ -130,7 +130,7 @@ class AnyPhase(Part):
     @property
     def vertical(self) -> Vertical | None:
         """The phase if it leads vehicles straight up or down, else None."""
-        return None
+        return self if isinstance(self, Vertical) else None
 
     @property
     def spelled(self) -> bool:
@@ -149,8 +149,9 @@ class AnyPhase(Part):
 
     @property
     def least_time(self) -> float:
-        """Duration of its motion [s], nan while it is automatic. The phase should not end before."""
-        return 0.0
+        """Duration of its travel or blend [s], nan while it is automatic. The phase should not end before."""
+        own = self.__dict__.get
+        return seconds(own("travel") or own("blend") or 0.0)
 
     @property
     def leads_to(self) -> str:
@@ -158,8 +159,9 @@ class AnyPhase(Part):
         return ""
 
     def ended(self, length: float) -> dict[str, Any]:
-        """Keys that change if the pilot ends the phase after another duration [s]."""
-        return {}
+        """Keys that change if the pilot ends the phase after another duration [s]: no motion is longer than it."""
+        own = ((key, self.__dict__.get(key)) for key in ("travel", "blend"))
+        return {key: min(seconds(time), length) for key, time in own if time is not None}
 
 
 class Attitude(Part):
@@ -208,19 +210,9 @@ class Shaping(AnyPhase):
     )
 
     @property
-    def shaping(self) -> Shaping:
-        """The phase itself."""
-        return self
-
-    @property
     def meets(self) -> tuple[str, ...]:
         """Position and velocity, if a place is commanded."""
         return () if self.position is None else ("position", "velocity")
-
-    @property
-    def least_time(self) -> float:
-        """Duration of the blend [s]."""
-        return seconds(self.blend)
 
     @property
     def aligned(self) -> bool:
@@ -235,9 +227,8 @@ class Shaping(AnyPhase):
 
     def ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
-        told = {"formation": self.formation}
-        return (
-            told if self.reference == "step" else told | {"blend": min(seconds(self.blend), length)}
+        return {"formation": self.formation} | (
+            {} if self.reference == "step" else super().ended(length)
         )
 
 
@@ -253,11 +244,6 @@ class Establish(Attitude, Shaping):
         "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
         "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
     )
-
-    @property
-    def establishing(self) -> Establish:
-        """The phase itself."""
-        return self
 
 
 class Reshape(Shaping):
@@ -312,29 +298,15 @@ class Steering(Attitude, AnyPhase):
     )
 
     @property
-    def steering(self) -> Steering:
-        """The phase itself."""
-        return self
-
-    @property
     def meets(self) -> tuple[str, ...]:
         """The attitude, if one is commanded."""
         return () if self.attitude_deg is None else ("attitude", "rates")
-
-    @property
-    def least_time(self) -> float:
-        """Time to the arrival [s]."""
-        return seconds(self.travel or 0.0)
 
     @property
     def leads_to(self) -> str:
         """The commanded angles and rates."""
         rates = [_vector(self.rates_deg_s, "°/s")] if any(self.rates_deg_s) else []
         return ", ".join([*self.angles, *rates])
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A travel time that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(seconds(self.travel), length)}
 
 
 class Through(Part):
@@ -428,15 +400,6 @@ class Arriving(AnyPhase):
         None, description="time from the start to the arrival [s]; default: the whole phase"
     )
 
-    @property
-    def least_time(self) -> float:
-        """Time to the arrival [s]."""
-        return self.travel or 0.0
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """A time to the arrival that is not longer than the phase."""
-        return {} if self.travel is None else {"travel": min(self.travel, length)}
-
 
 class Brake(Arriving):
     """Come to rest where braking leads, in position and attitude, with the least snap."""
@@ -462,11 +425,6 @@ class Vertical(Arriving):
         description="groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
         "in the order of their numbers",
     )
-
-    @property
-    def vertical(self) -> Vertical:
-        """The phase itself."""
-        return self
 
     @property
     def spelled(self) -> bool:
@@ -516,13 +474,23 @@ class Land(Vertical):
         return "the ground"
 
 
-class Follow(AnyPhase):
-    """Follow trajectories that another program made: the virtual body, or each vehicle its own."""
+class Cruising(AnyPhase):
+    """A phase on a course of its own, which it leaves with the velocity, and perhaps the attitude, there."""
 
     moves: ClassVar[bool] = True
     goal_moves: ClassVar[bool] = True
-    led: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
+
+    @property
+    def meets(self) -> tuple[str, ...]:
+        """Position and velocity at the end of the course, and the attitude if it turns."""
+        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
+
+
+class Follow(Cruising):
+    """Follow trajectories that another program made: the virtual body, or each vehicle its own."""
+
+    led: ClassVar[bool] = True
 
     kind: Literal["follow"] = Field(description="follow trajectories of a file")
     file: str | None = Field(
@@ -571,11 +539,6 @@ class Follow(AnyPhase):
         return self.yaw == "file"
 
     @property
-    def least_time(self) -> float:
-        """Time to the end of the trajectories [s]."""
-        return self.travel or 0.0
-
-    @property
     def leads_to(self) -> str:
         """The trajectories."""
         n = len(self.trajectories or ())
@@ -596,12 +559,8 @@ def _time_of(trajectories: Any) -> float:
         return 1.0
 
 
-class Orbit(AnyPhase):
+class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
-
-    moves: ClassVar[bool] = True
-    goal_moves: ClassVar[bool] = True
-    body_control: ClassVar[str] = "tracking"
 
     kind: Literal["orbit"] = Field(description="circle a point")
     centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
@@ -626,18 +585,9 @@ class Orbit(AnyPhase):
         return self.yaw == "along"
 
     @property
-    def least_time(self) -> float:
-        """Duration of the entry [s]."""
-        return seconds(self.blend)
-
-    @property
     def leads_to(self) -> str:
         """The circle."""
         return f"round {_vector(self.centre, 'm')} at {self.radius:g} m, {self.rate_deg_s:g}°/s"
-
-    def ended(self, length: float) -> dict[str, Any]:
-        """An entry that is not longer than the phase."""
-        return {"blend": min(seconds(self.blend), length)}
 
 
 def seconds(time: float | Literal["auto"]) -> float:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from functools import cache, cached_property
-from typing import Any, Literal, NamedTuple, Self
+from collections.abc import Callable, Mapping
+from copy import copy
+from functools import cache, cached_property, wraps
+from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 from pydantic import PrivateAttr
@@ -13,7 +14,7 @@ from pydantic import PrivateAttr
 from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import to_toml
-from rigidfleet.errors import Finding, MissionError, wrong_type
+from rigidfleet.errors import wrong_type
 from rigidfleet.formation.assignment import assigned, squashed
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
@@ -56,14 +57,20 @@ class Fleet(NamedTuple):
     thrust_limit: Floats
 
 
-class _Made(NamedTuple):
-    """What is computed once of each formation, by its name."""
+A = TypeVar("A", bound="Floats | Ints | None")
 
-    slots: dict[str, Floats | None]  # in their own order
-    ordered: dict[str, Floats | None]  # in the order of the agents
-    about_cm: dict[str, Floats | None]  # the same about their centre of mass
-    edges: dict[str, Ints]
-    distances: dict[str, Floats]
+
+def _once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
+    """Compute an array of each formation, by its name, once, and return a copy."""
+
+    @wraps(method)
+    def wrapper(self: Mission, name: Any) -> A:
+        key = wrapper.__name__, name
+        if key not in self._made:
+            self._made[key] = method(self, name)
+        return copy(self._made[key])
+
+    return wrapper
 
 
 @cache
@@ -157,8 +164,7 @@ class Mission(Contents):
         try:
             text = to_toml(data)
         except TypeError as error:
-            remedy = "use numbers, strings, lists and dicts"
-            raise MissionError([Finding(origin, "", None, str(error), remedy)]) from None
+            raise unread(origin, str(error), "use numbers, strings, lists and dicts") from None
         except RecursionError:
             raise unread(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_toml(text, origin)
@@ -368,48 +374,36 @@ class Mission(Contents):
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
     @cached_property
-    def _made(self) -> _Made:
-        return _Made({}, {}, {}, {}, {})
+    def _made(self) -> dict[tuple[str, str], Any]:
+        return {}
 
+    @_once
     def _slots(self, name: str) -> Floats | None:
-        """Slots (N, 3) [m] of a formation in their own order; computed once."""
-        made = self._made.slots
-        if name not in made:
-            made[name] = self.formations[name].slot_array(self.n_agents)
-        return made[name]
+        """Slots (N, 3) [m] of a formation in their own order."""
+        return self.formations[name].slot_array(self.n_agents)
 
+    @_once
     def formation_edges(self, name: str) -> Ints:
         """Edges (m, 2) of a formation, agents from 0, i < j."""
-        made = self._made.edges
-        if name not in made:
-            edges = self.formations[name].edge_array(self.n_agents)
-            if self.assignment != "given":
-                edges = np.sort(np.argsort(self.assigned_slots[name])[edges], axis=1)
-            made[name] = edges
-        return made[name]
+        edges = self.formations[name].edge_array(self.n_agents)
+        if self.assignment == "given":
+            return edges
+        return np.sort(np.argsort(self.assigned_slots[name])[edges], axis=1)
 
+    @_once
     def formation_slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
 
         Without slots, they are derived from the distances; None if the distances are not complete.
         """
-        made = self._made.ordered
-        if name not in made:
-            slots = self._slots(name)
-            made[name] = None if slots is None else slots[self.assigned_slots[name]]
-        ordered = made[name]
-        return None if ordered is None else ordered.copy()
+        slots = self._slots(name)
+        return None if slots is None else slots[self.assigned_slots[name]]
 
+    @_once
     def slots_about_cm(self, name: str | None) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their centre of mass; None without a formation, or if it has none."""
-        if name is None:
-            return None
-        made = self._made.about_cm
-        if name not in made:
-            slots = self.formation_slots(name)
-            made[name] = None if slots is None else about_cm(slots, self.fleet.mass)
-        found = made[name]
-        return None if found is None else found.copy()
+        slots = None if name is None else self.formation_slots(name)
+        return None if slots is None else about_cm(slots, self.fleet.mass)
 
     def formation_colours(self, name: str) -> tuple[str, ...] | None:
         """Light "#rrggbb" of each agent in a formation; None if the formation has none of its own."""
@@ -420,19 +414,15 @@ class Mission(Contents):
             return (colour,) * self.n_agents
         return tuple(colour[slot] for slot in self.assigned_slots[name].tolist())
 
+    @_once
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
-        made = self._made.distances
-        if name not in made:
-            given = self.formations[name].distances
-            if given is not None:
-                lengths = np.array(given, dtype=np.float64)
-            else:
-                slots = self.formation_slots(name)
-                assert slots is not None  # checked: without distances there is a shape or slots
-                lengths = distances(slots, self.formation_edges(name))
-            made[name] = lengths
-        return made[name].copy()
+        given = self.formations[name].distances
+        if given is not None:
+            return np.array(given, dtype=np.float64)
+        slots = self.formation_slots(name)
+        assert slots is not None  # checked: without distances there is a shape or slots
+        return distances(slots, self.formation_edges(name))
 
     def damping(self, name: str | None, lost: Bools | None = None) -> float:
         """Damping mu [-] of the iterated solver while a formation is held, or during a change if ``name`` is None.

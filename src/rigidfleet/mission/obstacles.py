@@ -266,77 +266,59 @@ def checked(collector: FindingCollector, kind: type[Part], data: Any, k: int) ->
     path: Keys = ("obstacles", k)
     name = "ground" if kind is Ground else f"{data['kind']} {k + 1}"
     found: Any = collector.validate(kind, data, path, {"name": name})
-    if found is None:
-        return None
-    if isinstance(found, Heights) and not _heights(collector, found, path):
-        return None
-    if isinstance(found, Moving) and not _motion(collector, found, path):
-        return None
+    if isinstance(found, Heights):
+        _heights(collector, found, path)
+    elif isinstance(found, Moving):
+        _motion(collector, found, path)
     if isinstance(found, Cylinder) and math.dist(*found.ends) < bounds.LENGTH.least:
         problem = "has both ends at the same place"
         collector.add((*path, "ends"), problem, "give the centres of its two ends")
-        return None
-    if isinstance(found, Hull) and collector.right(path, "points"):
+    if isinstance(found, Hull) and collector.right(path, "points", "waypoints", "times"):
         try:
             found.solid  # noqa: B018
         except ValueError as error:
             remedy = "add points beside the plane, or use a thin box"
             collector.add((*path, "points"), str(error), remedy, None)
-            return None
     return found
 
 
-def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> bool:
+def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> None:
     ways, times = thing.waypoints, thing.times
     if not thing.there[0] < thing.there[1]:
         problem = f"is not after {thing.there[0]:g} s, when the obstacle appears"
         collector.add((*path, "vanishes"), problem, "let it vanish after it has appeared")
-        return False
-    if thing.velocity is not None and ways is not None:
+    elif thing.velocity is not None and ways is not None:
         collector.add((*path, "velocity"), "has no effect with waypoints", "remove one of them")
-        return False
-    for one, other in ("waypoints", "times"), ("times", "waypoints"):
-        if getattr(thing, one) is not None and getattr(thing, other) is None:
-            if collector.right(path, other):
+    elif ways is None or times is None:
+        for one, other in ("waypoints", "times"), ("times", "waypoints"):
+            if getattr(thing, one) is not None and collector.right(path, other):
                 collector.add((*path, other), f"is missing: {one} need it", f"add {other}")
-            return False
-    if ways is None or times is None:
-        return True
-    if len(ways) != len(times) or len(ways) < 2:
+    elif len(ways) != len(times) or len(ways) < 2:
         problem = f"has {len(times)} entries for {len(ways)} waypoints"
-        collector.add(
-            (*path, "times"), problem, "give one time for each waypoint, two or more", None
-        )
-        return False
-    if min(b - a for a, b in pairwise(times)) < bounds.TIME.least:
+        remedy = "give one time for each waypoint, two or more"
+        collector.add((*path, "times"), problem, remedy, None)
+    elif min(b - a for a, b in pairwise(times)) < bounds.TIME.least:
         collector.add((*path, "times"), "must increase", "order the waypoints by time")
-        return False
-    return True
 
 
-def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> bool:
+def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> None:
     if thing.file is not None:
-        collector.add(
-            (*path, "file"), NOT_A_FILE, "load the mission from its file, or give heights"
-        )
-        return False
+        remedy = "load the mission from its file, or give heights"
+        collector.add((*path, "file"), NOT_A_FILE, remedy)
+        return
     if thing.heights is None:
         if collector.right(path, "heights"):
             collector.add((*path, "heights"), "is missing", "add heights, or a file with them")
-        return False
+        return
     rows = {len(row) for row in thing.heights}
+    count = len(thing.heights) * max(rows, default=0)
     if len(rows) > 1 or len(thing.heights) < 2 or min(rows) < 2:
         problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
         remedy = "give two rows or more, all of the same length, two or more"
         collector.add((*path, "heights"), problem, remedy, None)
-        return False
-    if (count := len(thing.heights) * max(rows)) > bounds.HEIGHTS:
+    elif count > bounds.HEIGHTS:
         problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"
         collector.add((*path, "heights"), problem, "use a coarser grid", None)
-        return False
-    lowest = min(map(min, thing.heights))
-    if thing.base is not None and thing.base > lowest:
+    elif thing.base is not None and thing.base > (lowest := min(map(min, thing.heights))):
         problem = f"lies above the lowest height, {lowest:g} m"
         collector.add((*path, "base"), problem, "give a base at or below all heights")
-        return False
-    return True

@@ -22,7 +22,6 @@ from rigidfleet.mission.kinds import (
     KINDS,
     TIMES,
     AnyPhase,
-    Brake,
     Establish,
     Follow,
     Go,
@@ -207,14 +206,7 @@ def _times(
             first = first + (shortest or 0.0) if first is not None else None
             last = last + (longest or 0.0) if last is not None else None
         lengths[k] = longest
-        travel = seconds(p.steering.travel or 0.0) if p.steering is not None else 0.0
-        if p.shaping is not None:
-            _blend(collector, p.shaping, longest, path)
-        elif travel and longest is not None and travel > longest * (1 + 1e-9):
-            problem = f"is longer than the phase, which ends after {longest:g} s"
-            collector.add(
-                (*path, "travel"), problem, "reduce travel or end the phase later", travel
-            )
+        _motion(collector, p, longest, path)
     return last, lengths
 
 
@@ -233,22 +225,24 @@ def _in_order(
         collector.add((*path, "until"), problem, remedy)
 
 
-def _blend(collector: FindingCollector, p: Shaping, longest: float | None, path: Keys) -> None:
+def _motion(collector: FindingCollector, p: AnyPhase, longest: float | None, path: Keys) -> None:
+    """Check that the travel or blend of a phase is not longer than the phase."""
+    lasts = p.least_time
     if not collector.right(path, "reference", "blend", *_ENDINGS):
         return
-    if p.reference == "step":
+    if p.shaping is not None and p.shaping.reference == "step":
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
             collector.add((*path, "blend"), "has no effect with reference 'step'", remedy)
-    else:
-        _blended(collector, seconds(p.blend), longest, path)
-
-
-def _blended(collector: FindingCollector, blend: float, longest: float | None, path: Keys) -> None:
-    if longest is not None and blend > longest * (1 + 1e-9):
+    elif longest is None or isinstance(p, Follow) or not lasts > longest * (1 + 1e-9):
+        return
+    elif hasattr(p, "blend"):
         problem = f"is longer than the phase, which lasts {longest:g} s"
         remedy = f"use blend <= {longest:g} or end the phase later"
-        collector.add((*path, "blend"), problem, remedy, blend)
+        collector.add((*path, "blend"), problem, remedy, lasts)
+    else:
+        problem = f"is longer than the phase, which ends after {longest:g} s"
+        collector.add((*path, "travel"), problem, "reduce travel or end the phase later", lasts)
 
 
 def _samples(
@@ -345,8 +339,6 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
         collector.add((*path, "control"), problem, "use control = 'tracking'")
     if p.settle is not None and collector.right(path, *_ENDINGS):
         collector.add((*path, "settle"), "an orbit never settles", "end it by duration or until")
-    if collector.right(path, "blend", *_ENDINGS):
-        _blended(collector, seconds(p.blend), longest, path)
     if not collector.right(path, "rate_deg_s", "radius"):
         return
     rate, where = abs(np.deg2rad(p.rate_deg_s)), (*path, "rate_deg_s")
@@ -361,18 +353,7 @@ def _orbit(collector: FindingCollector, p: Orbit, path: Keys, longest: float | N
         collector.add(where, problem, "use a lower rate or several phases")
 
 
-def _led(
-    collector: FindingCollector, p: Brake | Go | Vertical, path: Keys, longest: float | None
-) -> None:
-    """Check that a brake, a take-off, a landing or a way to be found has tracked slots and an end."""
-    _ended(collector, p, path)
-    travel = p.least_time
-    if longest is not None and travel > longest * (1 + 1e-9):
-        problem = f"is longer than the phase, which ends after {longest:g} s"
-        collector.add((*path, "travel"), problem, "reduce travel or end the phase later")
-
-
-def _ended(collector: FindingCollector, p: AnyPhase, path: Keys) -> None:
+def _ended(collector: FindingCollector, p: AnyPhase, path: Keys, _: float | None) -> None:
     """Check that a phase with a way of its own has tracked slots and a time of arrival."""
     kind_name = collector.data["phases"][path[1]]["kind"]
     if p.control == "body" and collector.right(path, "control"):
@@ -384,8 +365,8 @@ def _ended(collector: FindingCollector, p: AnyPhase, path: Keys) -> None:
 
 
 def _vertical(collector: FindingCollector, p: Vertical, path: Keys, longest: float | None) -> None:
-    """Check how a take-off or a landing is staggered, besides what `_led` checks."""
-    _led(collector, p, path, longest)
+    """Check how a take-off or a landing is staggered, besides what `_ended` checks."""
+    _ended(collector, p, path, longest)
     if p.stagger is None:
         if "by" in p.model_fields_set:
             collector.add((*path, "by"), "has no effect without stagger", "remove it")
@@ -400,7 +381,7 @@ def _vertical(collector: FindingCollector, p: Vertical, path: Keys, longest: flo
 
 def _go(collector: FindingCollector, p: Go, path: Keys, longest: float | None) -> None:
     """Check that a way can be found and flown: tracked slots, an end, and formations that exist."""
-    _led(collector, p, path, longest)
+    _ended(collector, p, path, longest)
     for name in p.formations or ():
         _exists(collector, name, path, "formations")
 
@@ -411,7 +392,7 @@ _JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float | None) -> None:
     """Check that there are trajectories, without jumps, and an end."""
-    _ended(collector, p, path)
+    _ended(collector, p, path, longest)
     where = (*path, "trajectories")
     if p.trajectories is None:
         problem, remedy = "is missing", "give the name of a file with trajectories"
@@ -491,7 +472,7 @@ def _reshape(collector: FindingCollector, p: Reshape, path: Keys, _: float | Non
 
 
 _OWN: dict[str, Callable[[FindingCollector, Any, Keys, float | None], None]] = {
-    "brake": _led,
+    "brake": _ended,
     "establish": _establish,
     "follow": _follow,
     "land": _vertical,

@@ -52,23 +52,18 @@ def read_text(path: str | Path) -> str:
     except IsADirectoryError:
         raise unread(origin, "is a folder", "give the path of a mission file in it") from None
     except PermissionError:
-        raise unread(
-            origin, "cannot be read: permission denied", "change its permissions"
-        ) from None
+        problem = "cannot be read: permission denied"
+        raise unread(origin, problem, "change its permissions") from None
     except (OSError, ValueError) as error:
-        raise unread(
-            origin, f"cannot be read ({error})", "give the path of a mission file"
-        ) from None
+        problem = f"cannot be read ({error})"
+        raise unread(origin, problem, "give the path of a mission file") from None
+    remedy = "give the path of a mission file (TOML)"
     if len(data) > bounds.BYTES:
-        raise unread(
-            origin,
-            f"is larger than {bounds.BYTES >> 20} MiB",
-            "give the path of a mission file (TOML)",
-        )
+        raise unread(origin, f"is larger than {bounds.BYTES >> 20} MiB", remedy)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        remedy = "give the path of a mission file (TOML)" if b"\0" in data else "save it as UTF-8"
+        remedy = remedy if b"\0" in data else "save it as UTF-8"
         raise unread(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
 
 
@@ -96,15 +91,11 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        problem, remedy = (
-            f"is not valid TOML: {error}",
-            "correct the line; toml.io describes the format",
-        )
+        problem = f"is not valid TOML: {error}"
+        remedy = "correct the line; toml.io describes the format"
     except ValueError as error:  # a number of thousands of digits
-        problem, remedy = (
-            f"cannot be read as TOML: {error}",
-            "correct it; toml.io describes the format",
-        )
+        problem = f"cannot be read as TOML: {error}"
+        remedy = "correct it; toml.io describes the format"
     except RecursionError:
         problem, remedy = "is nested too deeply", "use the keys of a mission"
     raise unread(origin, problem, remedy)

@@ -299,6 +299,13 @@ def equipped(collector: FindingCollector, agents: Any, vehicles: Mapping[str, Ve
     return {key: value for key, value in agents.items() if key != "saturate"} | own
 
 
+#: Problem and remedy of what points without sampled control cannot have.
+NOT_SAMPLED = (
+    "needs sampled control, which only vehicles have",
+    "give the agents a vehicle; model = 'point' flies points with sampled control",
+)
+
+
 def flies_vehicles(collector: FindingCollector) -> bool:
     """Whether the agents of a mission are to fly vehicles."""
     agents = collector.data.get("agents")
@@ -312,11 +319,7 @@ def check_flight(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
         tracking = parts.get("tracking")
         for key in ("integral", "drag_feedforward") if tracking is not None else ():
             if getattr(tracking, key):
-                problem = "needs sampled control, which only vehicles have"
-                remedy = (
-                    "give the agents a vehicle; model = 'point' flies points with sampled control"
-                )
-                collector.add(("tracking", key), problem, remedy)
+                collector.add(("tracking", key), *NOT_SAMPLED)
         if "autopilot" in collector.data:
             problem = "has no effect on point masses that give any force at once"
             collector.add(("autopilot",), problem, "remove it, or give the agents a vehicle", None)
