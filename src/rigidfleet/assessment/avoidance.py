@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import CheckResult, value
-from rigidfleet.result import Extremum, Result
+from rigidfleet.assessment.outcome import CheckResult, Extreme, bounded, value
+from rigidfleet.result import Result
 
 #: The two margins: between vehicles, and between vehicles and obstacles.
 _MARGINS = ("guarantee", "clearance_guarantee")
@@ -22,29 +22,20 @@ def guarantee_checks(measured: Measurements) -> Iterator[CheckResult]:
     given = measured.mission.avoidance
     if given is None or not given.guard:
         return
-    if (lost := _lost(measured)) is not None:
-        name, x, phase = lost
-        who = _who(measured, name, x)
+    lost, least = (_least(measured, ending) for ending in ("_lost", ""))
+    words = f"the guarantee of [avoidance] is {'held' if _doubt(measured) else 'proved'}"
+    if lost is not None:
         words = (
-            f"the guarantee of [avoidance] is lost at {x.time:.2f} s, by {who}: braking at once would leave them"
-            f" {value(-x.value, 'm')} too near"
+            f"the guarantee of [avoidance] is lost at {lost.when:.2f} s, by {lost.who}: braking at once would leave"
+            f" them {value(-lost.value, 'm')} too near"
         )
-        yield CheckResult(
-            "guarantee", False, words, x.value, 0.0, "m", at_least=True, when=x.time, who=who, phase=phase
-        )  # fmt: skip
-        return
-    state = "held" if _doubt(measured) else "proved"
-    least = _least(measured)
-    if least is None:
-        words = f"the guarantee of [avoidance] is {state}: no vehicle has come near anything"
-        yield CheckResult("guarantee", True, words, limit=0.0, unit="m", at_least=True)
-        return
-    name, x, phase = least
-    who = _who(measured, name, x)
-    words = f"the guarantee of [avoidance] is {state}, with {value(x.value, 'm')} to spare at least"
-    yield CheckResult(
-        "guarantee", True, words, max(x.value, 0.0), 0.0, "m", at_least=True, when=x.time, who=who, phase=phase
-    )  # fmt: skip
+    elif least is not None:
+        words += f", with {value(least.value, 'm')} to spare at least"
+        least = replace(least, value=max(least.value, 0.0))
+    else:
+        words += ": no vehicle has come near anything"
+    e, held = lost or least, lost is None
+    yield bounded("guarantee", e, "m", 0.0, words, passed=held, at_least=True)
 
 
 def avoidance_notes(measured: Measurements) -> Iterator[str]:
@@ -54,7 +45,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
         return
     if not given.guard:
         yield "[avoidance] without its guard guarantees nothing"
-    elif _lost(measured) is None:
+    elif _least(measured, "_lost") is None:
         doubt = _doubt(measured)
         yield (
             f"the guarantee of [avoidance] was held at every tick, but is not proved: {doubt}"
@@ -101,31 +92,12 @@ def _first_layers(result: Result) -> Iterator[str]:
         yield f"of the samples, by time: {', '.join(told)}{aside}"
 
 
-def _lost(measured: Measurements) -> tuple[str, Extremum, str] | None:
-    """The first time at which a margin was negative."""
-    found = [
-        (name, p.extremes[f"{name}_lost"], p.name)
-        for p in measured.result.phases
-        for name in _MARGINS
-        if f"{name}_lost" in p.extremes
-    ]
-    return min(found, key=lambda each: each[1].time, default=None)
-
-
-def _least(measured: Measurements) -> tuple[str, Extremum, str] | None:
-    found = [
-        (name, p.extremes[name], p.name)
-        for p in measured.result.phases
-        for name in _MARGINS
-        if name in p.extremes
-    ]
-    return min(found, key=lambda each: each[1].value, default=None)
-
-
-def _who(measured: Measurements, name: str, x: Extremum) -> str:
-    if name == "guarantee":
-        return agent_names(sorted((x.who, x.other)))
-    return measured.beside(x.who, x.other)
+def _least(measured: Measurements, ending: str) -> Extreme | None:
+    """The least margin, or with the ending "_lost" the first that was negative."""
+    phases = range(len(measured.result.phases))
+    every = [measured.between(name + ending, k) for k in phases for name in _MARGINS]
+    known = [e for e in every if e is not None]
+    return min(known, key=lambda e: e.when if ending else e.value, default=None)
 
 
 def _doubt(measured: Measurements) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from operator import itemgetter
 
 import numpy as np
 
@@ -16,10 +15,12 @@ from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import (
     FLIPPED,
+    SLACK,
     TOUCH_DOWN,
     CheckResult,
     Extreme,
     PhaseVerdict,
+    bounded,
     value,
 )
 from rigidfleet.assessment.vehicles import tracking_check, vehicle_checks
@@ -27,8 +28,6 @@ from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import DIRECTIONS, PAD, Result
 from rigidfleet.typing import Floats
 
-# Excess over a limit that counts as rounding.
-_SLACK = 1e-9
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
 #: Greatest jump of a velocity that counts as rounding [m/s].
@@ -56,7 +55,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     worst = verdict.worst
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
-        yield from _as_planned(measured, verdict.phases)
+        yield from _failures_or_worst(_as_planned(measured, verdict.phases))
     if "clearance" in worst:
         yield from _clearances(measured)
     if not measured.left.all():
@@ -67,7 +66,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
         yield _downwash(measured, limits.separation_below)
     if limits.geofence is not None:
         yield _geofence(measured, np.array(limits.geofence.min), np.array(limits.geofence.max))
-    yield _bounded("speed", worst.get("speed"), "m/s", limits.speed)
+    yield bounded("speed", worst.get("speed"), "m/s", limits.speed)
     acceleration = worst.get("acceleration")
     if acceleration is not None or limits.acceleration is not None:
         yield _moving("acceleration", acceleration, "m/s^2", limits.acceleration)
@@ -81,7 +80,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     yield from tracking_check(measured)
     yield from guarantee_checks(measured)
     units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
-    yield from (_bounded(name, worst[name], units[name], None) for name in units if name in worst)
+    yield from (bounded(name, worst[name], units[name], None) for name in units if name in worst)
 
 
 def _failures_or_worst(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -235,7 +234,7 @@ def _at_end(
 
 
 def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """Every waypoint that is missed, in each quantity, or the one met least well."""
+    """How well each waypoint is met, in each quantity."""
     points = [
         (p, what, at)
         for p in phases
@@ -248,11 +247,9 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = UNITS[name]
-        found = [
-            (miss, *point) for point in points if (miss := getattr(point[2], name)) is not None
-        ]
-        missed = [one for one in found if not one[0] <= limit]
-        for miss, p, what, at in missed or ([max(found, key=itemgetter(0))] if found else []):
+        for p, what, at in points:
+            if (miss := getattr(at, name)) is None:
+                continue
             passed = miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -288,43 +285,10 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         )
 
 
-def _bounded(
-    check: str,
-    e: Extreme | None,
-    unit: str,
-    limit: float | None,
-    words: str = "",
-    *,
-    passed: bool | None = None,
-    at_least: bool = False,
-    first: Extreme | None = None,
-) -> CheckResult:
-    """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
-    if e is None:
-        words = words or f"the flight has no {check.replace('_', ' ')} to judge"
-        return CheckResult(
-            check, True, words, None, limit, unit, at_least, judged=limit is not None
-        )
-    if not words:
-        name = check.replace("_", " ").replace("value", "value of J")
-        who = f", {e.who}," if e.who else ""
-        bound = "" if limit is None else f" (limit {limit:g} {unit})"
-        extreme = "smallest" if check == "singular_value" else "greatest"
-        words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
-    if e.at_samples:
-        words += ", at samples"
-    if passed is None:
-        passed = limit is None or e.value <= limit + _SLACK * max(1.0, abs(limit))
-    return CheckResult(
-        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None,
-        e.at_samples, first,
-    )  # fmt: skip
-
-
 def _moving(check: str, e: Extreme | None, unit: str, limit: float | None) -> CheckResult:
-    """As `_bounded`; a limit of what a trajectory does not have fails."""
+    """As `bounded`; a limit of what a trajectory does not have fails."""
     if e is not None or limit is None:
-        return _bounded(check, e, unit, limit)
+        return bounded(check, e, unit, limit)
     words = (
         f"{check.replace('_', ' ')} cannot be judged (limit {limit:g} {unit}): straight lines between samples have"
         " none. Assume cubics, or give velocities"
@@ -354,7 +318,7 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
 
 def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     limit = measured.mission.limits.separation or 0.0
-    passed = e.value > 0 and e.value >= limit - _SLACK
+    passed = e.value > 0 and e.value >= limit - SLACK
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
     first = None
@@ -364,26 +328,25 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
         words = (
             f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most, {depth}"
         )
-    return _bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
+    return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
 
 
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """Every phase in which agents come nearer than its plan's certificate allows, or the one nearest to that."""
+    """How much nearer agents come in each phase than its plan's certificate says."""
     allowed = measured.mission.limits.separation_allowance
-    found = [
-        (record.planned["separation"] - e.value, record.planned["separation"], phase.name, e)
-        for record, phase in zip(measured.result.phases, phases, strict=True)
-        if record.planned is not None and (e := phase.worst.get("separation")) is not None
-    ]
-    nearer = [one for one in found if not one[0] <= allowed + _SLACK]
-    for off, planned, name, e in nearer or ([max(found, key=itemgetter(0))] if found else []):
+    for record, phase in zip(measured.result.phases, phases, strict=True):
+        e = phase.worst.get("separation")
+        if record.planned is None or e is None:
+            continue
+        planned = record.planned["separation"]
+        off = planned - e.value
         words = (
-            f"in phase '{name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
+            f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
             f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
         )
         yield CheckResult(
-            "separation_as_planned", off <= allowed + _SLACK, words, off, allowed, "m",
-            when=e.when, who=e.who, phase=name,
+            "separation_as_planned", off <= allowed + SLACK, words, off, allowed, "m",
+            when=e.when, who=e.who, phase=phase.name,
         )  # fmt: skip
 
 
@@ -406,7 +369,7 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
             who, what = first.who.split(", ", 1)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = f"{who} hits '{what}', first at {first.when:.2f} s; {agent} is deepest in '{obstacle}', {depth}"
-        yield _bounded(
+        yield bounded(
             "clearance", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first
         )
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
@@ -415,7 +378,7 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
             agent, obstacle = e.who.split(", ", 1)
             how = "in contact with" if e.value <= _CONTACT else f"{value(e.value, 'm')} above"
             words = f"{agent} stands {how} '{obstacle}' {when} ({e.when:.2f} s)"
-            yield _bounded(name, e, "m", 0.0, words, passed=True, at_least=True)
+            yield bounded(name, e, "m", 0.0, words, passed=True, at_least=True)
 
 
 def _lost(measured: Measurements) -> CheckResult:
@@ -425,14 +388,14 @@ def _lost(measured: Measurements) -> CheckResult:
     told = ", ".join(f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
     e = measured.fallen_on()
     if e is None:
-        return _bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
+        return bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
     words = f"lost: {told}; after that, {e.who} come within {value(e.value, 'm')} of each other"
     words += f" at {e.when:.2f} s"
     first = None
     if e.value <= 0:
         first = measured.first_contact("lost") or e
         words = f"lost: {told}; after that, {first.who} collide, first at {first.when:.2f} s"
-    return _bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first)
+    return bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first)
 
 
 def abandoned(measured: Measurements) -> Iterator[CheckResult]:
@@ -461,11 +424,11 @@ def _downwash(measured: Measurements, limit: float) -> CheckResult:
     e = measured.below()
     if e is None:
         words = "no agent flies below another"
-        return _bounded("separation_below", e, "m", limit, words, at_least=True)
-    passed = e.value >= limit - _SLACK
+        return bounded("separation_below", e, "m", limit, words, at_least=True)
+    passed = e.value >= limit - SLACK
     words = f"{e.who} fly one below the other, {value(e.value, 'm')} apart"
     words += f" at {e.when:.2f} s (limit {limit:g} m)"
-    return _bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
+    return bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
 
 
 def _geofence(measured: Measurements, low: Floats, high: Floats) -> CheckResult:
@@ -474,7 +437,7 @@ def _geofence(measured: Measurements, low: Floats, high: Floats) -> CheckResult:
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
     if e.value > 0:
         words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
-    return _bounded("geofence", e, "m", 0.0, words)
+    return bounded("geofence", e, "m", 0.0, words)
 
 
 def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
@@ -483,7 +446,7 @@ def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
     if e is None:
         return  # nobody knows what a trajectory from elsewhere needs
     if beyond is None:
-        yield _bounded("thrust", e, "N", None)
+        yield bounded("thrust", e, "N", None)
         return
     limits = measured.mission.agents.thrust_limit
 
@@ -491,7 +454,7 @@ def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
         return float(limits[int(who.removeprefix("agent ")) - 1])
 
     if e.value - limit(e.who) < beyond.value:
-        yield _bounded("thrust_peak", e, "N", None)
+        yield bounded("thrust_peak", e, "N", None)
         most = limit(beyond.who)
         e = replace(beyond, value=beyond.value + most)
-    yield _bounded("thrust", e, "N", limit(e.who))
+    yield bounded("thrust", e, "N", limit(e.who))

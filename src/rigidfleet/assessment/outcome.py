@@ -14,6 +14,10 @@ TOUCH_DOWN = 0.5
 FLIPPED = 90.0
 
 
+#: Excess over a limit that counts as rounding.
+SLACK = 1e-9
+
+
 #: Depth below z = 0 from which an agent is noted if the mission has no ground [m].
 DIP = 0.01
 
@@ -143,3 +147,36 @@ def value(x: float, unit: str = "") -> str:
     """A number to three digits, with its unit."""
     number = f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
     return f"{number} {unit}".rstrip()
+
+
+def bounded(
+    check: str,
+    e: Extreme | None,
+    unit: str,
+    limit: float | None,
+    words: str = "",
+    *,
+    passed: bool | None = None,
+    at_least: bool = False,
+    first: Extreme | None = None,
+) -> CheckResult:
+    """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
+    if e is None:
+        words = words or f"the flight has no {check.replace('_', ' ')} to judge"
+        return CheckResult(
+            check, True, words, None, limit, unit, at_least, judged=limit is not None
+        )
+    if not words:
+        name = check.replace("_", " ").replace("value", "value of J")
+        who = f", {e.who}," if e.who else ""
+        bound = "" if limit is None else f" (limit {limit:g} {unit})"
+        extreme = "smallest" if check == "singular_value" else "greatest"
+        words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
+    if e.at_samples:
+        words += ", at samples"
+    if passed is None:
+        passed = limit is None or e.value <= limit + SLACK * max(1.0, abs(limit))
+    return CheckResult(
+        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None,
+        e.at_samples, first,
+    )  # fmt: skip

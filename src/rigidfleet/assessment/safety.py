@@ -59,6 +59,11 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     """
     measured = Measurements(result)
     found = {check.check: check for check in verdict.checks}
+    inside = found.get("geofence")
+    if inside is not None and inside.worst is not None:
+        inside = replace(
+            inside, worst=-inside.worst
+        )  # the distance inside the geofence, not outside
     rows = [
         _row(
             "proximity", "least distance between two vehicles' surfaces",
@@ -74,7 +79,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
         *_altitudes(measured),
         _row(
             "geofence", "least distance of a vehicle's centre to the geofence, from inside",
-            _from_inside(found.get("geofence")), "m", at_least=True,
+            inside, "m", at_least=True,
         ),
         _row("thrust", "greatest thrust of a vehicle", found.get("thrust"), "N"),
         _row(
@@ -118,13 +123,6 @@ def _row(
         worst = Extreme(finding.worst, finding.when, finding.who, finding.phase, finding.at_samples)
     limit = finding.limit if finding.limit is not None and np.isfinite(finding.limit) else None
     return Safety(quantity, text, unit, at_least, limit, worst, finding.passed)
-
-
-def _from_inside(finding: CheckResult | None) -> CheckResult | None:
-    """The geofence's finding; its worst value becomes the distance inside the geofence, not outside."""
-    if finding is None or finding.worst is None:
-        return finding
-    return replace(finding, worst=-finding.worst)
 
 
 def _altitudes(measured: Measurements) -> list[Safety]:

@@ -10,13 +10,10 @@ import numpy as np
 
 from rigidfleet._common.text import percent
 from rigidfleet.assessment.measure import Measurements, agent
-from rigidfleet.assessment.outcome import CheckResult, Extreme, value
+from rigidfleet.assessment.outcome import SLACK, CheckResult, Extreme, bounded, value
 from rigidfleet.math import attitude as att
 from rigidfleet.result import LABELS
 from rigidfleet.typing import Floats
-
-#: Share of a limit by which rounding may exceed it.
-_SLACK = 1e-9
 
 
 def vehicle_checks(measured: Measurements) -> Iterator[CheckResult]:
@@ -68,15 +65,12 @@ def _rotor_force(measured: Measurements, limits: Floats) -> Iterator[CheckResult
         f"the {names[j]} rotor of {who} gives up to {value(worst, 'N')} at {when:.2f} s"
         f" (limit {value(limit, 'N')})"
     )
-    passed = share <= 1.0 + _SLACK
-    yield CheckResult(
-        "rotor_force", passed, words, worst, limit, "N", when=when, who=who, phase=phase, at_samples=len(found) == 1
-    )  # fmt: skip
+    e = Extreme(worst, when, who, phase, at_samples=len(found) == 1)
+    yield bounded("rotor_force", e, "N", limit, words, passed=share <= 1.0 + SLACK)
 
 
 def _saturation(e: Extreme, limit: float) -> CheckResult:
     """Share of a phase in which a vehicle cannot give what is asked of it."""
-    passed = e.value <= limit + _SLACK
     words = (
         f"{e.who} cannot give what is asked of it for {percent(e.value)} of phase '{e.phase}'"
         f" (limit {percent(limit)})"
@@ -84,10 +78,7 @@ def _saturation(e: Extreme, limit: float) -> CheckResult:
     if e.value == 0.0:
         words = "no vehicle is asked for more than its rotors give"
         return CheckResult("saturation", True, words, 0.0, 100 * limit, "%")
-    share = 100 * e.value
-    return CheckResult(
-        "saturation", passed, words, share, 100 * limit, "%", when=e.when, who=e.who, phase=e.phase
-    )
+    return bounded("saturation", replace(e, value=100 * e.value), "%", 100 * limit, words)
 
 
 def _tilt(measured: Measurements) -> Extreme | None:
@@ -103,9 +94,4 @@ def _tilt(measured: Measurements) -> Extreme | None:
 def _checked(check: str, e: Extreme, unit: str, limit: float | None, deed: str) -> CheckResult:
     words = f"{e.who} {deed} up to {value(e.value, unit)} at {e.when:.2f} s"
     words += "" if limit is None else f" (limit {limit:g} {unit})"
-    words += ", at samples" * e.at_samples
-    passed = limit is None or e.value <= limit * (1.0 + _SLACK)
-    return CheckResult(
-        check, passed, words, e.value, limit, unit, when=e.when, who=e.who, phase=e.phase,
-        judged=limit is not None, at_samples=e.at_samples,
-    )  # fmt: skip
+    return bounded(check, e, unit, limit, words)
