@@ -175,25 +175,19 @@ class _Thing(NamedTuple):
     solid: Solids
 
 
-class _Flown(NamedTuple):
-    """The samples of a planned phase while an obstacle is there."""
-
-    time: Floats  # (K,) [s]; none if it is never there
-    position: Floats  # (K, N, 3) [m]
-    speed: Floats  # (K - 1, N) greatest speed between two samples [m/s]
-
-
-def _while_there(planned: PlannedPhase, since: float, until: float, speed: Floats) -> _Flown:
-    """The samples of a phase from one time to another [s], with samples at both."""
+def _while_there(
+    planned: PlannedPhase, since: float, until: float, speed: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Times (K,) of a phase from one time to another [s], positions (K, N, 3), and speeds (K - 1, N) between them."""
     leg, time = planned.leg, planned.time
     ends = np.array([max(since, time[0]), min(until, time[-1])])
     if ends[0] > ends[1]:
-        return _Flown(time[:0], planned.position[:0], speed[:0])
+        return time[:0], planned.position[:0], speed[:0]
     within = (time > ends[0]) & (time < ends[1])
     first, last = slot_derivatives(leg.reference, leg.motion, ends, 1)[:, :1]
     at = np.concatenate([ends[:1], time[within], ends[1:]])
     span = np.clip(np.searchsorted(time, at[:-1], side="right") - 1, 0, len(speed) - 1)
-    return _Flown(at, np.concatenate([first, planned.position[within], last]), speed[span])
+    return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 
 def _way(thing: Obstacle | _Thing, begin: Floats, end: Floats) -> Floats:
