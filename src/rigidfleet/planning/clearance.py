@@ -15,6 +15,7 @@ import numpy as np
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import proximity, series
 from rigidfleet.mission import Obstacle
+from rigidfleet.planning.certificate import of_agents
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.solids.records import Solids
@@ -146,7 +147,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         done += len(rows) * len(columns)
         half = 0.5 * spans.length
         middle, who = spans.first + half, spans.who
-        r = slot_derivatives(_of(leg.reference, who), leg.motion, middle, 1)[:, 0]
+        r = slot_derivatives(of_agents(leg.reference, who), leg.motion, middle, 1)[:, 0]
         between, _ = proximity.obstacle_clearances(r, radius[who], [met], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
@@ -159,14 +160,6 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
             )
         )  # fmt: skip
     return Closest(best, agent, when, min(least, best - CLOSE))
-
-
-def _of(reference: Reference, who: Ints) -> Reference:
-    """The reference of some agents' slots."""
-    if len(who) == len(reference.p0):
-        return reference
-    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
-    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 
 
 class _Thing(NamedTuple):
