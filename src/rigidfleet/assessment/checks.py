@@ -360,10 +360,8 @@ def _clearances(measured: Measurements) -> Iterator[CheckResult]:
         e = found.pop("clearance_flight", None)
     if e is not None:
         agent, obstacle = e.who.split(", ", 1)
-        words, first = (
-            f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s",
-            None,
-        )
+        words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
+        first = None
         if hit or e.value <= 0:
             first = measured.first_contact("clearance") or e
             who, what = first.who.split(", ", 1)

@@ -270,11 +270,8 @@ class Measurements:
 
     def height(self, *, lowest: bool) -> Extreme | None:
         """Least or greatest altitude [m] of an agent's centre."""
-        z, sense = (
-            self.of_left(self.result.position[..., 2]),
-            np.negative if lowest else np.positive,
-        )
-        name = "lowest" if lowest else "highest"
+        name, sense = ("lowest", np.negative) if lowest else ("highest", np.positive)
+        z = self.of_left(self.result.position[..., 2])
         return self.worst(name, self.extreme(z, agent, sense), sense)
 
     def nearest_to_limit(self) -> Extreme | None:
