@@ -387,30 +387,23 @@ def distances(
 
     Points farther than ``most`` may have infinity, too.
     """
-    found = _while_there(x, y, z, solid, time, most)
-    if not any(map(math.isfinite, solid.there[0].tolist())):
-        return found
-    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
-    return np.where(there, found, np.inf)
-
-
-def _while_there(
-    x: Floats, y: Floats, z: Floats, solid: Solids, time: ArrayLike, most: ArrayLike
-) -> Floats:
-    """Signed distance (...) [m] of points to a solid where it is, or would be, at ``time``."""
     if solid.moves:
         shift = distance.displacement(np.asarray(time, dtype=float).T, 0, solid)
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
     x, y, z = distance.own_axes(x, y, z, 0, solid)
-    if solid.kind[0] not in _SURFACES:
-        return distance.signed_distance(x, y, z, 0, solid)
-    found = np.full(x.shape, np.inf)
-    near = np.flatnonzero((distance.from_box(x, y, z, solid.size[0]) < most).reshape(-1))
-    points, flat = np.stack([x, y, z]).reshape(3, -1), found.reshape(-1)
-    for first in range(0, len(near), _TOGETHER):
-        some = near[first : first + _TOGETHER]
-        flat[some] = distance.signed_distance(*points[:, some], 0, solid)
-    return found
+    if solid.kind[0] in _SURFACES:
+        found = np.full(x.shape, np.inf)
+        near = np.flatnonzero((distance.from_box(x, y, z, solid.size[0]) < most).reshape(-1))
+        points, flat = np.stack([x, y, z]).reshape(3, -1), found.reshape(-1)
+        for first in range(0, len(near), _TOGETHER):
+            some = near[first : first + _TOGETHER]
+            flat[some] = distance.signed_distance(*points[:, some], 0, solid)
+    else:
+        found = distance.signed_distance(x, y, z, 0, solid)
+    if not any(map(math.isfinite, solid.there[0].tolist())):
+        return found
+    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
+    return np.where(there, found, np.inf)
 
 
 #: Number of points up to which all distances are compared: importing what finds neighbours faster takes longer.

@@ -11,7 +11,7 @@ from rigidfleet.formation.assignment import FEW, closest_approach
 from rigidfleet.kernel.problem import Reference, septic_polynomial
 from rigidfleet.math import proximity, series
 from rigidfleet.mission import Phase
-from rigidfleet.typing import Bools, Floats
+from rigidfleet.typing import Bools, Floats, Ints
 
 #: Greatest size of slots, in bytes, whose least separation is cached.
 _KEPT = 100_000
@@ -50,35 +50,38 @@ def certified(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
-    if not len(reference.knots):
-        return straight(reference, radius, lost)
     left = np.arange(len(radius)) if lost is None else np.flatnonzero(~lost)
     if len(left) < 2:
         return None
-    found = of_ways(reference.knots, reference.ways[:, left], radius[left])
+    some, r = of_agents(reference, left), radius[left]
+    found = of_ways(some.knots, some.ways, r) if len(some.knots) else straight(some, r)
+    assert found is not None  # of two agents
     i, j = (int(left[k]) for k in found.agents)
     return found._replace(agents=(i, j))
 
 
-def straight(reference: Reference, radius: Floats, lost: Bools | None = None) -> Certificate | None:
+def of_agents(reference: Reference, who: Ints) -> Reference:
+    """The reference of some agents' slots."""
+    if len(who) == len(reference.p0):
+        return reference
+    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
+    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
+
+
+def straight(reference: Reference, radius: Floats) -> Certificate | None:
     """Certificate of slots that blend: relative to the virtual body, all move straight and in step.
 
     How the virtual body moves and turns meanwhile does not matter to distances. None for a single agent.
     """
-    p, dp, r = reference.p0, reference.dp, radius
-    left = None if lost is None else np.flatnonzero(~lost)
-    if left is not None:
-        p, dp, r = p[left], dp[left], r[left]
+    p, dp = reference.p0, reference.dp
     if len(p) < 2:
         return None
     least = _least if p.nbytes < _KEPT else _least.__wrapped__
-    separation, (i, j), share = least(p.tobytes(), dp.tobytes(), r.tobytes())
-    if left is not None:
-        i, j = int(left[i]), int(left[j])
+    separation, pair, share = least(p.tobytes(), dp.tobytes(), radius.tobytes())
     time = reference.t0
     if share > 0.0:
-        time += reference.T_b * _when(share)
-    return Certificate(separation, time, (i, j), "closed form")
+        time += reference.T_b * float(np.interp(share, _FLOWN, _TAU))
+    return Certificate(separation, time, pair, "closed form")
 
 
 @lru_cache(64)
@@ -129,8 +132,3 @@ def of_ways(knots: Floats, ways: Floats, radius: Floats | None = None) -> Certif
 def _about(c: Floats, x: Floats) -> Floats:
     """Coefficients (L, 3, P) of polynomials about other points x (L,)."""
     return np.moveaxis(series.of_polynomials(c, x, c.shape[-1]), 0, -1)
-
-
-def _when(share: float) -> float:
-    """Share of the blend's duration at which agents have flown this share of their paths."""
-    return float(np.interp(share, _FLOWN, _TAU))

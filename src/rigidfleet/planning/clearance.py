@@ -15,6 +15,7 @@ import numpy as np
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import proximity, series
 from rigidfleet.mission import Obstacle
+from rigidfleet.planning.certificate import of_agents
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.solids.records import Solids
@@ -146,7 +147,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         done += len(rows) * len(columns)
         half = 0.5 * spans.length
         middle, who = spans.first + half, spans.who
-        r = slot_derivatives(_of(leg.reference, who), leg.motion, middle, 1)[:, 0]
+        r = slot_derivatives(of_agents(leg.reference, who), leg.motion, middle, 1)[:, 0]
         between, _ = proximity.obstacle_clearances(r, radius[who], [met], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
@@ -161,39 +162,25 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
     return Closest(best, agent, when, min(least, best - CLOSE))
 
 
-def _of(reference: Reference, who: Ints) -> Reference:
-    """The reference of some agents' slots."""
-    if len(who) == len(reference.p0):
-        return reference
-    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
-    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
-
-
 class _Thing(NamedTuple):
     """An obstacle that is always there."""
 
     solid: Solids
 
 
-class _Flown(NamedTuple):
-    """The samples of a planned phase while an obstacle is there."""
-
-    time: Floats  # (K,) [s]; none if it is never there
-    position: Floats  # (K, N, 3) [m]
-    speed: Floats  # (K - 1, N) greatest speed between two samples [m/s]
-
-
-def _while_there(planned: PlannedPhase, since: float, until: float, speed: Floats) -> _Flown:
-    """The samples of a phase from one time to another [s], with samples at both."""
+def _while_there(
+    planned: PlannedPhase, since: float, until: float, speed: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Times (K,) of a phase from one time to another [s], positions (K, N, 3), and speeds (K - 1, N) between them."""
     leg, time = planned.leg, planned.time
     ends = np.array([max(since, time[0]), min(until, time[-1])])
     if ends[0] > ends[1]:
-        return _Flown(time[:0], planned.position[:0], speed[:0])
+        return time[:0], planned.position[:0], speed[:0]
     within = (time > ends[0]) & (time < ends[1])
     first, last = slot_derivatives(leg.reference, leg.motion, ends, 1)[:, :1]
     at = np.concatenate([ends[:1], time[within], ends[1:]])
     span = np.clip(np.searchsorted(time, at[:-1], side="right") - 1, 0, len(speed) - 1)
-    return _Flown(at, np.concatenate([first, planned.position[within], last]), speed[span])
+    return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 
 def _way(thing: Obstacle | _Thing, begin: Floats, end: Floats) -> Floats:

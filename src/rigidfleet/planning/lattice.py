@@ -166,12 +166,8 @@ class Lattice:
         index = np.arange(len(grid)).reshape(self.shape)
         tails, heads = [], []
         for k in range(3):
-            one, two = (
-                np.delete(index, -1, axis=k).ravel(),
-                np.delete(index, 0, axis=k).ravel(),
-            )
-            tails.append(one)
-            heads.append(two)
+            tails.append(np.delete(index, -1, axis=k).ravel())
+            heads.append(np.delete(index, 0, axis=k).ravel())
         self.all_edges = np.array([np.concatenate(tails), np.concatenate(heads)])
         edges = self.all_edges[:, free[self.all_edges].all(axis=0)]
         still = np.zeros(len(radius))
@@ -197,11 +193,10 @@ def _coordinates(common: Floats, spans: Floats, above: float, below: float) -> F
 
 def _extent(thing: Obstacle, frame: Floats) -> Floats:
     """Lowest and highest coordinates (2, 3) [m] of an obstacle along the axes of a frame."""
+    solid, ends = thing.solid, records.extent(thing.solid)
     if np.array_equal(frame, np.eye(3)):
-        return records.extent(thing.solid)
-    solid = thing.solid
-    if not np.isfinite(records.extent(solid)).all():
-        ends = records.extent(solid)
+        return ends
+    if not np.isfinite(ends).all():
         upright = np.array_equal(frame[2], [0.0, 0.0, 1.0])
         wide = np.array([[-np.inf] * 3, [np.inf] * 3])
         wide[:, 2] = ends[:, 2] if upright else wide[:, 2]
@@ -256,6 +251,7 @@ class Network:
     def _join(self) -> None:
         """Collect motions within layers, changes at common places, and crossings from frame to frame."""
         tails, heads, costs = [], [], []
+        space, radius, need = self.space, self.radius, self.need
 
         def add(one: Ints, two: Ints, cost: Floats) -> None:
             tails.append(one)
@@ -273,7 +269,7 @@ class Network:
                 free = one.free[one.common] & two.free[two.common]
                 a, b = one.common[free], two.common[free]
                 spots = one.points[a]
-                good = self._changes(change, spots)
+                good = proved(space, spots, spots, change.path, change.ways, radius, need)
                 a, b = a[good] + self.first[f, change.before], b[good] + self.first[f, change.after]
                 add(a, b, np.full(len(a), change.cost))
         for f in range(1, len(self.lattices)):
@@ -281,11 +277,6 @@ class Network:
                 add(*self._crossings(k, layer, f))
         self.tails, self.heads = np.concatenate(tails), np.concatenate(heads)
         self.costs = np.concatenate(costs)
-
-    def _changes(self, change: Change, spots: Floats) -> Bools:
-        return proved(
-            self.space, spots, spots, change.path, change.ways, self.radius, self.need
-        )  # fmt: skip
 
     def _crossings(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
         """Straight ways of a layer between common places of the world's lattice and the nearest of another frame."""

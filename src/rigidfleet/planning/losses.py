@@ -44,15 +44,14 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
     d = mission.disturbances
     assert d is not None
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
-    travel = _shortest(mission, now, lambda t: _brake(t, max(t, rest)), _SHORTEST)
     phases: list[Phase] = []
 
-    def then(phase: Phase) -> None:
+    def then(make: Callable[[float], Phase], least: float = _SHORTEST) -> None:
         nonlocal now
-        phases.append(phase)
-        now = _after(mission, phase, now)
+        phases.append(make(_shortest(mission, now, make, least)))
+        now = changed(_planned(mission, phases[-1], now).after, blend=None)
 
-    then(_brake(travel, max(travel, rest)))
+    then(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
         if until > now.t:
@@ -60,20 +59,21 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
         return phases
     name = d.landing_formation
     if name is not None and name != now.formation:
-        make = partial(_spread, name)
-        then(make(_shortest(mission, now, make, _SHORTEST)))
+        spread = partial(Reshape, kind="reshape", name="spread (loss)", formation=name)
+        then(lambda t: spread(blend=t, duration=t))
     assert now.goal is not None
     axes = now.goal.T.T
     if math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
-        yaw = math.atan2(axes[1, 0] - axes[0, 1], axes[0, 0] + axes[1, 1])
-        make = partial(_turn, math.degrees(yaw))
-        then(make(_shortest(mission, now, make, _SHORTEST)))
+        yaw = math.degrees(math.atan2(axes[1, 0] - axes[0, 1], axes[0, 0] + axes[1, 1]))
+        level = partial(Turn, kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0)
+        then(lambda t: level(yaw_deg=yaw, duration=t))
     depth = height(mission, now)
     if depth > 0.0:
         least = max(
             _PEAK_SPEED * depth / DESCENT, math.sqrt(_PEAK_ACCELERATION * depth / DESCENDING)
         )
-        phases.append(_land(_shortest(mission, now, _land, max(least, _SHORTEST))))
+        land = partial(Land, kind="land", name="land (loss)")
+        then(lambda t: land(duration=t), max(least, _SHORTEST))
     return phases
 
 
@@ -91,35 +91,10 @@ def state_at(found: Leg, t: float, lost: np.ndarray | None) -> PhaseState:
     )  # fmt: skip
 
 
-def _after(mission: Mission, phase: Phase, now: PhaseState) -> PhaseState:
-    found = _planned(mission, phase, now).after
-    return changed(found, blend=None)
-
-
 def _planned(mission: Mission, phase: Phase, now: PhaseState) -> Leg:
     found = leg(mission, phase, now)
     assert found is not None  # slots are tracked
     return found
-
-
-def _brake(travel: float, duration: float) -> Brake:
-    return Brake(kind="brake", name="brake (loss)", duration=duration, travel=travel)
-
-
-def _spread(formation: str, time: float) -> Reshape:
-    return Reshape(
-        kind="reshape", name="spread (loss)", formation=formation, blend=time, duration=time
-    )
-
-
-def _turn(yaw: float, time: float) -> Turn:
-    return Turn(
-        kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0, yaw_deg=yaw, duration=time
-    )
-
-
-def _land(time: float) -> Land:
-    return Land(kind="land", name="land (loss)", duration=time)
 
 
 def _shortest(
@@ -130,15 +105,9 @@ def _shortest(
     Where the state at the start is beyond a limit, that counts as the limit. If no time keeps them, the best one tried.
     """
     own = mission.limits
-    limits = limits_of(
-        mission,
-        own.model_copy(
-            update={
-                "acceleration": BRAKING if own.acceleration is None else min(own.acceleration, BRAKING),
-                "jerk": JERK if own.jerk is None else min(own.jerk, JERK),
-            }
-        ),
-    )  # fmt: skip
+    gentle = {"acceleration": BRAKING, "jerk": JERK}
+    gentle = {name: min(most, getattr(own, name) or most) for name, most in gentle.items()}
+    limits = limits_of(mission, own.model_copy(update=gentle))
 
     def shares(reference: Reference, motion: Motion, end: float) -> np.ndarray:
         return np.array([x.share for x in reached(limits, reference, motion, now.t, end)])

@@ -121,23 +121,20 @@ def transfer(
     )  # fmt: skip
     rng = np.random.default_rng(seed)
     least_time = max(least_duration(s, g, limits.speed, limits.acceleration), _SHORTEST)
-    for slower in _SLOWER:
+    for duration in (slower * least_time for slower in _SLOWER):
         for start_number in range(_STARTS + 2):
             control = _straight(s, g)
             if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
-                control = _searched(_bowed(s, g), slower * least_time, limits, rng)
+                control = _searched(_bowed(s, g), duration, limits, rng)
             elif start_number:  # straight ways will not do
-                control = _searched(control, slower * least_time, limits, rng)
-            found = Transfer(control, slower * least_time, _NOTHING)
-            if not _kept(found, limits):
+                control = _searched(control, duration, limits, rng)
+            if not _kept(control, duration, limits):
                 continue
-            certificate = _proved(found, limits)
+            knots, pieces = splines.b_spline_pieces(control, duration)
+            certificate = of_ways(knots, pieces * metric[:, None])
             if certificate.separation >= distance:
-                return found._replace(certificate=certificate)
+                return Transfer(control, duration, certificate)
     return None
-
-
-_NOTHING = Certificate(0.0, 0.0, (0, 0), "conservative advancement")
 
 
 class _Limits(NamedTuple):
@@ -240,24 +237,15 @@ def _searched(
 
 def _turned(rise: Floats, order: int) -> Floats:
     """The negative transpose of differences of an order, applied to slopes of them."""
-    if order == 1:
-        return np.concatenate([rise[:1], np.diff(rise, axis=0), -rise[-1:]])
-    zero = np.zeros_like(rise[:1])
-    padded = np.concatenate([zero, zero, rise, zero, zero])
-    return -np.diff(padded, 2, axis=0)
+    turned = np.diff(np.pad(rise, ((order, order), (0, 0), (0, 0))), order, axis=0)
+    return turned if order == 1 else -turned
 
 
-def _kept(found: Transfer, limits: _Limits) -> bool:
+def _kept(control: Floats, duration: float, limits: _Limits) -> bool:
     """Whether ways keep the box, and the limits of speed and acceleration on each axis."""
-    h = found.duration / (len(found.control) - 3)
-    speed = np.abs(np.diff(found.control, 1, axis=0)) / h
-    acceleration = np.abs(np.diff(found.control, 2, axis=0)) / h**2
-    inside = (found.control >= limits.low - 1e-9) & (found.control <= limits.high + 1e-9)
+    h = duration / (len(control) - 3)
+    speed = np.abs(np.diff(control, 1, axis=0)) / h
+    acceleration = np.abs(np.diff(control, 2, axis=0)) / h**2
+    inside = (control >= limits.low - 1e-9) & (control <= limits.high + 1e-9)
     slow = (speed <= limits.speed * (1 + 1e-9)).all()
     return bool(inside.all() and slow and (acceleration <= limits.acceleration * (1 + 1e-9)).all())
-
-
-def _proved(found: Transfer, limits: _Limits) -> Certificate:
-    """Certificate of ways, in the metric of the distance to keep."""
-    knots, pieces = found.pieces()
-    return of_ways(knots, pieces * limits.metric[:, None])

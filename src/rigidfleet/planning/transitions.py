@@ -9,13 +9,13 @@ colours of the graph of these conflicts (greedy colouring, the agents with most 
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from rigidfleet._common.progress import report
-from rigidfleet.errors import Finding, MissionError
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
@@ -25,7 +25,7 @@ from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.preview import at_start, leg
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import transfer
-from rigidfleet.planning.ways import Timed
+from rigidfleet.planning.ways import Timed, refused
 from rigidfleet.typing import Floats, Ints
 
 #: What the parts of a transition are called.
@@ -67,13 +67,14 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
             room = _room(mission.rewritten(so_far) if tables else mission, len(tables), timed)
             parts = [_bent(mission, k, table, phase, before, room)]
         elif isinstance(phase, Reshape) and phase.transition != "straight":
-            levels = _levels(mission, k, phase, before)
-            if levels is not None:
+            stops = _stops(mission, k, phase, before)
+            if stops is not None:
                 names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
                 forms |= {
-                    name: {"slots": x, "edges": []} for name, x in zip(names, levels, strict=True)
+                    name: {"slots": x, "edges": []}
+                    for name, x in zip(names, stops[1:3], strict=True)
                 }
-                parts = _phases(table, phase, names, _lengths(mission, phase, before, levels))
+                parts = _phases(table, phase, names, stops)
         elif isinstance(phase, Vertical) and phase.stagger is not None:
             parts = _staggered(mission, k, table, phase, before)
         tables += parts
@@ -112,8 +113,7 @@ def _staggered(
             f"groups go one after another: give a duration of {len(groups) * phase.stagger:g} s, or up to"
             f" {phase.stagger:g} s less"
         )
-        path = f"phases[{number + 1}].duration"
-        raise MissionError([Finding(mission.origin, path, phase.duration, problem, remedy)])
+        raise refused(mission, number, "duration", phase.duration, problem, remedy)
     kept = {key: x for key, x in table.items() if key not in ("stagger", "by")}
     return [
         kept
@@ -121,12 +121,6 @@ def _staggered(
         | {"duration": phase.stagger if k < len(groups) else travel}
         for k, group in enumerate(groups, start=1)
     ]
-
-
-def _ends(mission: Mission, phase: Reshape, before: str | None) -> tuple[Floats, Floats] | None:
-    """Slots (N, 3) [m] about the centre of mass before and after a phase, in body axes; None if they are not known."""
-    found = [mission.slots_about_cm(name) for name in (before, phase.formation)]
-    return None if found[0] is None or found[1] is None else (found[0], found[1])
 
 
 def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
@@ -181,17 +175,12 @@ def _bent(
     MissionError
         There are no limits of speed and acceleration, no ways are found, or the blend is too short for them.
     """
-
-    def refused(key: str, value: object, problem: str, remedy: str) -> MissionError:
-        return MissionError(
-            [Finding(mission.origin, f"phases[{number + 1}].{key}", value, problem, remedy)]
-        )
-
-    p, q = _ends_known(mission, number, phase, before)
+    mistake = partial(refused, mission, number)
+    p, q = _ends(mission, number, phase, before)
     limits, radius = mission.limits, float(mission.fleet.radius.max())
     if limits.speed is None or limits.acceleration is None:
         problem = "is found within limits of speed and acceleration, and the mission lacks one"
-        raise refused(
+        raise mistake(
             "transition", phase.transition, problem, "give limits.speed and limits.acceleration"
         )
     distance = 2.0 * radius + (limits.separation or 0.0) + limits.separation_allowance
@@ -211,7 +200,7 @@ def _bent(
         )  # fmt: skip
     except ValueError as error:
         problem = f"between '{before}' and '{phase.formation}', {error}"
-        raise refused(
+        raise mistake(
             "transition", phase.transition, problem, "or lower limits.separation"
         ) from None
     if found is None:
@@ -219,15 +208,15 @@ def _bent(
             f"finds no ways to '{phase.formation}' that keep {distance:.3g} m from centre to centre"
         )
         remedy = "use transition = 'layers', place slots farther apart, or lower limits.separation"
-        raise refused("transition", phase.transition, problem, remedy)
+        raise mistake("transition", phase.transition, problem, remedy)
     least = math.ceil(found.duration * 1e3) / 1e3
     if phase.blend != AUTO and "blend" in phase.model_fields_set and phase.blend < least:
         problem = f"is too short for the ways found; the least is {least:g} s"
-        raise refused("blend", phase.blend, problem, "give that, or leave it out")
+        raise mistake("blend", phase.blend, problem, "give that, or leave it out")
     blend = phase.blend if "blend" in phase.model_fields_set and phase.blend != AUTO else least
     if isinstance(phase.duration, float) and phase.duration < blend:
         problem = f"is shorter than the ways found, which take {blend:g} s"
-        raise refused("duration", phase.duration, problem, "end the phase later")
+        raise mistake("duration", phase.duration, problem, "end the phase later")
     points = np.round(found.control, 9)
     points[:3], points[-3:] = p, q  # to the last bit, so that nothing jumps
     told = {"blend": blend, "alignment": "none", "control_points": points.tolist()}
@@ -236,30 +225,28 @@ def _bent(
     return table | told
 
 
-def _ends_known(
+def _ends(
     mission: Mission, number: int, phase: Reshape, before: str | None
 ) -> tuple[Floats, Floats]:
-    """`_ends` of a phase.
+    """Slots (N, 3) [m] about the centre of mass before and after a phase, in body axes.
 
     Raises
     ------
     MissionError
         They are not known.
     """
-    ends = _ends(mission, phase, before)
-    if ends is None:
-        path = f"phases[{number + 1}].transition"
+    p, q = (mission.slots_about_cm(name) for name in (before, phase.formation))
+    if p is None or q is None:
         problem, remedy = "starts from no formation with slots", "take a formation before"
-        raise MissionError([Finding(mission.origin, path, phase.transition, problem, remedy)])
-    return ends
+        raise refused(mission, number, "transition", phase.transition, problem, remedy)
+    return p, q
 
 
-def _levels(
+def _stops(
     mission: Mission, number: int, phase: Reshape, before: str | None
-) -> tuple[Floats, Floats] | None:
-    """Slots (N, 3) [m] of a phase's layers before and after the way across; None if its straight ways will do."""
-    p, q = _ends_known(mission, number, phase, before)
-    path = f"phases[{number + 1}].transition"
+) -> list[Floats] | None:
+    """Slots (N, 3) [m] before and after the three parts of a phase by layers; None if its straight ways will do."""
+    p, q = _ends(mission, number, phase, before)
     masses, radius, limits = mission.fleet.mass, mission.fleet.radius, mission.limits
     limit = limits.separation or 0.0
     if phase.transition == AUTO:
@@ -271,7 +258,8 @@ def _levels(
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
     level = height * _level_of(nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
-    for a, b, part in ((p, one, "apart"), (one, two, "across"), (two, q, "together")):
+    stops = [p, one, two, q]
+    for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):
         separation, pair, _ = closest_approach(a, b, radius)
         if separation <= 0.0 or separation < limit - _SLACK:
             who = " and ".join(f"agent {i + 1}" for i in pair)
@@ -280,8 +268,8 @@ def _levels(
                 f" {part} (limit {limit:g} m)"
             )
             remedy = "place slots farther apart as seen from above, or lower limits.separation"
-            raise MissionError([Finding(mission.origin, path, phase.transition, problem, remedy)])
-    return one, two
+            raise refused(mission, number, "transition", phase.transition, problem, remedy)
+    return stops
 
 
 _ABOVE = np.array([1.0, 1.0, 0.0])
@@ -304,22 +292,13 @@ def _level_of(conflicts: Ints, n: int) -> Floats:
     return place[colour]
 
 
-def _lengths(
-    mission: Mission, phase: Reshape, before: str | None, levels: tuple[Floats, Floats]
-) -> list[float]:
-    """Greatest way [m] of an agent in each of the three parts."""
-    ends = _ends(mission, phase, before)
-    assert ends is not None  # layers have been found between them
-    stops = [ends[0], *levels, ends[1]]
-    return [float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(stops)]
-
-
 def _phases(
-    table: dict[str, Any], phase: Reshape, names: list[str], lengths: list[float]
+    table: dict[str, Any], phase: Reshape, names: list[str], stops: list[Floats]
 ) -> list[dict[str, Any]]:
     """The three phases; a blend is shared such that all have about the same peak acceleration."""
     blends: list[Any] = [AUTO] * 3
     if phase.blend != AUTO:
+        lengths = [float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(stops)]
         shares = np.sqrt(np.maximum(lengths, 1e-3 * max(*lengths, 1e-6)))
         blends = [round(float(x), 6) for x in phase.blend * shares / shares.sum()]
     parts = []

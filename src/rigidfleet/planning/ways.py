@@ -26,7 +26,7 @@ from rigidfleet.planning.clearance import closest, pace
 from rigidfleet.planning.lattice import Lattice, Layer, Network, Space, Way, staying
 from rigidfleet.planning.preview import at_start, ending, leg, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.solids.records import extent
+from rigidfleet.solids.records import corners, extent
 from rigidfleet.typing import Floats
 
 #: A phase with its automatic times known, from the mission, the phase, the state at its start, and its number.
@@ -62,8 +62,8 @@ def found(mission: Mission, timed: Timed) -> Mission:
         for number, before in enumerate(mission.phases[:k]):
             planned = leg(mission, timed(mission, before, now, number), now)
             if planned is None:
-                raise _refused(mission, k, "kind", "go", "begins where distances alone have led",
-                               "give the formation a shape or slots")  # fmt: skip
+                raise refused(mission, k, "kind", "go", "begins where distances alone have led",
+                              "give the formation a shape or slots")  # fmt: skip
             now = planned.after
         mission = _Search(mission, k, phase, now, timed).expanded()
     return mission
@@ -77,12 +77,12 @@ class _Search:
     ) -> None:
         self.mission, self.number, self.phase, self.now, self.timed = mission, number, phase, now, timed  # fmt: skip
         if now.formation is None or now.slots is None:
-            raise _refused(mission, number, "kind", "go", "needs a formation that flies there",
-                           "add a phase of kind 'establish' before")  # fmt: skip
+            raise refused(mission, number, "kind", "go", "needs a formation that flies there",
+                          "add a phase of kind 'establish' before")  # fmt: skip
         speed = float(np.linalg.norm(now.v, axis=1).max())
         if speed > _REST:
-            raise _refused(mission, number, "kind", "go", f"begins at {speed:.2g} m/s, but a way begins at rest",
-                           "end the phase before at rest")  # fmt: skip
+            raise refused(mission, number, "kind", "go", f"begins at {speed:.2g} m/s, but a way begins at rest",
+                          "end the phase before at rest")  # fmt: skip
         masses = mission.fleet.mass
         pose = now.goal
         T = np.eye(3) if pose is None else pose.T
@@ -186,8 +186,8 @@ class _Search:
         )
         common = []
         for frame in frames:
-            corners = np.array(np.meshgrid(*self._domain.T)).reshape(3, -1).T @ frame.T
-            low, high = corners.min(axis=0), corners.max(axis=0)
+            points = corners(*self._domain) @ frame.T
+            low, high = points.min(axis=0), points.max(axis=0)
             ends = np.array([self.begin, self.end]) @ frame.T
             count = np.clip(np.ceil((high - low) / (2.0 * self.reach)), *_EVEN).astype(int)
             common.append(
@@ -284,8 +284,7 @@ class _Search:
             found = leg(tried, self.timed(tried, tried.phases[number], now, number), now)
             assert found is not None  # slots are tracked
             now = found.after
-            lacks = self._lacking(tried, found)
-            lacking = max(lacking, lacks)
+            lacking = max(lacking, self._lacking(tried, found))
         return tried, lacking
 
     def _lacking(self, mission: Mission, found: Any) -> float:
@@ -314,12 +313,12 @@ class _Search:
 
     def _unmet(self) -> MissionError:
         problem = f"ways are found round obstacles at rest, and on the one found {self._worst}"
-        return _refused(self.mission, self.number, "position", self.phase.position, problem,
-                        "wait before by kind 'hold', or fly elsewhere first")  # fmt: skip
+        return refused(self.mission, self.number, "position", self.phase.position, problem,
+                       "wait before by kind 'hold', or fly elsewhere first")  # fmt: skip
 
     def _unproved(self, lacking: float) -> MissionError:
         problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
-        return _refused(self.mission, self.number, "clearance", self.phase.clearance, problem,
+        return refused(self.mission, self.number, "clearance", self.phase.clearance, problem,
                        "give more time, or ask for less clearance")  # fmt: skip
 
     def _none(self, network: Network) -> MissionError:
@@ -333,8 +332,8 @@ class _Search:
                     f"its {what} leaves agent {agent + 1} {room.min():.2f} m of clearance from {thing}, which is less"
                     f" than {self.phase.clearance:g} m"
                 )
-                return _refused(self.mission, self.number, "position", self.phase.position, problem,
-                                "move it, or ask for less clearance")  # fmt: skip
+                return refused(self.mission, self.number, "position", self.phase.position, problem,
+                               "move it, or ask for less clearance")  # fmt: skip
         least, place, layer = network.widest((self.begin, 0), (self.end, self._last))
         x = network.layers[layer]
         room = network.space.room(place + x.offsets, network.radius)
@@ -348,7 +347,7 @@ class _Search:
             or f"has {least:.2f} m of clearance from {thing}, {network.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
-        return _refused(self.mission, self.number, "position", self.phase.position, problem, remedy)
+        return refused(self.mission, self.number, "position", self.phase.position, problem, remedy)
 
     def _nearest(
         self, network: Network, place: Floats, layer: int, room: Floats
@@ -392,8 +391,9 @@ def _angles(angles: layers.Angles) -> dict[str, float]:
     return {k: x for k, x in zip(ANGLES, angles, strict=True) if x or k == "yaw_deg"}
 
 
-def _refused(
+def refused(
     mission: Mission, number: int, key: str, value: object, problem: str, remedy: str
 ) -> MissionError:
+    """The error of a key of a phase, whose number counts from 0."""
     path = f"phases[{number + 1}].{key}"
     return MissionError([Finding(mission.origin, path, value, problem, remedy)])

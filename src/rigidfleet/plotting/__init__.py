@@ -9,8 +9,6 @@ user's matplotlib settings.
 from __future__ import annotations
 
 import io
-import os
-import secrets
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -18,6 +16,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.files import replacing, why_not
 from rigidfleet.errors import ResultError
 from rigidfleet.plotting.curves import (
     attitude,
@@ -267,17 +266,9 @@ def write(path: Path, data: bytes) -> None:
     ResultError
         The file cannot be written.
     """
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            part.write_bytes(data)
-            os.replace(part, path)
-        except BaseException:
-            part.unlink(missing_ok=True)
-            raise
+        with replacing(path) as file:
+            file.write(data)
     except OSError as error:
-        reason = error.strerror or error
-        raise ResultError(
-            f"{path}: the figure cannot be written: {reason}. Choose another folder."
-        ) from error
+        raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.plotting import peaks
+from rigidfleet.plotting import peaks, quadrotors
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
@@ -357,12 +357,7 @@ def disturbance(result: Result) -> Figure:
         force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
         if peaks.from_none(above, result, force, "N"):
             st.agents_legend(above, result.n_agents)
-    below.set_ylabel("from the slot [m]")
-    off = np.linalg.norm(result.position - result.slot_position, axis=2)
-    if np.isfinite(off).any():
-        peaks.from_none(below, result, off, "m")
-    else:
-        st.note(below, "no slots are tracked")
+    quadrotors.draw_off_slot(below, result)
     st.name_phases([above], result)
     return fig
 
@@ -490,29 +485,29 @@ def _who(result: Result, name: str, first: int, second: int) -> str:
 def draw_separation(ax: Axes, result: Result) -> None:
     """Least distance between the surfaces of two agents, with its limit."""
     ax.set_ylabel("between agents [m]")
-    values = np.where(np.isfinite(result.separation), result.separation, np.nan)
-    if not np.isfinite(values).any():
-        st.note(ax, "only one agent" if result.n_agents == 1 else "unknown")
-        return
-    st.line(ax, result.time, values, color=st.TONES[0])
     least = result.mission.limits.separation
-    st.limit(
-        ax, 0.0 if least is None else least, "contact" if least is None else f"limit {least:g} m"
-    )
-    _mark_least(ax, result, values, "separation")
-    _from_zero(ax, values)
+    words = "contact" if least is None else f"limit {least:g} m"
+    none = "only one agent" if result.n_agents == 1 else "unknown"
+    _draw_least(ax, result, "separation", none, least or 0.0, words)
 
 
 def draw_clearance(ax: Axes, result: Result) -> None:
     """Least distance to an obstacle."""
     ax.set_ylabel("to obstacles [m]")
-    values = np.where(np.isfinite(result.clearance), result.clearance, np.nan)
+    none = "no obstacles" if not result.mission.obstacles else "unknown"
+    _draw_least(ax, result, "clearance", none, 0.0, "contact")
+
+
+def _draw_least(ax: Axes, result: Result, name: str, none: str, limit: float, words: str) -> None:
+    """Least distances of a result by name, with a limit and what it is called; ``none`` if nothing is known."""
+    values = getattr(result, name)
+    values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
-        st.note(ax, "no obstacles" if not result.mission.obstacles else "unknown")
+        st.note(ax, none)
         return
     st.line(ax, result.time, values, color=st.TONES[0])
-    st.limit(ax, 0.0, "contact")
-    _mark_least(ax, result, values, "clearance")
+    st.limit(ax, limit, words)
+    _mark_least(ax, result, values, name)
     _from_zero(ax, values)
 
 

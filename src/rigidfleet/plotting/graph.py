@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,19 +28,11 @@ _DRAWN = 3
 
 def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
-    from rigidfleet.plotting.figure import Figure
-
     names = list(mission.formations)
-    columns = min(max(len(names), 1), 3)
-    rows = math.ceil(max(len(names), 1) / columns)
     with st.settings():
-        fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.4 + 3.6 * rows))
-        fig.settings = st.settings
-        height = (1 - 0.3 / fig.get_figheight()) / rows
-        for k, name in enumerate(names):
-            row, column = divmod(k, columns)
-            x, y = column / columns, (rows - 1 - row) * height + 0.2 / fig.get_figheight()
-            ax = fig.add_axes((x + 0.04 / columns, y, 0.92 / columns, 0.8 * height))
+        fig, rects = sketches.tiles(len(names), 3.6, 0.4, (0.1, 0.2))
+        for (x, y, width, height), name in zip(rects, names, strict=True):
+            ax = fig.add_axes((x + 0.04 * width, y, 0.92 * width, 0.8 * height))
             _draw(ax, mission, name, judged.get(name))
     return fig
 

@@ -50,10 +50,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
 @styled
 def summary(result: Result) -> Figure:
     """Trajectory, top view, distances, attitude, thrust and clearance on one page."""
-    from rigidfleet.plotting.figure import Figure
-
-    fig = Figure(figsize=(11.4, 7.0))
-    fig.settings = st.settings
+    fig = st.blank(11.4, 7.0)
     st.head(fig, result, st.clean(result.mission.title, 80) or "Flight")
     view = space.scene(result)
     space.draw_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))

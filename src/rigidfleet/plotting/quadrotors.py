@@ -133,22 +133,26 @@ def vehicles(result: Result) -> Figure:
     title = "Tilt, tracking error and saturation of the vehicles"
     fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
     above, middle, below = axes[:, 0]
-    limits = result.mission.limits
     above.set_ylabel("tilt [deg]")
     if not has_rotors(result):
         st.note(above, "points do not tilt")
     else:
-        _draw_limited(above, result, tilt(result), "deg", "tilt", limits.tilt_deg)
+        _draw_limited(above, result, tilt(result), "deg", "tilt", result.mission.limits.tilt_deg)
         st.agents_legend(above, result.n_agents)
-    middle.set_ylabel("from the slot [m]")
-    off = tracking_error(result)
-    if np.isfinite(off).any():
-        _draw_limited(middle, result, off, "m", "tracking_error", limits.tracking_error)
-    else:
-        st.note(middle, "no slots are tracked")
+    draw_off_slot(middle, result)
     _draw_saturation(below, result, saturated)
     st.name_phases([above], result)
     return fig
+
+
+def draw_off_slot(ax: Axes, result: Result) -> None:
+    """Distance of each vehicle from its slot, with the mission's limit."""
+    ax.set_ylabel("from the slot [m]")
+    off, limit = tracking_error(result), result.mission.limits.tracking_error
+    if np.isfinite(off).any():
+        _draw_limited(ax, result, off, "m", "tracking_error", limit)
+    else:
+        st.note(ax, "no slots are tracked")
 
 
 def _draw_limited(

@@ -47,25 +47,38 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
     return places, False
 
 
+#: Left, bottom, width and height, as shares of a figure.
+Rect = tuple[float, float, float, float]
+
+
+def tiles(
+    n: int, high: float, more: float, beside: tuple[float, float]
+) -> tuple[Figure, list[Rect]]:
+    """A figure with places for n pictures, up to three side by side: ``high`` for each row, and ``more`` [in].
+
+    Above and below the pictures there is room ``beside`` [in].
+    """
+    columns = min(max(n, 1), 3)
+    rows = math.ceil(max(n, 1) / columns)
+    fig = st.blank(max(3.4 * columns, 6.0), more + high * rows)
+    above, below = (room / fig.get_figheight() for room in beside)
+    height = (1 - above - below) / rows
+    places = (divmod(k, columns) for k in range(n))
+    return fig, [
+        (x / columns, 1 - above - (y + 1) * height, 1 / columns, height) for y, x in places
+    ]
+
+
 @styled
 def formations(result: Result) -> Figure:
     """Constraint graph and body axes of each formation of the mission."""
-    from rigidfleet.plotting.figure import Figure
-
     names = list(result.mission.formations)
-    columns = min(max(len(names), 1), 3)
-    rows = math.ceil(max(len(names), 1) / columns)
-    fig = Figure(figsize=(max(3.4 * columns, 6.0), 0.5 + 3.5 * rows))
-    fig.settings = st.settings
+    legend = len(result.edges) > curves.SINGLE and bool(names)
+    fig, rects = tiles(len(names), 3.5, 0.5, (0.45, 0.7 * legend))
     st.head(fig, result, "Formations with their body axes")
     if not names:
         fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
-    legend = len(result.edges) > curves.SINGLE and bool(names)
-    top, bottom = 1 - 0.45 / fig.get_figheight(), 0.7 * legend / fig.get_figheight()
-    for k, name in enumerate(names):
-        row, column = divmod(k, columns)
-        height = (top - bottom) / rows
-        rect = (column / columns, top - (row + 1) * height, 1 / columns, height)
+    for rect, name in zip(rects, names, strict=True):
         _sketch(fig, rect, result, name)
     if legend:
         entries = curves.edge_handles(result)
@@ -78,9 +91,7 @@ def formations(result: Result) -> Figure:
     return fig
 
 
-def _sketch(
-    fig: Figure, rect: tuple[float, float, float, float], result: Result, name: str
-) -> None:
+def _sketch(fig: Figure, rect: Rect, result: Result, name: str) -> None:
     mission = result.mission
     p, placed = sketch_places(mission, name)
     edges = mission.formation_edges(name)

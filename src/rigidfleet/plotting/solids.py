@@ -145,14 +145,8 @@ def draw_from_above(ax: Axes, shape: Shape) -> None:
     if len(shape.way) > 1:
         way = shape.way[:, :2] + rim.mean(axis=0)
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=1.2)
-    x, y = rim.mean(axis=0) + shape.at[-1, :2]
-    low = float(rim[:, 1].min() + shape.at[-1, 1])
-    label = ax.text(
-        x, low, st.clean(shape.name, 20), fontsize=6.5, color=st.GREY, ha="center", va="bottom", zorder=1.5,
-        parse_math=False,
-    )  # fmt: skip
-    if label.get_window_extent().width > patch.get_window_extent().width:
-        label.remove()
+    x, y = rim.mean(axis=0)[0], rim[:, 1].min()
+    st.name_box(ax, patch, x + shape.at[-1, 0], y + shape.at[-1, 1], shape.name)
 
 
 def _ramp() -> Any:

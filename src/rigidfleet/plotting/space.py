@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import product
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -13,6 +12,7 @@ from rigidfleet.plotting import solids
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
+from rigidfleet.solids.records import corners
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -140,12 +140,8 @@ def _shots(result: Result, rows: Any) -> list[int]:
     return sorted(kept)
 
 
-def _corners(low: Floats, high: Floats) -> Floats:
-    return np.array(list(product(*zip(low, high, strict=True))))
-
-
 def _faces(low: Floats, high: Floats) -> list[Floats]:
-    c = _corners(low, high)
+    c = corners(low, high)
     sides = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
     return [c[list(side)] for side in sides]
 
@@ -161,19 +157,18 @@ def _segments(result: Result, shots: list[int]) -> Floats:
 
 def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Draw paths, agents at the drawn samples, start, end and waypoints, in 2 or 3 axes."""
-    shots = view.shots
+    for _, place in view.waypoints:
+        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
     if result.n_agents > st.MANY:
         _draw_many(ax, result, view, axes)
         return
     for i, colour in enumerate(st.agent_colours(result.n_agents)):
         path: dict[str, Any] = {"color": colour, "linewidth": 0.8, "alpha": 0.9, "zorder": 3}
         ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
-        r = result.position[shots, i, :axes].T
+        r = result.position[view.shots, i, :axes].T
         ax.plot(*r, **dot(colour, 3), zorder=5)
         ax.plot(*r[:, :1], **dot(colour, 5, hollow=True), zorder=6, gid="start")
         ax.plot(*r[:, -1:], **dot(colour, 5, marker="s"), zorder=6, gid="end")
-    for _, place in view.waypoints:
-        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
 
 
 def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
@@ -188,8 +183,6 @@ def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         look: dict[str, Any] = {"c": "white" if hollow else colours, "edgecolors": colours}
         look |= {"marker": "s" if k == last else "o", "linewidths": 0.5 if hollow else 0.0}
         ax.scatter(*r, s=4 if k in (first, last) else 3, **look, zorder=6 if hollow else 5)
-    for _, place in view.waypoints:
-        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
 
 
 def dot(colour: str, size: float, *, hollow: bool = False, marker: str = "o") -> dict[str, Any]:
@@ -222,7 +215,7 @@ def draw_space(
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     _plain_axes(ax)
     if view.ground:
-        flat = _corners(low, high)[[0, 2, 6, 4]]
+        flat = corners(low, high)[[0, 2, 6, 4]]
         flat[:, 2] = view.floor
         ax.add_collection3d(Poly3DCollection([flat], facecolor=_GROUND, alpha=0.8, zorder=0))
     for _, a, b in view.boxes:
@@ -314,18 +307,18 @@ def _fit(fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, 
     margin = 0.42 * fig.dpi  # for tick and axis labels
     side = max(width, height)
     spans = [float(s) for s in view.high - view.low]
-    corners = _corners(view.low, view.high)
+    ends = corners(view.low, view.high)
 
     def place(x: float, y: float) -> None:
         ax.set_position(Bbox.from_bounds(x, y, side, side).transformed(fig.transFigure.inverted()))
         ax.apply_aspect()
 
     place(left, bottom)
-    extent = np.ptp(_on_screen(ax, corners), axis=0)
+    extent = np.ptp(_on_screen(ax, ends), axis=0)
     zoom = min((width - 2 * margin) / extent[0], (height - 2 * margin) / extent[1])
     ax.set_box_aspect(spans, zoom=zoom)
     place(left, bottom)
-    now = _on_screen(ax, corners)
+    now = _on_screen(ax, ends)
     middle = (now.min(axis=0) + now.max(axis=0)) / 2
     place(left + (left + width / 2 - middle[0]), bottom + (bottom + height / 2 - middle[1]))
 
@@ -369,12 +362,7 @@ def _outline(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> Non
 
     (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
     box = ax.add_artist(Rectangle((x, y), width, depth, zorder=1, **look))
-    label = ax.text(
-        x + width / 2, y, st.clean(name, 20), fontsize=6.5, color=st.GREY, ha="center",
-        va="bottom", zorder=1.5, parse_math=False,
-    )  # fmt: skip
-    if label.get_window_extent().width > box.get_window_extent().width:
-        label.remove()
+    st.name_box(ax, box, x + width / 2, y, name)
 
 
 def handles(result: Result, view: Scene) -> list[Any]:
@@ -393,11 +381,8 @@ def handles(result: Result, view: Scene) -> list[Any]:
 @styled
 def trajectory(result: Result) -> Figure:
     """Trajectory in three dimensions and from above, with the formation drawn at chosen times."""
-    from rigidfleet.plotting.figure import Figure
-
     wide = st.width(10.5)
-    fig = Figure(figsize=(wide, 2.2 * wide if st.narrow() else 6.2))
-    fig.settings = st.settings
+    fig = st.blank(wide, 2.2 * wide if st.narrow() else 6.2)
     st.head(fig, result, "Trajectory")
     view = scene(result)
     if st.narrow():  # the view from above stands below

@@ -20,6 +20,7 @@ from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -188,6 +189,15 @@ def scale(n: int) -> list[str]:
 # -- figures over time -------------------------------------------------------------------------------
 
 
+def blank(wide: float, high: float, layout: Any = None) -> Figure:
+    """An empty figure of a width and a height [in], which is drawn in our style."""
+    from rigidfleet.plotting.figure import Figure
+
+    fig = Figure(figsize=(wide, high), layout=layout)
+    fig.settings = settings
+    return fig
+
+
 def time_figure(
     result: Result,
     title: str,
@@ -197,7 +207,6 @@ def time_figure(
     shares: Sequence[float] | None = None,
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
-    from rigidfleet.plotting.figure import Figure
     from rigidfleet.plotting.layout import Layout
 
     shares = [1.0] * rows if shares is None else shares
@@ -205,8 +214,7 @@ def time_figure(
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)
-    fig = Figure(figsize=(width(WIDTH), whole), layout=Layout(_PAD))
-    fig.settings = settings
+    fig = blank(width(WIDTH), whole, Layout(_PAD))
     # Nearly the heights that the axes will have, as the number of their ticks depends on it
     inside = whole - 1.2 - 2 * _PAD * (rows - 1)
     grid = {"bottom": 0.5 / whole, "top": 1 - 0.7 / whole, "hspace": 2 * _PAD * rows / inside}
@@ -441,6 +449,16 @@ def power(value: float, _: int) -> str:
     if abs(exponent - round(exponent)) > 1e-9:  # as a user's ticks may be
         return f"{value:g}"
     return "10" + f"{exponent:.0f}".translate(_RAISED)
+
+
+def name_box(ax: Axes, box: Artist, x: float, y: float, name: str) -> None:
+    """Write the name of a box above its lower edge, if it fits."""
+    label = ax.text(
+        x, y, clean(name, 20), fontsize=6.5, color=GREY, ha="center", va="bottom", zorder=1.5,
+        parse_math=False,
+    )  # fmt: skip
+    if label.get_window_extent().width > box.get_window_extent().width:
+        label.remove()
 
 
 def spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:

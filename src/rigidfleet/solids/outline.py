@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.solids.distance import displacement
-from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, HULL, Solids, corners
 from rigidfleet.typing import Floats
 
 #: Number of sides of a circle.
@@ -49,15 +49,8 @@ def places(solid: Solids, times: Floats) -> Floats:
 
 
 def _box(size: Floats) -> Outline:
-    corner = np.array(
-        [
-            [size[3 * i], size[1 + 3 * j], size[2 + 3 * k]]
-            for k in (0, 1)
-            for j in (0, 1)
-            for i in (0, 1)
-        ]
-    )
-    faces = [(4, 5, 7, 6), (0, 2, 3, 1), (0, 1, 5, 4), (2, 6, 7, 3), (1, 3, 7, 5), (0, 4, 6, 2)]
+    corner = corners(size[:3], size[3:])
+    faces = [(1, 5, 7, 3), (0, 2, 6, 4), (0, 4, 5, 1), (2, 3, 7, 6), (4, 6, 7, 5), (0, 1, 3, 2)]
     triangles = corner[[[a, b, c] for a, b, c, _ in faces] + [[a, c, d] for a, _, c, d in faces]]
     edges = [(a, a | bit) for a in range(8) for bit in (1, 2, 4) if not a & bit]
     return Outline(triangles, corner[edges])
@@ -97,9 +90,9 @@ def _creases(triangles: Floats) -> Floats:
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     sides: dict[tuple[tuple[float, ...], ...], list[int]] = {}
-    for t, corners in enumerate(triangles.tolist()):
+    for t, points in enumerate(triangles.tolist()):
         for a, b in ((0, 1), (1, 2), (2, 0)):
-            sides.setdefault(tuple(sorted((tuple(corners[a]), tuple(corners[b])))), []).append(t)
+            sides.setdefault(tuple(sorted((tuple(points[a]), tuple(points[b])))), []).append(t)
     kept = [e for e, t in sides.items() if len(t) != 2 or normal[t[0]] @ normal[t[1]] < _FLAT]
     return np.array(kept).reshape(-1, 2, 3)
 
@@ -109,19 +102,10 @@ def _terrain(solid: Solids) -> Outline:
     z, size = solid.heights.reshape(solid.grid[0]), solid.size[0]
     x, y = (np.linspace(0.0, size[3 + k], n) for k, n in enumerate(z.shape))
     top = np.stack([*np.meshgrid(x, y, indexing="ij"), z], axis=-1)
-    a, b, c, d = (
-        p.reshape(-1, 3) for p in (top[:-1, :-1], top[1:, :-1], top[1:, 1:], top[:-1, 1:])
-    )
-    faces = [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
-    rims = [top[:, 0], top[-1], top[::-1, -1], top[::-1][-1, ::-1]]
-    for rim in rims:
-        under = rim.copy()
-        under[:, 2] = z.min()
-        faces += [
-            np.stack([under[:-1], under[1:], rim[1:]], axis=1),
-            np.stack([under[:-1], rim[1:], rim[:-1]], axis=1),
-        ]
+    a, b, c = solid.triangles.swapaxes(0, 1)
+    faces = solid.triangles[np.cross(b - a, c - a)[:, 2] >= 0.0]  # without the bottom
+    faces[..., 2] = np.maximum(faces[..., 2], z.min())
     pick = [np.unique(np.linspace(0, n - 1, min(n, 13)).round().astype(int)) for n in z.shape]
     rows = [*top[pick[0]], *top[:, pick[1]].swapaxes(0, 1)]
     lines = np.concatenate([np.stack([row[:-1], row[1:]], axis=1) for row in rows])
-    return Outline(np.concatenate(faces), lines)
+    return Outline(faces, lines)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -132,12 +133,9 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     Each cell of the grid is two triangles, divided from its lowest i, j to its highest.
     """
     z = np.asarray(heights, dtype=float)
-    step, origin = (
-        np.asarray(spacing, dtype=float),
-        np.array([*np.asarray(corner, dtype=float), 0.0]),
-    )
+    x, y = np.asarray(spacing, dtype=float)
     i, j = np.indices(z.shape)
-    top = np.stack([i * step[0], j * step[1], z], axis=-1)
+    top = np.stack([i * x, j * y, z], axis=-1)
     low = top.copy()
     low[..., 2] = base
     faces = _cells(top)
@@ -149,6 +147,7 @@ def height_map(corner: ArrayLike, spacing: ArrayLike, heights: ArrayLike, base: 
     a, b, c, d = low[0, 0], low[-1, 0], low[-1, -1], low[0, -1]
     faces.append(np.array([[a, c, b], [a, d, c]]))
     size = [0.0, 0.0, base, *top[-1, -1, :2], float(z.max())]
+    origin = np.array([*np.asarray(corner, dtype=float), 0.0])
     return Form(HEIGHTS, origin, _UPRIGHT, size, triangles=np.concatenate(faces), heights=z)
 
 
@@ -213,6 +212,11 @@ def boxes_of(parts: Sequence[Solids]) -> Floats | None:
     return np.concatenate([s.size for s in parts]) if parts else None
 
 
+def corners(low: ArrayLike, high: ArrayLike) -> Floats:
+    """Corners (8, 3) of a box from ``low`` to ``high`` (3,): those with the lowest x first, and so on."""
+    return np.array(list(product(*np.transpose([low, high]))))
+
+
 def extent(solid: Solids) -> Floats:
     """Lowest and highest corner (2, 3) [m] of the space that a solid, alone in its record, ever takes."""
     size, turn = solid.size[0], solid.turn[0]
@@ -221,11 +225,8 @@ def extent(solid: Solids) -> Floats:
         reach = half * np.abs(turn[2]) + radius * np.sqrt(np.maximum(1.0 - turn[2] ** 2, 0.0))
         low, high = -reach, reach
     elif solid.turned[0]:
-        corners = np.array(
-            [[size[a], size[b], size[c]] for a in (0, 3) for b in (1, 4) for c in (2, 5)]
-        )
-        corners = corners @ turn  # from own axes to the world's
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        points = corners(size[:3], size[3:]) @ turn  # from own axes to the world's
+        low, high = points.min(axis=0), points.max(axis=0)
     else:
         low, high = size[:3], size[3:]
     ends = np.array([low - solid.rounding[0], high + solid.rounding[0]]) + solid.origin[0]
