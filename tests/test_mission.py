@@ -1054,3 +1054,10 @@ def test_reading_missions_waits_for_no_compiler():
         "sys.exit(any(m in sys.modules for m in ('numba', 'scipy', 'matplotlib', 'xarray')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("value", [REMOVED, 0, []])
+def test_a_formation_with_errors_in_a_plane_is_a_finding(value):
+    """Where a formation of dimension 2 has no distances, or wrong ones, the check says so and computes no slots."""
+    keys = findings(("dimension", 2), ("formations/line/distances", value))
+    assert {f.key for f in keys} <= {"formations.line", "formations.line.distances"}
