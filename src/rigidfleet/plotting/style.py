@@ -197,14 +197,13 @@ def time_figure(
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
     from rigidfleet.plotting.figure import Figure
-    from rigidfleet.plotting.layout import Layout
 
     shares = [1.0] * rows if shares is None else shares
     stacked = (columns, rows) if narrow() else None  # the second column then stands below the first
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)
-    fig = Figure(figsize=(width(WIDTH), whole), layout=Layout(_PAD))
+    fig = Figure(figsize=(width(WIDTH), whole), layout="constrained")
     fig.settings = settings
     # Nearly the heights that the axes will have, as the number of their ticks depends on it
     inside = whole - 1.2 - 2 * _PAD * (rows - 1)
