@@ -42,7 +42,7 @@ def code(answer: int) -> bytes:
 
 def answer() -> int:
     """Which machine code a new process would call."""
-    found = native._load()
+    found = native._load("flight")
     return found.integrate(0, 0, 0, 0)
 
 
@@ -66,9 +66,9 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     folder = tmp_path / "base"
     folder.mkdir(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
-    monkeypatch.setattr(native, "_compile", lambda: [code(OWN)])
-    monkeypatch.setattr(native, "_loaded", [])
-    file = native._file()
+    monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
+    monkeypatch.setattr(native, "_loaded", {})
+    file = native._file("flight")
     file.write_bytes(objects.concatenated([code(PLANTED)]))
     file.chmod(0o600)
     forget()
@@ -299,7 +299,7 @@ def test_a_relative_path(base, monkeypatch):
 def test_what_is_made_is_private(tmp_path, monkeypatch):
     """Folders and files of the cache are this user's alone, though whatever else they make is everybody's."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "a" / "b"))
-    monkeypatch.setattr(native, "_compile", lambda: [code(OWN)])
+    monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
     before = os.umask(0)
     try:
         assert answer() == OWN
@@ -314,15 +314,15 @@ def test_what_is_made_is_private(tmp_path, monkeypatch):
 def test_writers_at_the_same_time(base):
     """However many write the machine code at the same time, who reads it finds one of them whole."""
     ours = [[bytes([k]) * 200_000] for k in range(4)]
-    native._write(ours[0])
+    native._write(ours[0], "flight")
     writers = [
-        threading.Thread(target=lambda k=k: [native._write(ours[k]) for _ in range(50)])
+        threading.Thread(target=lambda k=k: [native._write(ours[k], "flight") for _ in range(50)])
         for k in range(4)
     ]
     for writer in writers:
         writer.start()
     while any(writer.is_alive() for writer in writers):
-        assert native._read() in ours
+        assert native._read("flight") in ours
     assert [file.name for file in place(base).iterdir()] == [planted(base).name]
 
 
@@ -474,7 +474,7 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
         assert native._code().integrate(0, 0, 0, 0) == OWN
     given = pickle.loads(pickle.dumps(native.bequeath()))
     forget()
-    monkeypatch.setattr(native, "_loaded", [])
+    monkeypatch.setattr(native, "_loaded", {})
     monkeypatch.setattr(native, "_compile", refused)
     native.inherit(given)
     assert native._code().integrate(0, 0, 0, 0) == OWN

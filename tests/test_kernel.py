@@ -795,11 +795,11 @@ assert not {"numba", "scipy"} & set(sys.modules)
 def test_half_a_kernel_is_none(tmp_path, monkeypatch):
     """Machine code that was cut off in the writing is compiled again, not called."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert native._write([b"machine", b"code"])
-    assert native._read() == [b"machine", b"code"]
-    file = native._file()
+    assert native._write([b"machine", b"code"], "flight")
+    assert native._read("flight") == [b"machine", b"code"]
+    file = native._file("flight")
     file.write_bytes(file.read_bytes()[:-1])
-    assert native._read() is None
+    assert native._read("flight") is None
 
 
 @pytest.mark.long
@@ -833,7 +833,7 @@ if sys.argv[1] == "other":
     numba_internals.TESTED = ()
     assert not numba_internals.known()
     from rigidfleet.kernel.engine import build, native
-    native._loaded.append(native._linked(build.machine_code()))
+    native._loaded["flight"] = native._linked(build.machine_code())
 import rigidfleet as rf
 print(hashlib.sha256(rf.simulate("establish-triangle").position.tobytes()).hexdigest())
 """
@@ -929,7 +929,7 @@ def test_the_kernel_for_three_agents_is_the_kernel(monkeypatch):
     """Of the same source, but for the lengths of its loops: the same flight to rounding."""
     own = simulate("narrow-passage")
     code = native._code()
-    monkeypatch.setattr(native, "_loaded", [code._replace(integrate_three=code.integrate)])
+    monkeypatch.setitem(native._loaded, "flight", code._replace(integrate_three=code.integrate))
     other = simulate("narrow-passage")
     assert own.statistics["steps"] == other.statistics["steps"]
     assert np.abs(own.position - other.position).max() < 1e-9
@@ -940,6 +940,6 @@ def test_the_kernel_for_three_agents_is_for_them_alone(monkeypatch):
         raise AssertionError("called")
 
     code = native._code()
-    monkeypatch.setattr(native, "_loaded", [code._replace(integrate_three=refused)])
+    monkeypatch.setitem(native._loaded, "flight", code._replace(integrate_three=refused))
     for mission in ("two-agents", "square", "hexagon"):
         assert simulate(mission).complete

@@ -479,13 +479,13 @@ import sys
 import rigidfleet as rf
 rf.simulate("establish-triangle")
 from rigidfleet.kernel.engine import native
-assert not native._sampled
+assert "sampled" not in native._loaded
 sys.path.insert(0, sys.argv[1])
 from vehicle_samples import PAPER, begun, fleet
 from rigidfleet.kernel.engine import sampled
 problem, work, flight, state = begun([PAPER])
 sampled.fly_ticks(problem, work, flight, state, fleet.segment(1, 0, 0.1))
-assert native._sampled
+assert "sampled" in native._loaded
 assert "numba" not in sys.modules
 """
 
@@ -500,12 +500,13 @@ def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
     """Where nothing can be kept, a child process gets the second library's code, too."""
     code = native._read("sampled")
     assert code is not None
-    monkeypatch.setattr(native, "_sampled", [native._linked_sampled(code, code)])
+    others = {part: x for part, x in native._loaded.items() if part != "sampled"}
+    made = native._linked_sampled(code, code)
+    monkeypatch.setattr(native, "_loaded", others | {"sampled": made})
     given = native.bequeath()
-    monkeypatch.setattr(native, "_sampled", [])
-    monkeypatch.setattr(native, "_loaded", [*native._loaded])
+    monkeypatch.setattr(native, "_loaded", others)
     native.inherit(given)
-    assert native._sampled[0].unkept == code
+    assert native.sampled().unkept == code
 
 
 def test_a_flight_goes_on_under_another_problem():

@@ -13,7 +13,7 @@ _help: Any = artist
 _help.kwdoc = lambda _: ""
 _help.Artist._update_set_signature_and_docstring = lambda: None
 for _name in (
-    "rigidfleet.plotting.figure", "rigidfleet.plotting.layout", "matplotlib.backends.backend_agg",
+    "rigidfleet.plotting.figure", "matplotlib.backends.backend_agg",
     "matplotlib.patheffects", "mpl_toolkits.mplot3d.axes3d",
 ):  # fmt: skip
     import_module(_name)

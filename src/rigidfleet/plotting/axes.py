@@ -7,8 +7,6 @@ tick is left to matplotlib: ticks that are changed one by one, minor ticks, tick
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -28,30 +26,6 @@ class _Sparing(axis.Axis):
 
     _side = 0  # of the coordinates x and y, the one along this axis
     _autolabelpos: bool  # matplotlib's: whether it places the name of the axis
-
-    @contextmanager
-    def _as_it_is(self) -> Generator[None]:
-        """Keep matplotlib from making the first minor tick, which few axes need, only to change it."""
-        if "minorTicks" in vars(self):
-            yield
-            return
-        vars(self)["minorTicks"] = []
-        try:
-            yield
-        finally:
-            vars(self).pop(
-                "minorTicks", None
-            )  # it is made when it is asked for, as it is to be by then
-
-    def set_clip_path(self, path: Any, transform: Any = None) -> None:
-        """Clip what is drawn to a path."""
-        with self._as_it_is():
-            super().set_clip_path(path, transform)
-
-    def set_tick_params(self, *arguments: Any, **options: Any) -> None:
-        """Change how ticks look; parameters are those of matplotlib."""
-        with self._as_it_is():
-            super().set_tick_params(*arguments, **options)
 
     def _marks(self) -> tuple[Tick, list[tuple[float, str]]] | None:
         """The tick that stands for all, with their places and words; None if matplotlib has to draw them."""

@@ -207,14 +207,12 @@ def time_figure(
     shares: Sequence[float] | None = None,
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
-    from rigidfleet.plotting.layout import Layout
-
     shares = [1.0] * rows if shares is None else shares
     stacked = (columns, rows) if narrow() else None  # the second column then stands below the first
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)
-    fig = blank(width(WIDTH), whole, Layout(_PAD))
+    fig = blank(width(WIDTH), whole, "constrained")
     # Nearly the heights that the axes will have, as the number of their ticks depends on it
     inside = whole - 1.2 - 2 * _PAD * (rows - 1)
     grid = {"bottom": 0.5 / whole, "top": 1 - 0.7 / whole, "hspace": 2 * _PAD * rows / inside}

@@ -13,8 +13,9 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,16 +101,16 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    record_into(pack(out), 0, packed(problem), workspace, times, samples)
+    record_into(pack(out), 0, problem, workspace, times, samples)
     return out
 
 
 def record_into(
-    out: Packed, first: int, problem: Packed, workspace: Workspace, times: Floats, samples: Floats
+    out: Packed, first: int, problem: Problem, workspace: Workspace, times: Floats, samples: Floats
 ) -> None:
-    """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
+    """`record` into a `Record` from row ``first`` on; it is packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(_code().record, problem, packed(workspace), pack(segment), out)
+    _call(_code().record, packed(problem), packed(workspace), pack(segment), out)
 
 
 class Watch:
@@ -132,23 +133,8 @@ class Watch:
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    found = _own.segment
-    if found is None or len(found.of.dy) != len(y):
-        found = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
-        _own.segment = found
-    segment: Segment = found.of
-    segment.times[0], segment.samples[0] = t, y
-    _call(_code().record, packed(problem), packed(workspace), found, packed(UNRECORDED))
-    dy[:] = segment.dy
-
-
-class _Own(threading.local):
-    """The segment of one state with which a thread has called `closed_loop` last."""
-
-    segment: Packed | None = None
-
-
-_own = _Own()
+    segment = pack(Segment(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy))
+    _call(_code().record, packed(problem), packed(workspace), segment, packed(UNRECORDED))
 
 
 def _call(function: Any, *arguments: Packed) -> int:
@@ -218,83 +204,68 @@ class Avoiding(NamedTuple):
 
 
 _loading = threading.RLock()
-
-
-_loaded: list[_Code] = []
-
-
-_sampled: list[Sampled] = []
-
-
-_avoiding: list[Avoiding] = []
+#: The libraries that are loaded, by part.
+_loaded: dict[str, Any] = {}
 
 
 def _code() -> _Code:
     """The kernel's machine code: from the cache, or compiled."""
-    if not _loaded:
-        with _loading:
-            if not _loaded:
-                _loaded.append(_load())
-    return _loaded[0]
-
-
-def _load() -> _Code:
-    if (parts := _read()) is not None:
-        return _linked(parts)
-    parts = _compile()
-    return _linked(parts, None if _write(parts) else parts)
+    return _library("flight")
 
 
 def sampled() -> Sampled:
     """The machine code of sampled flights: from the cache, or compiled."""
-    return _library("sampled", _sampled, _linked_sampled)
+    return _library("sampled")
 
 
 def avoiding() -> Avoiding:
     """The machine code of avoidance in flight: from the cache, or compiled."""
-    return _library("avoidance", _avoiding, _linked_avoiding)
+    return _library("avoidance")
 
 
-def _library(part: str, loaded: list[Any], link: Callable[..., Any]) -> Any:
-    with _loading:
-        if not loaded:
-            if (parts := _read(part)) is not None:
-                loaded.append(link(parts))
-            else:
-                parts = _compile(part)
-                loaded.append(link(parts, None if _write(parts, part) else parts))
-    return loaded[0]
+def _library(part: str) -> Any:
+    if part not in _loaded:
+        with _loading:
+            if part not in _loaded:
+                _loaded[part] = _load(part)
+    return _loaded[part]
+
+
+def _load(part: str) -> Any:
+    if (parts := _read(part)) is not None:
+        return _LINKED[part](parts)
+    parts = _compile(part)
+    return _LINKED[part](parts, None if _write(parts, part) else parts)
+
+
+def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
+    engine = _engine(parts)
+    *calls, gather, three = map(partial(_function, engine), ENTRIES, (4, 4, 4, 1, 1, 1, 1, 4, 4))
+    use(gather, engine)
+    distance.use(nearest_boxes)
+    return _Code(*calls, three, engine.get_function_address(ENTRIES[1]), engine, unkept)
 
 
 def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Sampled:
     engine = _engine(parts)
-    fly, evaluate = (engine.get_function_address(name) for name in SAMPLED_ENTRIES)
-    word = ctypes.c_int64
-    return Sampled(
-        ctypes.CFUNCTYPE(word, *(word,) * 5)(fly), ctypes.CFUNCTYPE(word, word, word)(evaluate), _code().recorder,
-        engine, unkept,
-    )  # fmt: skip
+    calls = map(partial(_function, engine), SAMPLED_ENTRIES, (5, 2))
+    return Sampled(*calls, _code().recorder, engine, unkept)
 
 
 def _linked_avoiding(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Avoiding:
     engine = _engine(parts)
     address = engine.get_function_address(AVOIDANCE_ENTRY)
-    word = ctypes.c_int64
-    return Avoiding(ctypes.CFUNCTYPE(word, *(word,) * 4)(address), address, engine, unkept)
+    return Avoiding(_function(engine, AVOIDANCE_ENTRY, 4), address, engine, unkept)
 
 
-def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
-    engine = _engine(parts)
+#: What makes a library of the objects of each part.
+_LINKED = {"flight": _linked, "sampled": _linked_sampled, "avoidance": _linked_avoiding}
+
+
+def _function(engine: Any, name: str, words: int) -> Any:
+    """A function of machine code that takes this number of words and returns one."""
     word = ctypes.c_int64
-    addresses = [engine.get_function_address(name) for name in ENTRIES]
-    functions = (
-        ctypes.CFUNCTYPE(word, *(word,) * words)(address)
-        for words, address in zip((4, 4, 4, 1, 1, 1, 1, 4, 4), addresses, strict=True)
-    )
-    *calls, gather, three = functions
-    use(gather, engine)
-    distance.use(nearest_boxes)
-    return _Code(*calls, three, addresses[1], engine, unkept)
+    return ctypes.CFUNCTYPE(word, *(word,) * words)(engine.get_function_address(name))
 
 
 def _engine(parts: Sequence[bytes]) -> Any:
@@ -309,35 +280,27 @@ def _engine(parts: Sequence[bytes]) -> Any:
 
 
 class Inheritance(NamedTuple):
-    """Code that a child process need not compile again, and warnings that it need not repeat."""
+    """Code by part that a child process need not compile again, and whether it need not repeat a warning."""
 
-    code: list[bytes] | None
+    code: dict[str, list[bytes]]
     told: bool
-    sampled: list[bytes] | None
-    avoiding: list[bytes] | None
 
 
 def bequeath() -> Inheritance:
     """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
-    return Inheritance(
-        _loaded[0].unkept if _loaded else None, told.is_set(), _sampled[0].unkept if _sampled else None,
-        _avoiding[0].unkept if _avoiding else None,
-    )  # fmt: skip
+    unkept = {part: library.unkept for part, library in _loaded.items()}
+    return Inheritance({part: code for part, code in unkept.items() if code}, told.is_set())
 
 
 def inherit(given: Inheritance) -> None:
     """Take over the code and warnings of the parent process."""
     if given.told:
         told.set()
-    if given.code is not None:
-        _loaded.append(_linked(given.code, given.code))
-    if given.sampled is not None:
-        _sampled.append(_linked_sampled(given.sampled, given.sampled))
-    if given.avoiding is not None:
-        _avoiding.append(_linked_avoiding(given.avoiding, given.avoiding))
+    for part, code in given.code.items():
+        _loaded[part] = _LINKED[part](code, code)
 
 
-def _compile(part: str = "flight") -> list[bytes]:
+def _compile(part: str) -> list[bytes]:
     """Compile the kernel, or another library (``part``), in a separate process if possible.
 
     In that process Numba only translates. Otherwise it would optimise each function before all are optimised
@@ -357,7 +320,7 @@ def _compile(part: str = "flight") -> list[bytes]:
     return build.LIBRARIES.get(part, build.machine_code)()
 
 
-def _file(part: str = "flight") -> Path:
+def _file(part: str) -> Path:
     """The cache file of a part of the machine code for this kind of machine.
 
     Raises
@@ -369,7 +332,7 @@ def _file(part: str = "flight") -> Path:
     return cache_directory() / f"{part}-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
 
 
-def _read(part: str = "flight") -> list[bytes] | None:
+def _read(part: str) -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
         with opened(_file(part)) as stream:
@@ -378,7 +341,7 @@ def _read(part: str = "flight") -> list[bytes] | None:
         return None
 
 
-def _write(parts: Sequence[bytes], part: str = "flight") -> bool:
+def _write(parts: Sequence[bytes], part: str) -> bool:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replacing(_file(part), private=True) as stream:
@@ -392,7 +355,7 @@ def _write(parts: Sequence[bytes], part: str = "flight") -> bool:
 def is_compiled() -> bool:
     """Return whether the machine code is in the cache, so that nothing has to be compiled."""
     try:
-        with opened(_file()):
+        with opened(_file("flight")):
             return True
     except OSError:
         return False
