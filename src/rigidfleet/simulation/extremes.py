@@ -127,7 +127,8 @@ class Extremes:
         self.low = np.full((self.n, 3), np.inf)
         # Obstacles that are not boxes may be large, and are not to be kept.
         standing = _standing_kept if self.solids is None else _standing
-        self.standing = standing(mission.fleet.position, self.radius, mission.obstacles).copy()
+        self.stood = standing(mission.fleet.position, self.radius, mission.obstacles)
+        self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.state: records.IntegratorState | None = None  # of the integrator that is monitored
@@ -161,6 +162,23 @@ class Extremes:
         found = [x for x in (self._extremum(records.FLYING), self._landing()) if x is not None]
         deepest = min(found, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
+
+    @property
+    def reusable(self) -> bool:
+        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
+        return self.n <= _FEW and bool(self.left.all())
+
+    def restart(self) -> None:
+        """Forget the flight that was monitored."""
+        self.worst[:] = self.none
+        self.low.fill(np.inf)
+        self.when.fill(0.0)
+        self.who.fill(-1)
+        self.standing[:] = self.stood
+        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
+        if self.size is not None:
+            flags = self.monitor.monitor.flags
+            flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
 
     def begin(
         self,

@@ -19,11 +19,10 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
-from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose
-from rigidfleet.planning.timing import timed, with_times
+from rigidfleet.planning.timing import with_times
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
@@ -35,7 +34,7 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     RotorCommand,
 )
-from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
@@ -206,7 +205,8 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self.mission = mission = timed(as_mission(mission))
+        self._prepared = prepared(as_mission(mission))
+        self.mission = mission = self._prepared.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (("controller", controller), ("progress", progress)):
@@ -229,13 +229,13 @@ class Flight:
         if mission.body_frame is not None:
             b = mission.body_frame
             frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        self._reached = PhaseState(
+        self._begins = self._reached = PhaseState(
             0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
         )
         self._vehicles = Vehicles(mission, self._push.max_step) if mission.vehicle_models else None
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = disturbance(mission) if self._vehicles is None else None
-        self._extremes = Extremes(mission)
+        self._disturbance = self._prepared.disturbance if self._vehicles is None else None
+        self._extremes = self._prepared.extremes()
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
             None  # the phase before, if its last state is not known yet
@@ -346,9 +346,12 @@ class Flight:
         if self._asked:
             self._report(phase, planning=True)
         try:
-            plan = plan_phase(
-                self.mission, phase, self._now, disturbance=self._disturbance, external=self._push
-            )
+            if self._now is self._begins and self._now.lost is None:
+                plan = self._prepared.first_plan(phase, self._now, self._disturbance, self._push)
+            else:
+                plan = plan_phase(
+                    self.mission, phase, self._now, disturbance=self._disturbance, external=self._push
+                )  # fmt: skip
             self._check_frame(plan)
             make = ActivePhase
             if self._vehicles is not None:
@@ -499,7 +502,7 @@ class Flight:
             self._ended.release()
             self._ended = None
         result = self.record(self.pieces, None if own else self._asked)
-        self._extremes.let_go()
+        self._prepared.give_back(self._extremes)
         return result
 
     def record(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -103,12 +103,14 @@ class Unevaluated(NamedTuple):
     def evaluated(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
         out = recorder(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
-        self.evaluate_into(native.pack(out), 0, times, work)
+        self.evaluate_into(native.pack(out), 0, times, work, native.packed(self.problem))
         return out
 
-    def evaluate_into(self, out: native.Packed, first: int, times: Floats, work: Workspace) -> None:
-        """Write them into a packed record from row ``first`` on."""
-        native.record_into(out, first, self.problem, work, times, self.y)
+    def evaluate_into(
+        self, out: native.Packed, first: int, times: Floats, work: Workspace, problem: native.Packed
+    ) -> None:
+        """Write them into a record from row ``first`` on; it and the ``problem`` as flown are packed."""
+        native.record_into(out, first, problem, work, times, self.y)
         if self.problem is not self.planned:
             of_phase = native.record(self.planned, work, times, self.y)
             for name in _REFERENCES:
@@ -141,6 +143,12 @@ class Piece:
     led: Led  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
+    #: The problem as flown, packed while it is at hand; None of a large formation, and where nothing is left to do.
+    _problem: native.Packed | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.given, Unevaluated) and self.given.setup is None:
+            self._problem = native.packed(self.given.problem)
 
     @cached_property
     def record(self) -> Record:
@@ -164,12 +172,13 @@ class Piece:
             planned = solved_by(solver, given.planned)
             own = given.problem is given.planned
             problem = planned if own else solved_by(solver, given.problem)
-            found = given._replace(problem=problem, planned=planned)
-            found.evaluate_into(out, first, self.time, solver.workspace)
+            found, words = given._replace(problem=problem, planned=planned), native.packed(problem)
+            found.evaluate_into(out, first, self.time, solver.workspace, words)
             solver.check()
         else:
+            assert self._problem is not None
             work = small_workspace(given.planned)
-            given.evaluate_into(out, first, self.time, work)
+            given.evaluate_into(out, first, self.time, work, self._problem)
             give_back(given.planned, work)
 
 

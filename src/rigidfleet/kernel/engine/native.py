@@ -101,16 +101,16 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    record_into(pack(out), 0, problem, workspace, times, samples)
+    record_into(pack(out), 0, packed(problem), workspace, times, samples)
     return out
 
 
 def record_into(
-    out: Packed, first: int, problem: Problem, workspace: Workspace, times: Floats, samples: Floats
+    out: Packed, first: int, problem: Packed, workspace: Workspace, times: Floats, samples: Floats
 ) -> None:
-    """`record` into a `Record` from row ``first`` on; it is packed."""
+    """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(_code().record, packed(problem), packed(workspace), pack(segment), out)
+    _call(_code().record, problem, packed(workspace), pack(segment), out)
 
 
 class Watch:
@@ -133,8 +133,23 @@ class Watch:
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    segment = pack(Segment(0.0, False, 0, np.array([t]), y.reshape(1, -1), dy))
-    _call(_code().record, packed(problem), packed(workspace), segment, packed(UNRECORDED))
+    found = _own.segment
+    if found is None or len(found.of.dy) != len(y):
+        found = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
+        _own.segment = found
+    segment: Segment = found.of
+    segment.times[0], segment.samples[0] = t, y
+    _call(_code().record, packed(problem), packed(workspace), found, packed(UNRECORDED))
+    dy[:] = segment.dy
+
+
+class _Own(threading.local):
+    """The segment of one state with which a thread has called `closed_loop` last."""
+
+    segment: Packed | None = None
+
+
+_own = _Own()
 
 
 def _call(function: Any, *arguments: Packed) -> int:
