@@ -15,8 +15,6 @@ from rigidfleet._version import __version__ as __version__
 
 TYPE_CHECKING = False  # for the command, which has to take over Ctrl-C before it loads `typing`
 if TYPE_CHECKING:
-    from typing import Any
-
     from rigidfleet.assessment import Verdict, assess
     from rigidfleet.errors import (
         FlightError,
@@ -124,7 +122,7 @@ _HOME = {
 }
 
 
-def __getattr__(name: str) -> "Any":
+def __getattr__(name: str) -> object:
     """Load a public name from its module on first use."""
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
