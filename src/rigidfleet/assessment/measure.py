@@ -586,7 +586,9 @@ class Measurements:
             miss[name] = dict(zip(asked, off, strict=True))
         for i, off in miss["position"].items():
             if result.phases[targets[i][0]].formation is None:
-                miss["position"][i] = max(off, float(np.fmax.reduce(self.off_slot[at[i]])))
+                own = float(np.fmax.reduce(self.off_slot[at[i]]))
+                # With a vehicle lost, the centre of those left says nothing of their places.
+                miss["position"][i] = max(off, own) if self.left[at[i]].all() else own
         return {
             k: Waypoint(
                 time=t,
