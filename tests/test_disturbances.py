@@ -406,7 +406,7 @@ def test_falling_on_another_fails_the_verdict():
     assert not verdict.passed
     (failed,) = [f for f in verdict.checks if not f.passed]
     assert failed.check == "lost"
-    assert "agent 1 at 1.00 s; after that, agents 1 and 2 collide at 2." in failed.message
+    assert "agent 1 at 1.00 s; after that, agents 1 and 2 collide, first at 2." in failed.message
 
 
 def test_losses_at_a_switch_and_while_settling():
