@@ -140,7 +140,7 @@ def _broken(
         if nearer > limits.separation_allowance:
             broken["collision"] = f"{least[2]} come {nearer:.2f} m nearer than the plan proves"
     arrival = min(int(np.searchsorted(planned.time, leg.arrival)), len(r) - 1)
-    held = [("tracking error", float(far.max()), limits.tracking_error)]
+    held = [("tracking error", "", float(far.max()), limits.tracking_error)]
     # As `Plan.target` and `Plan.stay` promise.
     stays, later = "position" not in phase.meets, arrival < len(r) - 1
     places = [("waypoint", arrival)] * (not stays)
@@ -153,14 +153,14 @@ def _broken(
     for place, k in places:
         by = float(np.linalg.norm(masses @ off[k]) / masses.sum())
         by = by if leg.after.formation else max(by, float(far[k].max()))
-        held.append((place, by, WAYPOINT_TOLERANCE["position"]))
+        held.append(("waypoint", place, by, WAYPOINT_TOLERANCE["position"]))
     forms, turns = phase.establishing is not None, "attitude" in phase.meets
     lies, goal = forms and not mission.free_attitude(phase), leg.after.goal
     kept = stays and not forms and goal is not None and goal.named
     for k in [arrival] * (lies or turns) + [-1] * (later if turns else kept):
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
         by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
-        held.append(("attitude", by, WAYPOINT_TOLERANCE["attitude"]))
+        held.append(("attitude", "", by, WAYPOINT_TOLERANCE["attitude"]))
     last, name = planned is found.planned_phases[-1], leg.after.formation
     if name and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
         # To first order: a turn of the whole changes no distance.
@@ -168,11 +168,11 @@ def _broken(
         apart, moved = planned.position[-1, i] - planned.position[-1, j], off[-1, i] - off[-1, j]
         length = np.linalg.norm(apart, axis=1)
         by = float(np.abs((apart * moved).sum(axis=1) / length).max())
-        held.append(("formation", by, mission.formations[name].greatest_error(length.min())))
+        held.append(("formation", "", by, mission.formations[name].greatest_error(length.min())))
     if phase.settle is not None and not mission.tracking.integral:  # which settles later
-        held.append(("settle", float(far[-1].max()), phase.settle.tolerance))
-    for topic, by, most in held:
+        held.append(("settle", "", float(far[-1].max()), phase.settle.tolerance))
+    for topic, what, by, most in held:
         if most is not None and by > most:
             unit = UNITS.get(topic, "m")
-            broken[topic] = f"{topic}: {by:.2g} {unit} off (limit {most:g} {unit})"
+            broken[topic] = f"{what or topic}: {by:.2g} {unit} off (limit {most:g} {unit})"
     return broken
