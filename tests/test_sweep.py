@@ -665,15 +665,16 @@ def test_a_killed_worker_is_replaced(flown, tmp_path, monkeypatch):
     killed: list[int] = []
 
     def kill(progress: SweepProgress) -> None:
-        if progress.workers == 2 and not killed:
-            child = multiprocessing.active_children()[0]
+        children = multiprocessing.active_children()  # none once all chunks are flown
+        if progress.workers == 2 and children and not killed:
+            child = children[0]
             assert child.pid is not None
             killed.append(child.pid)
             os.kill(child.pid, signal.SIGKILL)
 
-    table = fly(sweep(runs=40), tmp_path, workers=2, progress=kill)
+    table = fly(sweep(runs=400), tmp_path, workers=2, progress=kill)
     assert killed
-    assert numbers(table) == numbers(fly(sweep(runs=40), tmp_path / "whole", workers=1))
+    assert numbers(table) == numbers(fly(sweep(runs=400), tmp_path / "whole", workers=1))
 
 
 def started(arguments: list[str]) -> subprocess.Popen[bytes]:
