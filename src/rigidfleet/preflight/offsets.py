@@ -12,7 +12,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy.linalg import expm
 
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
@@ -41,18 +40,26 @@ _SMALL = 0.05
 
 def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
+    tracked = [planned.leg.phase.control == "tracking" for planned in way]
+    pushes = [
+        _pushed(mission, planned) if one else np.zeros_like(planned.position)
+        for planned, one in zip(way, tracked, strict=True)
+    ]
+    if not any(pushed.any() for pushed in pushes):
+        return pushes  # nothing pushes: SciPy, which takes long to load, is not needed
+    from scipy.linalg import expm
+
     law = feedback(mission, None, None)
     laws = np.zeros((2, 4, 4))  # of the integral, the offset, its rate and a held force
     laws[:, 0, 1] = laws[:, 1, 2] = laws[:, 2, 3] = 1.0
     laws[0, 2, :3] = -law.ki, -law.k1, -law.k2
     laws[1, 2, :3] = -law.gamma, -(law.beta**2), -2.0 * law.alpha
     now, found = np.zeros((2, 3, 3 * mission.n_agents)), []
-    for planned in way:
-        if planned.leg.phase.control != "tracking":
+    for planned, pushed, one in zip(way, pushes, tracked, strict=True):
+        if not one:
             now = np.zeros_like(now)
-            found.append(np.zeros_like(planned.position))
+            found.append(pushed)
             continue
-        pushed = _pushed(mission, planned)
         flat, steps = pushed.reshape(len(pushed), -1), expm(laws * np.diff(planned.time[:2])[0])
         answers = np.empty((len(flat), 2, flat.shape[1]))
         for k, push in enumerate(flat):
