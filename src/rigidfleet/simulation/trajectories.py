@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +19,32 @@ from numpy.typing import ArrayLike
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
-from rigidfleet.kernel.problem import workspace
-from rigidfleet.math import proximity, series
+from rigidfleet.math import proximity
 from rigidfleet.math.bernstein import SIZES, greatest
-from rigidfleet.math.piecewise import Piecewise, common_knots, join
+from rigidfleet.math.piecewise import (
+    Piecewise,
+    common_knots,
+    join,
+    pad,
+    piece_at,
+    refine,
+)
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.plan import plan_phase
-from rigidfleet.planning.reference import PhaseState
 from rigidfleet.result import Extremum, PhaseRecord, Result
+from rigidfleet.result.result import CLOSE
 from rigidfleet.setpoints import intervals
-from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.typing import Floats
+from rigidfleet.simulation.extremes import CurveWatch
+from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
 _CLOSE, _PARTS = 1e-6, 256
 #: Greatest jump of a position between two pieces [m]; a larger one is no flight.
 _JUMP = 1e-3
-#: Numbers of a result, and of a part of the pieces that is processed together.
-_MOST, _TOGETHER = 5e8, 4_000_000
-#: Time between samples [s], unless the trajectory itself has more; about so many in all.
-_STEP, _SAMPLES = 0.05, 2_000_000
+#: Numbers of a result, and of a block of pieces that is processed together.
+_MOST, _TOGETHER = 5e8, 400_000
+#: Time between samples [s], unless the trajectory itself has more; about so many in all, and steps of all vehicles
+#: beside obstacles.
+_STEP, _SAMPLES, _WATCHED = 0.05, 400_000, 2_000_000
 #: Where a start is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
@@ -48,6 +55,16 @@ NAMES = {
 }
 #: Limits of a mission that positions over time do not show.
 UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
+#: What of a mission trajectories are judged by, beside radii and masses.
+_JUDGING = {
+    "schema_version",
+    "name",
+    "title",
+    "limits",
+    "obstacles",
+    "gravity",
+    "geodetic_origin",
+}
 #: Name of the only phase.
 PHASE = "flight"
 
@@ -181,7 +198,9 @@ def judged_as(
     ground: float | None = None,
     name: str = "trajectories",
 ) -> Mission:
-    """The mission against which trajectories are judged: one phase, in which nothing is commanded.
+    """What trajectories are judged against: radii, limits and obstacles, as the mission that readers of a result need.
+
+    It is data of one phase in which nothing is commanded. Nothing plans or flies it.
 
     Parameters
     ----------
@@ -201,28 +220,17 @@ def judged_as(
         The mission has another number of vehicles.
     """
     phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": max(duration, 1e-3)}
+    agents: dict[str, Any] = {"position": start.tolist()}
     if mission is not None:
         given = mission if isinstance(mission, Mission) else load_mission(mission)
         if given.n_agents != len(start):
             raise ResultError(
                 f"the mission {given.name!r} has {given.n_agents} agents, and there are {len(start)} trajectories."
             )
-        kept = (
-            "schema_version",
-            "name",
-            "title",
-            "limits",
-            "obstacles",
-            "gravity",
-            "geodetic_origin",
-        )
-        data = {key: x for key, x in given.to_dict().items() if key in kept}
+        data = {key: x for key, x in given.to_dict().items() if key in _JUDGING}
         bounds = data.get("limits", {})
         data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
-        agents: dict[str, Any] = {
-            "radius": list(given.agents.radius),
-            "mass": list(given.agents.mass),
-        }
+        agents |= {"radius": list(given.agents.radius), "mass": list(given.agents.mass)}
     else:
         if "separation_below" in (limits or {}) and radius == 0.0:
             raise ResultError(
@@ -233,19 +241,9 @@ def judged_as(
         data = {"schema_version": 1, "name": name, "limits": bounds}
         if ground is not None:
             data["obstacles"] = [{"kind": "ground", "height": ground}]
-        agents = {"radius": radius, "mass": 1.0}
-    agents["position"] = _told_apart(start).tolist()
+        agents |= {"radius": radius, "mass": 1.0}
     step = {"output_step": phase["duration"]} if duration < _STEP else {}
-    return Mission.from_dict(data | step | {"agents": agents, "phases": [phase]}, "the limits")
-
-
-def _told_apart(start: Floats) -> Floats:
-    """Starts (N, 3) of which no two are equal: a mission refuses what the verdict on the curves has to judge."""
-    _, first, again = np.unique(start, axis=0, return_index=True, return_inverse=True)
-    twice = np.flatnonzero(first[again.ravel()] != np.arange(len(start)))
-    found = start.copy()
-    found[twice, 2] += 1e-6 * np.arange(1, len(twice) + 1)
-    return found
+    return Mission.from_plain(data | step | {"agents": agents, "phases": [phase]}, "the limits")
 
 
 def of_curve(
@@ -268,19 +266,37 @@ def of_curve(
     """
     if abs(curve.time[0]) > _CLOCK or curve.time[0] < 0.0:
         curve = curve.later(-curve.time[0])
-    _continuous(curve)
-    n, span = curve.pieces.shape[1], float(curve.time[-1] - curve.time[0])
-    step = max(_STEP, span * n / _SAMPLES)
-    grid = curve.time[0] + step * np.arange(1, math.ceil(span / step))
-    _bounded(n, len(curve.time) + len(grid))
-    curve = curve.cut(grid, 1e-6)
-    time, state, yaw = _samples(curve)
-    mission = judged_as(state[0, 0], span, **judged)
+    time, n, powers = curve.time, curve.pieces.shape[1], curve.pieces.shape[-1]
+    span = float(time[-1] - time[0])
+    # Samples are at all knots, and between them so that none is further from the next one than a step.
+    step = max(_STEP, span * n / _SAMPLES) * (1.0 + 1e-9)
+    parts = np.ceil(np.diff(time) / step).astype(np.int64)
+    _bounded(n, int(parts.sum()) + 1)
+    start = curve.at(time[:1])[0, :, :3]
+    mission = judged_as(start, span, **judged)
+    watch = CurveWatch(
+        mission.fleet.radius, start, mission.obstacles, mission.limits, float(time[0])
+    )
+    # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
+    near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
+    grid = time[0] + near * np.arange(1, math.ceil(span / near))
+    samples = _Samples(int(parts.sum()) + len(time), n)
+    fastest: dict[str, Extremum] = {}
+    together = max(1, _TOGETHER // (4 * n * powers))
+    for k in range(0, len(parts), together):  # in blocks, to save memory
+        block = Piecewise(time[k : k + together + 1], curve.pieces[k : k + together])
+        samples.take(block.on(_split(block.time, parts[k : k + together])))
+        way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
+        _watch(watch, way, grid)
+        _accelerations(fastest, way, directed=watch.directed)
+    samples.end(float(time[-1]))
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    _put_extremes(record, mission, Piecewise(curve.time, curve.pieces[:, :, :3]))
-    if curve.pieces.shape[-1] < 3:  # lines turn at once at samples
-        state[2:] = np.nan
-    return _result(mission, record, time, state, yaw, interpolation, names)
+    record.extremes.update(watch.phase())
+    watch.flight([record])
+    record.extremes.update(fastest)
+    if powers < 3:  # lines turn at once at samples
+        samples.state[2:] = np.nan
+    return _result(mission, record, samples, interpolation, names)
 
 
 def of_curves(
@@ -318,105 +334,123 @@ def _bounded(n: int, times: int) -> None:
         )
 
 
-def _continuous(curve: Piecewise) -> None:
-    """Refuse trajectories that jump.
+class _Samples:
+    """Samples of a curve that comes in blocks: one at each end of a piece, two where states jump.
 
-    Raises
-    ------
-    ResultError
-        One does.
+    Attributes
+    ----------
+    rows : number of samples so far
+    time, state, yaw : (K,) [s], (4, K, N, 3) position to jerk, (K, N) [rad], with room for ``most`` samples
     """
-    off = np.linalg.norm(curve.jumps(1)[0, ..., :3], axis=2)
-    if off.size and off.max() > _JUMP:
-        k, i = np.unravel_index(int(off.argmax()), off.shape)
-        raise ResultError(
-            f"agent {i + 1} jumps by {off[k, i]:.3g} m at {curve.time[k + 1]:g} s: its pieces do not join."
+
+    def __init__(self, most: int, n: int) -> None:
+        self.rows = 0
+        self.time, self.yaw = np.empty(most), np.empty((most, n))
+        self.state = np.empty((4, most, n, 3))
+        self._scale = np.ones((4, 1, 1, 1))
+        self._last: Floats | None = None
+
+    def take(self, block: Piecewise) -> None:
+        """Take the pieces (K, N, 4, P) that follow.
+
+        Raises
+        ------
+        ResultError
+            A vehicle jumps.
+        """
+        after, end = block.ends(4)
+        last = after[:, :1] if self._last is None else self._last
+        before = np.concatenate([last, end[:, :-1]], axis=1)
+        self._last = end[:, -1:]
+        apart = (after - before)[..., :3]
+        off = np.linalg.norm(apart[0], axis=2)
+        if off.max() > _JUMP:
+            k, i = np.unravel_index(int(off.argmax()), off.shape)
+            raise ResultError(
+                f"agent {i + 1} jumps by {off[k, i]:.3g} m at {block.time[k]:g} s: its pieces do not join."
+            )
+        greatest_of = np.abs(after[..., :3]).max(axis=(1, 2, 3), keepdims=True)
+        self._scale = np.maximum(self._scale, 1.0 + greatest_of)
+        jump = (np.abs(apart) > 1e-9 * self._scale).any(axis=(0, 2, 3))
+        k = np.repeat(np.arange(len(jump)), 1 + jump)
+        second = np.append(False, k[1:] == k[:-1])
+        first = np.append(second[1:], False)
+        time, state = block.time[k], after[:, k]
+        time[second] = np.nextafter(time[second], np.inf)
+        state[:, first] = before[:, k[first]]
+        self._put(time, state)
+
+    def end(self, t: float) -> None:
+        """Take the end of the last piece, at a time [s]."""
+        assert self._last is not None
+        self._put(np.array([t]), self._last)
+        self.time, self.yaw = self.time[: self.rows], self.yaw[: self.rows]
+        self.state = self.state[:, : self.rows]
+
+    def _put(self, time: Floats, state: Floats) -> None:
+        rows = slice(self.rows, self.rows + len(time))
+        self.time[rows], self.state[:, rows], self.yaw[rows] = (
+            time,
+            state[..., :3],
+            state[0, ..., 3],
         )
+        self.rows = rows.stop
 
 
-def _samples(curve: Piecewise) -> tuple[Floats, Floats, Floats]:
-    """Times (K',), states (4, K', N, 3) and yaws (K', N): one sample at each end of a piece, two where states jump."""
-    begin, end = curve.ends(4)
-    first, last = begin[..., :3], end[..., :3]
-    before, after = last[:, :-1], first[:, 1:]
-    scale = 1.0 + np.abs(after).max(axis=(1, 2, 3), initial=0.0)
-    jump = (np.abs(after - before) > 1e-9 * scale[:, None, None, None]).any(axis=(0, 2, 3))
-    again = np.flatnonzero(jump) + 1
-    k = np.sort(np.concatenate([np.arange(len(curve.time)), again]))
-    later = np.append(False, k[1:] == k[:-1])  # the second sample of a jump
-    time = curve.time[k]
-    time[later] = np.nextafter(time[later], np.inf)
-    state = np.concatenate([first, last[:, -1:]], axis=1)[:, k]
-    state[:, np.flatnonzero(later) - 1] = before[:, again - 1]
-    return time, state, np.concatenate([begin[0], end[0, -1:]])[k, :, 3]
+def _split(time: Floats, parts: Ints) -> Floats:
+    """Knots (sum of the parts + 1,) [s] that cut each interval between times (K + 1,) into equal parts (K,)."""
+    k = np.repeat(np.arange(len(parts)), parts)
+    share = (np.arange(len(k)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[k]
+    return np.append(time[k] + np.diff(time)[k] * share, time[-1])
 
 
-def _put_extremes(record: PhaseRecord, mission: Mission, curve: Piecewise) -> None:
-    """Give the phase the extremes of the curves, in continuous time."""
-    n = mission.n_agents
-    extremes = Extremes(mission)
-    r, v = curve.states(curve.time[:1], 2)[:, 0]
-    problem = plan_phase(mission, mission.phases[0], PhaseState(0.0, r, v)).problem
-    work = workspace(n, 0)
-    y = np.zeros(6 * n)
-    state = extremes.begin(y, record.t_start, 0, rtol=1e-9, atol=np.ones_like(y))
-    trail = state.trail
-    powers = curve.pieces.shape[-1]
-    together = max(1, _TOGETHER // (n * 3 * powers))
-    row, best = 0, {}
-    for begin in range(0, len(curve.pieces), together):
-        c = curve.pieces[begin : begin + together]
-        t, h = curve.time[begin : begin + len(c)], np.diff(curve.time[begin : begin + len(c) + 1])
-        for k, parts in enumerate(_parts(c, h)):
-            for part in range(parts):
-                width = h[k] / parts
-                x = part * width + width * records.KNOTS
-                x = series.of_polynomials(np.broadcast_to(c[k], (5, *c[k].shape)), x, 2)
-                trail.clock[row] = t[k] + part * width, width
-                trail.points[row] = records.FROM_KNOTS @ x.reshape(2, 5, -1).swapaxes(0, 1).reshape(
-                    5, -1
-                )
-                row += 1
-                if row == len(trail.clock):
-                    _take(extremes, problem, work, state, row)
-                    row = 0
-        part = Piecewise(curve.time[begin : begin + len(c) + 1], c)
-        _accelerations(best, part, directed=extremes.directed)
-    _take(extremes, problem, work, state, row)
-    record.extremes.update(extremes.phase())
-    extremes.flight([record])
-    record.extremes.update(best)
+def _watch(watch: CurveWatch, way: Piecewise, grid: Floats) -> None:
+    """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree."""
+    knots = refine(way.time, grid, 1e-6)
+    k = piece_at(way.time, 0.5 * (knots[:-1] + knots[1:]))
+    share = np.diff(knots) / np.diff(way.time)[k]
+    knots = _split(knots, np.ceil(_parts(way)[k] * share - 1e-9).astype(np.int64))
+    together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
+    for first in range(0, len(knots) - 1, together):
+        part = way.on(knots[first : first + together + 1])
+        at = [x.within(records.KNOTS) for x in (part, part.rate())]
+        points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
+        clock = np.column_stack([part.time[:-1], np.diff(part.time)])
+        watch.take_curves(clock, records.FROM_KNOTS @ points)
 
 
-def _take(
-    extremes: Extremes, problem: Any, work: Any, state: records.IntegratorState, rows: int
-) -> None:
-    state.count[4] = rows
-    extremes.take_path(problem, work, state)
-
-
-def _parts(c: Floats, h: Floats) -> list[int]:
-    """Into how many parts each piece (M, N, 3, P) of width h (M,) is cut, to be within `_CLOSE` of fourth degree."""
-    beyond = np.abs(c[..., 5:]).max(axis=(1, 2), initial=0.0)
-    power = np.arange(5, c.shape[-1])
-    parts = np.ones(len(c), dtype=np.int64)
+def _parts(way: Piecewise) -> Ints:
+    """Into how many parts each piece (K, N, 3, P) is cut, to be within `_CLOSE` of curves of fourth degree."""
+    h, powers = np.diff(way.time), way.pieces.shape[-1]
+    parts = np.ones(len(h), dtype=np.int64)
+    if powers <= 5:
+        return parts
+    size = np.abs(way.pieces).max(axis=(1, 2))
+    power = np.arange(5, powers)
+    # The greatest coefficients about any place of a piece.
+    beyond = np.stack(
+        [
+            sum(math.comb(j, p) * size[:, j] * h ** (j - p) for j in range(p, powers))
+            for p in range(5, powers)
+        ],
+        axis=1,
+    )
     while True:
         # Of a position, and of a velocity in the time of a part.
         off = (beyond * (h / parts)[:, None] ** power * (1.0 + power)).sum(axis=1)
         wide = (off > _CLOSE) & (parts < _PARTS)
         if not wide.any():
-            return parts.tolist()
+            return parts
         parts[wide] *= 2
 
 
 def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
-    n, powers = curve.pieces.shape[1], curve.pieces.shape[-1]
-    if powers < 3:
+    n = curve.pieces.shape[1]
+    if curve.pieces.shape[-1] < 3:
         return
-    power = np.arange(2, powers)
-    a = Piecewise(curve.time, curve.pieces[..., 2:] * (power * (power - 1)))
-    points = a.bernstein().reshape(-1, 3, powers - 2)
+    points = curve.rate().rate().bernstein()
+    points = points.reshape(-1, *points.shape[2:])
     for way in SIZES if directed else ("",):
         name = f"{way}_acceleration".lstrip("_")
         found, known = greatest(points, SIZES[way]), best.get(name)
@@ -429,17 +463,12 @@ def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: boo
 def _result(
     mission: Mission,
     record: PhaseRecord,
-    time: Floats,
-    state: Floats,
-    yaw: Floats,
+    samples: _Samples,
     interpolation: str,
     names: Sequence[str],
 ) -> Result:
-    r, v, a, j = state
+    time, (r, v, a, j) = samples.time, samples.state
     k, n = r.shape[:2]
-    left = np.ones((k, n), dtype=np.bool_)
-    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    close = proximity.Closeness._make(x.copy() for x in close)
     nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
     cm, cm_velocity = r.mean(axis=1), v.mean(axis=1)
     unknown: dict[str, Any] = {
@@ -460,14 +489,30 @@ def _result(
         "multiplier",
     )
     empty: dict[str, Any] = dict.fromkeys(edged, none)
-    return Result(
+    result = Result(
         time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=a,
         slot_position=r, slot_velocity=v, slot_acceleration=a, slot_jerk=j,
-        yaw=np.nan_to_num(yaw), yaw_rate=np.zeros((k, n)),
+        yaw=np.nan_to_num(samples.yaw, copy=False), yaw_rate=np.zeros((k, n)),
         input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
         cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,
         edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
-        separation=close.separation, separation_pair=close.pair, clearance=close.clearance,
-        clearance_agent=close.agent, clearance_obstacle=close.obstacle, **unknown, phases=[record],
-        mission_text=mission.text, statistics={"interpolation": interpolation, "names": list(names)},
+        **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
+        statistics={"interpolation": interpolation, "names": list(names)},
+        later=[(CLOSE, partial(_close, mission, r, time)), (("mission_text",), partial(_text, mission))],
     )  # fmt: skip
+    vars(result)["mission"] = (
+        mission  # its text is written where the result is, and need not be read
+    )
+    return result
+
+
+def _close(mission: Mission, r: Floats, time: Floats) -> dict[str, Any]:
+    """Distances at samples."""
+    left = np.ones(r.shape[:2], dtype=np.bool_)
+    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
+    values = close.separation, close.pair, close.clearance, close.agent, close.obstacle
+    return {name: x.copy() for name, x in zip(CLOSE, values, strict=True)}
+
+
+def _text(mission: Mission) -> dict[str, str]:
+    return {"mission_text": mission.text}
