@@ -92,13 +92,10 @@ def at_times(given: Setpoints, wanted: Floats) -> Setpoints:
     time, count, n = given.time, len(wanted), given.yaw.shape[1]
     if len(time) == 1:
         return given
-    state = np.empty((count, *given.state.shape[1:]))
-    yaw, yaw_rate = np.empty((count, n)), np.empty((count, n))
+    x = np.empty((count, 4, n, 4))
     for i in range(n):
-        x = curve(given, i).states(wanted, 4)
-        state[:, :, i] = x[..., :3].swapaxes(0, 1)
-        yaw[:, i], yaw_rate[:, i] = x[:2, :, 3]
-    return Setpoints(wanted, state, yaw, yaw_rate)
+        x[:, :, i] = curve(given, i).states(wanted, 4).swapaxes(0, 1)
+    return Setpoints(wanted, x[..., :3], x[:, 0, :, 3], x[:, 1, :, 3])
 
 
 def curve(given: Setpoints, agent: int) -> Piecewise:

@@ -120,6 +120,11 @@ class Piecewise(NamedTuple):
         """The same with further knots at times that lie inside, further ``apart`` [s] from any of its own."""
         return self.on(refine(self.time, times, apart))
 
+    def part(self, first: int, last: int) -> Piecewise:
+        """The pieces from a first one to before a last one."""
+        pieces = self.pieces[first:last]
+        return Piecewise(self.time[first : first + len(pieces) + 1], pieces)
+
     def between(self, start: float, end: float) -> Piecewise:
         """The part from a start to an end [s] within it."""
         inside = self.time[(self.time > start) & (self.time < end)]

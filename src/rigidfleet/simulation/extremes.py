@@ -22,6 +22,7 @@ from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
+from rigidfleet.mission.model import Fleet
 from rigidfleet.result import DIRECTIONS, PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
@@ -111,16 +112,11 @@ class CurveWatch:
     monitor: native.Watch
 
     def __init__(
-        self,
-        radius: Floats,
-        start: Floats,
-        obstacles: Sequence[Obstacle],
-        limits: Limits,
-        t: float = 0.0,
+        self, fleet: Fleet, obstacles: Sequence[Obstacle], limits: Limits, t: float = 0.0
     ) -> None:
-        """Watch vehicles with radii (N,) [m], that are at ``start`` (N, 3) [m] at time t [s]."""
-        self.n = len(radius)
-        self.radius = np.array(radius, dtype=float)
+        """Watch vehicles that begin at a time [s]."""
+        self.n = len(fleet.radius)
+        self.radius = np.array(fleet.radius, dtype=float)
         self._take_obstacles(obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
@@ -136,7 +132,7 @@ class CurveWatch:
         self.low = np.full((self.n, 3), np.inf)
         # Obstacles that are not boxes may be large, and are not to be kept.
         standing = _standing_kept if self.solids is None else _standing
-        self.stood = standing(start, self.radius, tuple(obstacles), t)
+        self.stood = standing(fleet.position, self.radius, tuple(obstacles), t)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
@@ -173,8 +169,9 @@ class CurveWatch:
         trail = state.trail._replace(clock=clock, points=points)
         if "monitor" not in vars(self):
             self._begin_monitor(points.shape[2], 0, 0)
-        state = state._replace(trail=trail, count=np.zeros(6, dtype=np.int64))
-        self._take_steps(problem, work, state, len(clock))
+        self.take_path(
+            problem, work, state._replace(trail=trail, count=np.array([0, 0, 0, 0, len(clock), 0]))
+        )
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
@@ -182,10 +179,9 @@ class CurveWatch:
         deepest = min(found, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
-    def _take_steps(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, steps: int
-    ) -> None:
+    def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
+        steps = int(state.count[4])
         self._take_solids(problem, state, range(steps))
         if self.n > _FEW:
             for step in range(steps):
@@ -383,8 +379,7 @@ class Extremes(CurveWatch):
     """Monitors a flight and reports the worst values of each phase."""
 
     def __init__(self, mission: Mission) -> None:
-        fleet = mission.fleet
-        super().__init__(fleet.radius, fleet.position, mission.obstacles, mission.limits)
+        super().__init__(mission.fleet, mission.obstacles, mission.limits)
         self.state: records.IntegratorState | None = None  # of the integrator that is monitored
         self.size: _Size | None = None  # for which there is a monitor
         self._thread: ThreadPoolExecutor | None = None  # of large formations
@@ -609,10 +604,6 @@ class Extremes(CurveWatch):
         if len(who) and (value := float(values.min())) < self.worst[kind]:
             i = int(np.where(values == value, times, np.inf).argmin())
             self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
-
-    def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
-        """Evaluate the paths alone of the steps in the trail, not the forces."""
-        self._take_steps(problem, work, state, int(state.count[4]))
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
-from rigidfleet.math import proximity
+from rigidfleet.math import proximity, series
 from rigidfleet.math.bernstein import SIZES, greatest
 from rigidfleet.math.piecewise import (
     Piecewise,
@@ -31,7 +31,7 @@ from rigidfleet.math.piecewise import (
 )
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Extremum, PhaseRecord, Result
-from rigidfleet.result.result import CLOSE
+from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
 from rigidfleet.simulation.extremes import CurveWatch
 from rigidfleet.typing import Floats, Ints
@@ -56,15 +56,7 @@ NAMES = {
 #: Limits of a mission that positions over time do not show.
 UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
 #: What of a mission trajectories are judged by, beside radii and masses.
-_JUDGING = {
-    "schema_version",
-    "name",
-    "title",
-    "limits",
-    "obstacles",
-    "gravity",
-    "geodetic_origin",
-}
+_JUDGING = "schema_version", "name", "title", "limits", "obstacles", "gravity", "geodetic_origin"
 #: Name of the only phase.
 PHASE = "flight"
 
@@ -122,9 +114,9 @@ def trajectories(
     MissionError
         A limit is invalid.
     """
-    t = _checked("time", time, 1)
-    states = [_checked("position", position, 3)]
-    lacks = ""
+    t = _checked("time", time, None)
+    states = [_checked("position", position, len(t), None, 3)]
+    shape, lacks = states[0].shape, ""
     for what, given in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
         if given is None:
             lacks = lacks or what
@@ -133,13 +125,7 @@ def trajectories(
                 f"without {lacks}, {what} says nothing. Give {lacks}, or leave {what} out."
             )
         else:
-            states.append(_checked(what, given, 3))
-    shape = (len(t), states[0].shape[1], 3)
-    for what, x in zip(("position", "velocity", "acceleration", "jerk"), states, strict=False):
-        if x.shape != shape:
-            raise ResultError(
-                f"{what} has shape {x.shape}, expected {shape}: samples, vehicles, x y z."
-            )
+            states.append(_checked(what, given, *shape))
     if len(t) < 2:
         raise ResultError("a trajectory needs two samples or more.")
     if not (np.diff(t) > 0).all():
@@ -147,39 +133,40 @@ def trajectories(
         raise ResultError(
             f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
         )
+    # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
     first, knots = intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
-    yaws = None if yaw is None else _checked("yaw", yaw, 2)
-    if yaws is not None and yaws.shape != shape[:2]:
-        raise ResultError(f"yaw has shape {yaws.shape}, expected {shape[:2]}: samples, vehicles.")
-    # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
+    yaws = np.full(shape[:2], np.nan) if yaw is None else _checked("yaw", yaw, *shape[:2])
+    x, angle = np.stack(states), yaws[None, ..., None]
+    way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
+    how = NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
         from scipy.interpolate import CubicSpline
 
-        spline = CubicSpline(knots, np.append(states[0][first], states[0][-1:], axis=0))
-        position = Piecewise(knots, np.moveaxis(spline.c[::-1], 0, -1))
-        how = ASSUMED["cubic"]
-    else:
-        x = np.stack(states)
-        position = Piecewise.of_ends(knots, x[:, first], x[:, first + 1])
-        how = NAMES[2 * len(states) - 1]
-    angle = (np.full(shape[:2], np.nan) if yaws is None else yaws)[None, ..., None]
-    turned = Piecewise.of_ends(knots, angle[:, first], angle[:, first + 1])
+        _refuse_jumps(way)
+        spline = CubicSpline(knots, way.at(knots))
+        way, how = Piecewise(knots, np.moveaxis(spline.c[::-1], 0, -1)), ASSUMED["cubic"]
     return of_curve(
-        position.beside(turned), how,
+        way.beside(turned), how,
         mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
     )  # fmt: skip
 
 
-def _checked(name: str, given: ArrayLike, dimensions: int) -> Floats:
+def _checked(name: str, given: ArrayLike, *sizes: int | None) -> Floats:
+    """Finite numbers of these sizes, of which None is any but none."""
     try:
         x = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ResultError(f"{name} is no array of numbers.") from None
-    if x.ndim != dimensions or not x.size:
+    if x.ndim != len(sizes) or not x.size:
         raise ResultError(
-            f"{name} has shape {x.shape}; it needs {dimensions} dimensions, none of them empty."
+            f"{name} has shape {x.shape}; it needs {len(sizes)} dimensions, none of them empty."
+        )
+    if any(size not in (None, own) for size, own in zip(sizes, x.shape, strict=True)):
+        asked = ", ".join("any" if size is None else f"{size}" for size in sizes)
+        raise ResultError(
+            f"{name} has shape {x.shape}, expected ({asked}): samples, vehicles, axes."
         )
     if not np.isfinite(x).all():
         where = ", ".join(str(k + 1) for k in np.argwhere(~np.isfinite(x))[0])
@@ -266,6 +253,7 @@ def of_curve(
     """
     if abs(curve.time[0]) > _CLOCK or curve.time[0] < 0.0:
         curve = curve.later(-curve.time[0])
+    _refuse_jumps(curve)
     time, n, powers = curve.time, curve.pieces.shape[1], curve.pieces.shape[-1]
     span = float(time[-1] - time[0])
     # Samples are at all knots, and between them so that none is further from the next one than a step.
@@ -274,29 +262,25 @@ def of_curve(
     _bounded(n, int(parts.sum()) + 1)
     start = curve.at(time[:1])[0, :, :3]
     mission = judged_as(start, span, **judged)
-    watch = CurveWatch(
-        mission.fleet.radius, start, mission.obstacles, mission.limits, float(time[0])
-    )
+    watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, float(time[0]))
     # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
     near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
     grid = time[0] + near * np.arange(1, math.ceil(span / near))
-    samples = _Samples(int(parts.sum()) + len(time), n)
     fastest: dict[str, Extremum] = {}
     together = max(1, _TOGETHER // (4 * n * powers))
     for k in range(0, len(parts), together):  # in blocks, to save memory
-        block = Piecewise(time[k : k + together + 1], curve.pieces[k : k + together])
-        samples.take(block.on(_split(block.time, parts[k : k + together])))
+        block = curve.part(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
         _watch(watch, way, grid)
         _accelerations(fastest, way, directed=watch.directed)
-    samples.end(float(time[-1]))
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     record.extremes.update(watch.phase())
     watch.flight([record])
     record.extremes.update(fastest)
+    at, state, yaws = _samples(curve, parts)
     if powers < 3:  # lines turn at once at samples
-        samples.state[2:] = np.nan
-    return _result(mission, record, samples, interpolation, names)
+        state[2:] = np.nan
+    return _result(mission, record, at, state, yaws, interpolation, names)
 
 
 def of_curves(
@@ -334,67 +318,51 @@ def _bounded(n: int, times: int) -> None:
         )
 
 
-class _Samples:
-    """Samples of a curve that comes in blocks: one at each end of a piece, two where states jump.
+def _refuse_jumps(curve: Piecewise) -> None:
+    """Refuse trajectories that jump.
 
-    Attributes
-    ----------
-    rows : number of samples so far
-    time, state, yaw : (K,) [s], (4, K, N, 3) position to jerk, (K, N) [rad], with room for ``most`` samples
+    Raises
+    ------
+    ResultError
+        One does.
     """
-
-    def __init__(self, most: int, n: int) -> None:
-        self.rows = 0
-        self.time, self.yaw = np.empty(most), np.empty((most, n))
-        self.state = np.empty((4, most, n, 3))
-        self._scale = np.ones((4, 1, 1, 1))
-        self._last: Floats | None = None
-
-    def take(self, block: Piecewise) -> None:
-        """Take the pieces (K, N, 4, P) that follow.
-
-        Raises
-        ------
-        ResultError
-            A vehicle jumps.
-        """
-        after, end = block.ends(4)
-        last = after[:, :1] if self._last is None else self._last
-        before = np.concatenate([last, end[:, :-1]], axis=1)
-        self._last = end[:, -1:]
-        apart = (after - before)[..., :3]
-        off = np.linalg.norm(apart[0], axis=2)
-        if off.max() > _JUMP:
-            k, i = np.unravel_index(int(off.argmax()), off.shape)
-            raise ResultError(
-                f"agent {i + 1} jumps by {off[k, i]:.3g} m at {block.time[k]:g} s: its pieces do not join."
-            )
-        greatest_of = np.abs(after[..., :3]).max(axis=(1, 2, 3), keepdims=True)
-        self._scale = np.maximum(self._scale, 1.0 + greatest_of)
-        jump = (np.abs(apart) > 1e-9 * self._scale).any(axis=(0, 2, 3))
-        k = np.repeat(np.arange(len(jump)), 1 + jump)
-        second = np.append(False, k[1:] == k[:-1])
-        first = np.append(second[1:], False)
-        time, state = block.time[k], after[:, k]
-        time[second] = np.nextafter(time[second], np.inf)
-        state[:, first] = before[:, k[first]]
-        self._put(time, state)
-
-    def end(self, t: float) -> None:
-        """Take the end of the last piece, at a time [s]."""
-        assert self._last is not None
-        self._put(np.array([t]), self._last)
-        self.time, self.yaw = self.time[: self.rows], self.yaw[: self.rows]
-        self.state = self.state[:, : self.rows]
-
-    def _put(self, time: Floats, state: Floats) -> None:
-        rows = slice(self.rows, self.rows + len(time))
-        self.time[rows], self.state[:, rows], self.yaw[rows] = (
-            time,
-            state[..., :3],
-            state[0, ..., 3],
+    off = np.linalg.norm(curve.jumps(1)[0, ..., :3], axis=2)
+    if off.size and off.max() > _JUMP:
+        k, i = np.unravel_index(int(off.argmax()), off.shape)
+        raise ResultError(
+            f"agent {i + 1} jumps by {off[k, i]:.3g} m at {curve.time[k + 1]:g} s: its pieces do not join."
         )
-        self.rows = rows.stop
+
+
+def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
+    """Times (K,) [s], position to jerk (4, K, N, 3) and yaw (K, N) [rad] at the ends of equal parts of pieces (M,).
+
+    Where states jump, there are two samples.
+    """
+    time, (pieces, n, _, powers) = curve.time, curve.pieces.shape
+    together = max(1, _TOGETHER // (4 * n * powers))
+    greatest_of = np.abs(curve.pieces[:, :, :3, :4]).max(axis=(0, 1, 2))
+    scale = 1.0 + series.derivatives(pad(greatest_of, 4))
+    ends = np.append(np.zeros(pieces - 1, dtype=np.bool_), True)  # which pieces have a sample there
+    for k in range(0, pieces - 1, together):
+        jumps = curve.part(k, k + together + 1).jumps(4)[..., :3]
+        jumps = np.abs(jumps) > 1e-9 * scale[:, None, None, None]
+        ends[k : k + jumps.shape[1]] |= jumps.any(axis=(0, 2, 3))
+    count = parts + ends
+    k = np.repeat(np.arange(pieces), count)
+    first = np.cumsum(count) - count
+    share = (np.arange(len(k)) - first[k]) / parts[k]
+    at = time[k] + np.diff(time)[k] * share
+    at[share == 1.0] = time[1:][ends]
+    again = np.flatnonzero(ends[:-1]) + 1
+    at[first[again]] = np.nextafter(time[again], np.inf)
+    state, yaw = np.empty((4, len(k), n, 3)), np.empty((len(k), n))
+    for row in range(0, len(k), together):
+        rows = slice(row, row + together)
+        after = np.diff(time)[k[rows]] * share[rows]
+        x = series.derivatives(series.of_polynomials(curve.pieces[k[rows]], after, 4))
+        state[:, rows], yaw[rows] = x[..., :3], x[0, ..., 3]
+    return at, state, yaw
 
 
 def _split(time: Floats, parts: Ints) -> Floats:
@@ -463,40 +431,30 @@ def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: boo
 def _result(
     mission: Mission,
     record: PhaseRecord,
-    samples: _Samples,
+    time: Floats,
+    state: Floats,
+    yaw: Floats,
     interpolation: str,
     names: Sequence[str],
 ) -> Result:
-    time, (r, v, a, j) = samples.time, samples.state
-    k, n = r.shape[:2]
-    nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
-    cm, cm_velocity = r.mean(axis=1), v.mean(axis=1)
-    unknown: dict[str, Any] = {
-        name: np.full((k, size), np.nan)
-        for names, size in (
-            (("attitude", "attitude_reference", "frame"), 4),
-            (("rates", "rates_reference"), 3),
-            (("wrench_asked", "wrench_achieved"), 6),
-        )
-        for name in names
+    r, v, a, j = state
+    k, n = yaw.shape
+    sizes = {"time": k, "agent": n, "axis": 3, "quaternion": 4, "wrench": 6, "edge": 0}
+    nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
+    known: dict[str, Any] = {
+        "time": time, "phase": np.zeros(k, dtype=np.int64), "position": r, "velocity": v, "acceleration": a,
+        "slot_position": r, "slot_velocity": v, "slot_acceleration": a, "slot_jerk": j,
+        "yaw": np.nan_to_num(yaw, copy=False), "yaw_rate": np.zeros((k, n)),
+        "cm": r.mean(axis=1), "cm_velocity": v.mean(axis=1), "edges": np.zeros((0, 2), dtype=np.int64),
+    }  # fmt: skip
+    known |= {"cm_reference": known["cm"], "cm_velocity_reference": known["cm_velocity"]}
+    unknown = {
+        name: nothing(*(sizes[dim] for dim in x.dims))
+        for name, x in VARIABLES.items()
+        if not x.optional and name not in (*known, *CLOSE)
     }
-    edged = (
-        "distance",
-        "distance_reference",
-        "distance_rate_reference",
-        "constraint",
-        "integral",
-        "multiplier",
-    )
-    empty: dict[str, Any] = dict.fromkeys(edged, none)
     result = Result(
-        time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=a,
-        slot_position=r, slot_velocity=v, slot_acceleration=a, slot_jerk=j,
-        yaw=np.nan_to_num(samples.yaw, copy=False), yaw_rate=np.zeros((k, n)),
-        input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
-        cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,
-        edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
-        **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
+        **known, **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
         statistics={"interpolation": interpolation, "names": list(names)},
         later=[(CLOSE, partial(_close, mission, r, time)), (("mission_text",), partial(_text, mission))],
     )  # fmt: skip
