@@ -122,7 +122,8 @@ class AnyPhase(Part):
     @property
     def free(self) -> bool:
         """Whether a place is to be reached at any velocity."""
-        return "position" in self.meets and "velocity" not in self.meets
+        meets = self.meets
+        return "position" in meets and "velocity" not in meets
 
     @property
     def turns_away(self) -> bool:

@@ -51,12 +51,15 @@ def certified(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
-    left = np.arange(len(radius)) if lost is None else np.flatnonzero(~lost)
-    if len(left) < 2:
+    left = None if lost is None else np.flatnonzero(~lost)
+    if left is not None:
+        reference, radius = of_agents(reference, left), radius[left]
+    if len(radius) < 2:
         return None
-    some, r = of_agents(reference, left), radius[left]
-    found = of_ways(some.knots, some.ways, r) if len(some.knots) else straight(some, r)
-    assert found is not None  # of two agents
+    some = reference
+    found = of_ways(some.knots, some.ways, radius) if len(some.knots) else straight(some, radius)
+    if found is None or left is None:
+        return found
     i, j = (int(left[k]) for k in found.agents)
     return found._replace(agents=(i, j))
 
