@@ -1,4 +1,4 @@
-"""The extremes of a flight in continuous time, found by the kernel's monitor phase by phase.
+"""The extremes of curves in continuous time, found by the kernel's monitor: of a flight's, or of others'.
 
 `rigidfleet.kernel.monitor` says how extremes are found. This module chooses the pairs to monitor: all pairs of a
 small fleet, and the near pairs of a large one. The list of near pairs is renewed before any other pair can have come
