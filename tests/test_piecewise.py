@@ -73,6 +73,14 @@ def test_hermite_meets_all_derivatives(orders):
     np.testing.assert_allclose(apart.jumps(orders), 1.0, rtol=1e-7)
 
 
+def test_a_cubic_spline_is_that_of_scipy():
+    x = normal(len(TIME), 2, 3)
+    curve, known = Piecewise.cubic_spline(TIME, x), CubicSpline(TIME, x)
+    np.testing.assert_allclose(curve.at(INSIDE), known(INSIDE), atol=1e-12)
+    np.testing.assert_allclose(curve.rate().at(INSIDE), known(INSIDE, 1), atol=1e-11)
+    np.testing.assert_allclose(curve.part(2, 4).at(TIME[2:5]), x[2:5], atol=1e-12)
+
+
 def test_a_uniform_b_spline_is_that_of_scipy():
     control, spans = normal(9, 2, 3), 6
     curve = Piecewise.b_spline(control, 3.0)

@@ -131,9 +131,8 @@ def headings(curve: Piecewise) -> tuple[Floats, Floats]:
     times[again] += 1e-3
     needed = ~again | np.append(False, abs(np.diff(yaws)) > 1e-9)
     times, yaws = times[needed], yaws[needed]
-    level = np.append(abs(np.diff(yaws)) < 1e-12, True) & np.append(
-        True, abs(np.diff(yaws)) < 1e-12
-    )
+    flat = abs(np.diff(yaws)) < 1e-12
+    level = np.append(flat, True) & np.append(True, flat)
     level[[0, -1]] = False
     return times[~level], yaws[~level]
 

@@ -54,6 +54,13 @@ class Piecewise(NamedTuple):
         return cls(time, scaled / _widths(time, points) ** np.arange(powers))
 
     @classmethod
+    def cubic_spline(cls, time: Floats, x: Floats) -> Piecewise:
+        """Through values (K + 1, ...) at knots (K + 1,) [s], with continuous acceleration (not-a-knot at the ends)."""
+        from scipy.interpolate import CubicSpline
+
+        return cls(time, np.moveaxis(np.asarray(CubicSpline(time, x).c)[::-1], 0, -1))
+
+    @classmethod
     def b_spline(cls, control: Floats, duration: float) -> Piecewise:
         """The uniform cubic B-spline with control points (K + 3, ...) from 0 to a duration [s]."""
         spans = len(control) - 3

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
-from rigidfleet.math import proximity, series
+from rigidfleet.math import series
 from rigidfleet.math.bernstein import SIZES, greatest
 from rigidfleet.math.piecewise import (
     Piecewise,
@@ -34,6 +34,7 @@ from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
 from rigidfleet.simulation.extremes import CurveWatch
+from rigidfleet.simulation.recording import Places, distances, text_of
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
@@ -142,11 +143,8 @@ def trajectories(
     way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
     how = NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
-        from scipy.interpolate import CubicSpline
-
         _refuse_jumps(way)
-        spline = CubicSpline(knots, way.at(knots))
-        way, how = Piecewise(knots, np.moveaxis(spline.c[::-1], 0, -1)), ASSUMED["cubic"]
+        way, how = Piecewise.cubic_spline(knots, way.at(knots)), ASSUMED["cubic"]
     return of_curve(
         way.beside(turned), how,
         mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
@@ -443,21 +441,12 @@ def _result(
     result = Result(
         **known, **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
         statistics={"interpolation": interpolation, "names": list(names)},
-        later=[(CLOSE, partial(_close, mission, r, time)), (("mission_text",), partial(_text, mission))],
+        later=[
+            (CLOSE, partial(distances, mission, [record.extremes], Places([r], n), time)),
+            (("mission_text",), partial(text_of, mission)),
+        ],
     )  # fmt: skip
     vars(result)["mission"] = (
         mission  # its text is written where the result is, and need not be read
     )
     return result
-
-
-def _close(mission: Mission, r: Floats, time: Floats) -> dict[str, Any]:
-    """Distances at samples."""
-    left = np.ones(r.shape[:2], dtype=np.bool_)
-    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    values = close.separation, close.pair, close.clearance, close.agent, close.obstacle
-    return {name: x.copy() for name, x in zip(CLOSE, values, strict=True)}
-
-
-def _text(mission: Mission) -> dict[str, str]:
-    return {"mission_text": mission.text}
