@@ -282,13 +282,13 @@ def test_long_pieces_of_any_degree_are_watched_exactly(powers):
     flight = of_curve(curve, "a curve", separation=0.0)
     dense = np.linspace(0.0, 20.0, 400_001)
     r = curve.at(dense)[..., :3]
-    found = flight.phases[0].extremes
+    extremes = flight.phases[0].extremes
     apart = np.linalg.norm(r[:, 0] - r[:, 1], axis=1).min()
-    assert found["separation"].value == pytest.approx(apart, abs=3e-6)
-    assert found["highest"].value == pytest.approx(r[..., 2].max(), abs=3e-6)
-    assert found["lowest"].value == pytest.approx(r[..., 2].min(), abs=3e-6)
+    assert extremes["separation"].value == pytest.approx(apart, abs=3e-6)
+    assert extremes["highest"].value == pytest.approx(r[..., 2].max(), abs=3e-6)
+    assert extremes["lowest"].value == pytest.approx(r[..., 2].min(), abs=3e-6)
     speed = np.linalg.norm(curve.states(dense[1:-1], 2)[1, ..., :3], axis=-1).max()
-    assert found["speed"].value == pytest.approx(speed, rel=1e-5)
+    assert extremes["speed"].value == pytest.approx(speed, rel=1e-5)
 
 
 @pytest.mark.long
@@ -310,5 +310,7 @@ for i in range(1000):
 assert rf.assess(of_curves(curves, "splines", separation=0.5)).passed
 print(next(x.split()[1] for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x))
 """
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert int(told.stdout) * 1024 < 0.5e9
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert int(process.stdout) * 1024 < 0.5e9

@@ -76,7 +76,7 @@ def fit(source: Piecewise, tolerance: float, orders: int = 4, longest: float = n
     t = time[:-1, None] + np.diff(time)[:, None] * _CHECKED
     wanted = source.within(_CHECKED)
 
-    def tried(i: int, j: int) -> tuple[Floats, float]:
+    def piece_over(i: int, j: int) -> tuple[Floats, float]:
         """The piece over intervals i to j - 1, and its error as a share of what is allowed."""
         ends = time[[i, j]]
         position, yaw = (
@@ -95,7 +95,7 @@ def fit(source: Piecewise, tolerance: float, orders: int = 4, longest: float = n
         good, bad = i, n + 1  # the longest piece known to fit, the shortest known not to
         j = min(i + length, n)
         while good < n and bad - good > 1:
-            piece, error = tried(i, j)
+            piece, error = piece_over(i, j)
             if error <= 1.0:
                 good, best = j, piece
             elif j > i + 1:

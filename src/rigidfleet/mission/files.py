@@ -197,11 +197,11 @@ def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     try:
-        found = read_trajectories(name)
+        read = read_trajectories(name)
     except TrajectoryError as error:
         raise _unread(name, "", error) from None
-    curves = [curve.later(-curve.time[0]) for curve in found.curves]
-    if found.assumed in ASSUMED.values():
+    curves = [curve.later(-curve.time[0]) for curve in read.curves]
+    if read.assumed in ASSUMED.values():
         curves = [least_jerk(curve) for curve in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         raise unread(name, "has no yaw", "remove yaw = 'file', or give a file with a yaw")

@@ -115,18 +115,18 @@ def trajectories(
     MissionError
         A limit is invalid.
     """
-    t = _checked("time", time, None)
-    states = [_checked("position", position, len(t), None, 3)]
+    t = _array("time", time, None)
+    states = [_array("position", position, len(t), None, 3)]
     shape, lacks = states[0].shape, ""
-    for what, given in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
-        if given is None:
+    for what, values in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
+        if values is None:
             lacks = lacks or what
         elif lacks:
             raise ResultError(
                 f"without {lacks}, {what} says nothing. Give {lacks}, or leave {what} out."
             )
         else:
-            states.append(_checked(what, given, *shape))
+            states.append(_array(what, values, *shape))
     if len(t) < 2:
         raise ResultError("a trajectory needs two samples or more.")
     if not (np.diff(t) > 0).all():
@@ -138,7 +138,7 @@ def trajectories(
     first, knots = intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
-    yaws = np.full(shape[:2], np.nan) if yaw is None else _checked("yaw", yaw, *shape[:2])
+    yaws = np.full(shape[:2], np.nan) if yaw is None else _array("yaw", yaw, *shape[:2])
     x, angle = np.stack(states), yaws[None, ..., None]
     way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
     how = NAMES[2 * len(states) - 1]
@@ -151,10 +151,10 @@ def trajectories(
     )  # fmt: skip
 
 
-def _checked(name: str, given: ArrayLike, *sizes: int | None) -> Floats:
+def _array(name: str, values: ArrayLike, *sizes: int | None) -> Floats:
     """Finite numbers of these sizes, of which None is any but none."""
     try:
-        x = np.asarray(given, dtype=np.float64)
+        x = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ResultError(f"{name} is no array of numbers.") from None
     if x.ndim != len(sizes) or not x.size:
@@ -162,9 +162,9 @@ def _checked(name: str, given: ArrayLike, *sizes: int | None) -> Floats:
             f"{name} has shape {x.shape}; it needs {len(sizes)} dimensions, none of them empty."
         )
     if any(size not in (None, own) for size, own in zip(sizes, x.shape, strict=True)):
-        asked = ", ".join("any" if size is None else f"{size}" for size in sizes)
+        expected = ", ".join("any" if size is None else f"{size}" for size in sizes)
         raise ResultError(
-            f"{name} has shape {x.shape}, expected ({asked}): samples, vehicles, axes."
+            f"{name} has shape {x.shape}, expected ({expected}): samples, vehicles, axes."
         )
     if not np.isfinite(x).all():
         where = ", ".join(str(k + 1) for k in np.argwhere(~np.isfinite(x))[0])
@@ -207,15 +207,15 @@ def judged_as(
     phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": max(duration, 1e-3)}
     agents: dict[str, Any] = {"position": start.tolist()}
     if mission is not None:
-        given = mission if isinstance(mission, Mission) else load_mission(mission)
-        if given.n_agents != len(start):
+        own = mission if isinstance(mission, Mission) else load_mission(mission)
+        if own.n_agents != len(start):
             raise ResultError(
-                f"the mission {given.name!r} has {given.n_agents} agents, and there are {len(start)} trajectories."
+                f"the mission {own.name!r} has {own.n_agents} agents, and there are {len(start)} trajectories."
             )
-        data = {key: x for key, x in given.to_dict().items() if key in _JUDGING}
+        data = {key: x for key, x in own.to_dict().items() if key in _JUDGING}
         bounds = data.get("limits", {})
         data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
-        agents |= {"radius": list(given.agents.radius), "mass": list(given.agents.mass)}
+        agents |= {"radius": list(own.agents.radius), "mass": list(own.agents.mass)}
     else:
         if "separation_below" in (limits or {}) and radius == 0.0:
             raise ResultError(
@@ -257,7 +257,7 @@ def of_curve(
     # Samples are at all knots, and between them so that none is further from the next one than a step.
     step = max(_STEP, span * n / _SAMPLES) * (1.0 + 1e-9)
     parts = np.ceil(np.diff(time) / step).astype(np.int64)
-    _bounded(n, int(parts.sum()) + 1)
+    _refuse_too_many(n, int(parts.sum()) + 1)
     start = curve.at(time[:1])[0, :, :3]
     mission = judged_as(start, span, **judged)
     watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, float(time[0]))
@@ -296,11 +296,11 @@ def of_curves(
     ResultError, MissionError
         As for `of_curve`.
     """
-    _bounded(len(curves), len(common_knots(curves)))
+    _refuse_too_many(len(curves), len(common_knots(curves)))
     return of_curve(join(curves), interpolation, names=names, **judged)
 
 
-def _bounded(n: int, times: int) -> None:
+def _refuse_too_many(n: int, times: int) -> None:
     """Refuse more numbers than a result may have.
 
     Raises
@@ -406,11 +406,11 @@ def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: boo
     points = points.reshape(-1, *points.shape[2:])
     for way in SIZES if directed else ("",):
         name = f"{way}_acceleration".lstrip("_")
-        found, known = greatest(points, SIZES[way]), best.get(name)
-        if known is None or found.value > known.value:
-            k, i = divmod(found.curve, n)
+        peak, known = greatest(points, SIZES[way]), best.get(name)
+        if known is None or peak.value > known.value:
+            k, i = divmod(peak.curve, n)
             t, end = curve.time[k : k + 2]
-            best[name] = Extremum(found.value, float(t + found.place * (end - t)), i, -1)
+            best[name] = Extremum(peak.value, float(t + peak.place * (end - t)), i, -1)
 
 
 def _result(
