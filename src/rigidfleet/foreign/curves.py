@@ -85,7 +85,7 @@ def with_yaw(position: Floats, yaw: Floats) -> Floats:
 
 
 def with_headings(curve: Curve, times: Floats, yaws: Floats) -> Curve:
-    """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]."""
+    """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]; it jumps where two have one time."""
     time = np.unique(
         np.concatenate([curve.time, times[(times > curve.time[0]) & (times < curve.time[-1])]])
     )
@@ -94,7 +94,9 @@ def with_headings(curve: Curve, times: Floats, yaws: Floats) -> Curve:
         curve.pieces[k], time[:-1] - curve.time[k], curve.pieces.shape[-1]
     )
     pieces = np.moveaxis(moved, 0, -1)
-    at = np.interp(time, times, yaws)
+    quarter = np.diff(time) / 4  # inside of a piece, where a jump at its end is not seen
+    early, late = (np.interp(t, times, yaws) for t in (time[:-1] + quarter, time[1:] - quarter))
     pieces[:, 3] = 0.0
-    pieces[:, 3, 0], pieces[:, 3, 1] = at[:-1], np.diff(at) / np.diff(time)
+    pieces[:, 3, 1] = (late - early) / (2 * quarter)
+    pieces[:, 3, 0] = early - pieces[:, 3, 1] * quarter
     return Curve(time, pieces)

@@ -21,6 +21,7 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import replacing_folder, write_file
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
+from rigidfleet.foreign.curves import Curve
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
 from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
 from rigidfleet.result import Result, as_result
@@ -28,7 +29,7 @@ from rigidfleet.result import Result, as_result
 __all__ = ["FORMATS", "Export", "Format", "FormatName", "export"]
 
 FormatName = Literal[
-    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "plan", "rrd", "gltf"
+    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "rrd", "gltf"
 ]
 #: How much further off than its tolerance an export may be, by rounding and between the times that a fit checks.
 _SLACK = 1.05
@@ -40,7 +41,7 @@ class Format(NamedTuple):
     Attributes
     ----------
     write : from what is exported and the rate [Hz] or the tolerance [m] to the bytes of each file
-    read : from the bytes of a file to the ways of its vehicles (of a plan: its points)
+    read : from the bytes of a file to the ways of its vehicles
     suffix : of the files' names
     each : whether each vehicle has a file of its own
     tolerance : default tolerance of fitted curves [m]; None: it has samples at a rate instead
@@ -50,7 +51,7 @@ class Format(NamedTuple):
     """
 
     write: Callable[[Motion, Any], Iterator[bytes]]
-    read: Callable[[bytes], Any]
+    read: Callable[[bytes], list[Curve]]
     suffix: str
     each: bool
     tolerance: float | None
@@ -90,10 +91,6 @@ FORMATS: dict[str, Format] = {
         mavlink.write_tlog, mavlink.read_tlog, "tlog", True, None,
         "position, velocity, acceleration, yaw and yaw rate", "jerk, tilt and rotors",
     ),
-    "plan": Format(
-        mavlink.write_plan, mavlink.read_plan, "plan", True, 0.1,
-        "path (straight legs)", "all times and speeds, and yaw: it is a preview",
-    ),
     "rrd": Format(
         recordings.write_rrd, recordings.read_rrd, "rrd", False, None,
         "position and yaw", "velocity, acceleration, jerk, tilt and rotors", False, "rerun", "rerun-sdk",
@@ -115,8 +112,8 @@ class Export:
     format, path : what was written, and where: a file, or a folder with one file a vehicle
     files, size : number of files and of all their bytes
     flown : whether it is the motion flown, not the reference
-    deviation : greatest distance of the files' ways from what was exported [m]; of a plan, of the paths
-    yaw_deviation : greatest difference of yaw [rad]; NaN if the format has no yaw
+    deviation : greatest distance of the files' ways from what was exported [m]
+    yaw_deviation : greatest difference of yaw [rad]
     span : first and last mission time of the ways [s]
     part : words about the part of the flight that the files have; "" for all of it
     """
@@ -136,13 +133,10 @@ class Export:
         files = "1 file" if self.files == 1 else f"{self.files} files"
         source = "flown" if self.flown else "reference"
         turned = math.degrees(self.yaw_deviation)
-        within = f"{brief(1e3 * self.deviation)} mm" + (
-            "" if math.isnan(turned) else f" and {brief(turned)} deg"
-        )
+        within = f"{brief(1e3 * self.deviation)} mm and {brief(turned)} deg"
         size = max(1, round(self.size / 1e3))
         # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
-        heading = self.flown and not math.isnan(turned)
-        extra = "; yaw is the reference's, and east where it has none" if heading else ""
+        extra = "; yaw is the reference's, and east where it has none" if self.flown else ""
         return (
             f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}; lost "
             f"{what.lost}{extra}."
@@ -207,10 +201,22 @@ def export(
     )
 
 
+def format_of(name: str) -> Format:
+    """The format of a name.
+
+    Raises
+    ------
+    ValueError
+        There is none of this name.
+    """
+    if name not in FORMATS:
+        why = "; plans have no times: use tlog to fly, gltf to look" if name == "plan" else ""
+        raise ValueError(f"there is no format {name!r}{why}; use one of {', '.join(FORMATS)}")
+    return FORMATS[name]
+
+
 def _chosen(format: str, path: Path) -> Format:
-    if format not in FORMATS:
-        raise ValueError(f"there is no format {format!r}; use one of {', '.join(FORMATS)}")
-    chosen = FORMATS[format]
+    chosen = format_of(format)
     if format == "setpoints" and path.suffix != ".csv":
         return chosen._replace(write=tables.write_tables, each=True)
     return chosen
@@ -268,18 +274,12 @@ def _written(
 
 def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list[Deviation]:
     """How far the ways in a file are from those of the vehicles from ``first`` on."""
-    read = chosen.read(data)
-    if isinstance(read, np.ndarray):  # a path without times
-        source = motion.knots(first).curve()
-        between = (source.time[:-1] + source.time[1:]) / 2
-        points = source.at(np.sort(np.concatenate([source.time, between])))[:, :3]
-        return [Deviation(float(mavlink.to_segments(points, read).max()), math.nan, 0.0)]
     start = motion.start if chosen.own_time else 0.0
     return [
         deviation(
             motion.knots(first + i).curve(), curve.later(start), motion.result.motors_off[first + i]
         )
-        for i, curve in enumerate(read)
+        for i, curve in enumerate(chosen.read(data))
     ]
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import NAMES, Curve
 from rigidfleet.foreign.pieces import curve_to_rows, rows_to_curve
-from rigidfleet.interchange.curves import Knots, Motion
+from rigidfleet.interchange.curves import YAW_TOLERANCE, Knots, Motion
 from rigidfleet.math.bernstein import bernstein, of_bernstein
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
@@ -106,7 +106,11 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
 
 def _compressed(knots: Knots, tolerance: float, agent: int) -> tuple[bytes, Floats]:
     """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
-    curve = knots.fitted(tolerance - COMPRESSED_ROUNDING, longest=_LONGEST * _MS)
+    curve = knots.fitted(
+        tolerance - COMPRESSED_ROUNDING,
+        yaw_tolerance=YAW_TOLERANCE - _TENTH,
+        longest=_LONGEST * _MS,
+    )
     duration = np.diff(curve.time)
     position = bernstein(curve.pieces[:, :3], duration) / _MM
     yaw = (

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import Curve, with_headings
-from rigidfleet.interchange.curves import Motion, headings
+from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, headings
 from rigidfleet.math import series, splines
 from rigidfleet.typing import Floats, Ints
 
@@ -65,7 +65,7 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
     }
     nodes, samplers, channels = [], [], []
     for agent, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
-        curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
+        curve = motion.knots(agent).fitted(tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
         times, yaws = headings(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (

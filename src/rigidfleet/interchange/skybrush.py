@@ -2,7 +2,8 @@
 
 Source: the types of Skybrush's show format (`ShowSpecification`, `Trajectory`, `YawControl`), and, for the location,
 `ShowLocation` of Skybrush Studio: [latitude, longitude] in 1e-7 deg, altitude in mm, and the direction of the show's
-x axis from north to east [deg], here east.
+x axis from north to east [deg], here east. Yaw is in degrees clockwise from the show's x axis, and begins within a turn
+from zero (`sbstudio/model/yaw.py` of Skybrush Studio).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import Motion, headings
+from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, headings
 from rigidfleet.interchange.lights import FRAME, fades, program
 from rigidfleet.math.bernstein import bernstein
 
@@ -46,7 +47,7 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     last = round((motion.end - motion.start) / FRAME)
     drones, files = [], {}
     for agent in range(motion.n_agents):
-        curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
+        curve = motion.knots(agent).fitted(tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _segments(curve)
@@ -57,7 +58,9 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
             "version": 1, "points": points, "takeoffTime": 0, "landingTime": landing
         }  # fmt: skip
         times, yaws = headings(curve)
-        setpoints = np.column_stack([times.round(6), np.degrees(yaws).round(4)]).tolist()
+        clockwise = -np.degrees(yaws)
+        clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
+        setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
         light = base64.b64encode(bytes(program(changes, agent, last))).decode()
         files[f"{folder}/lights.json"] = {"version": 1, "data": light}
