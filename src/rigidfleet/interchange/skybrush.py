@@ -21,8 +21,9 @@ from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.shows import read_show
 from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, headings
-from rigidfleet.interchange.lights import FRAME, fades, program
+from rigidfleet.interchange.lights import program
 from rigidfleet.math.bernstein import bernstein
+from rigidfleet.result.lights import fades
 
 #: Greatest number of vehicles of a show.
 MOST = 5000
@@ -43,8 +44,7 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     if motion.n_agents > MOST:
         raise ResultError(f"a show has at most {MOST} drones, and this flight {motion.n_agents}.")
     mission = motion.result.mission
-    changes = fades(motion.result, motion.start, motion.end)
-    last = round((motion.end - motion.start) / FRAME)
+    changes = fades(motion.result)
     drones, files = [], {}
     for agent in range(motion.n_agents):
         curve = motion.knots(agent).fitted(tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
@@ -62,7 +62,7 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
         clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
         setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
-        light = base64.b64encode(bytes(program(changes, agent, last))).decode()
+        light = base64.b64encode(bytes(program(changes, agent, motion.start, motion.end))).decode()
         files[f"{folder}/lights.json"] = {"version": 1, "data": light}
         settings = {
             "name": name,
