@@ -25,6 +25,7 @@ from rigidfleet.foreign.curves import Curve
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
 from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
 from rigidfleet.result import Result, as_result
+from rigidfleet.result.lights import has_lights
 
 __all__ = ["FORMATS", "Export", "Format", "FormatName", "export"]
 
@@ -48,6 +49,7 @@ class Format(NamedTuple):
     kept, lost : what such a file has of each vehicle, and what it lacks
     own_time : whether its time begins at 0, not at the mission time of the first state
     package, distribution : module that has to be installed, and the name under which pip installs it
+    lights : whether it has the vehicles' lights
     """
 
     write: Callable[[Motion, Any], Iterator[bytes]]
@@ -60,6 +62,7 @@ class Format(NamedTuple):
     own_time: bool = True
     package: str = ""
     distribution: str = ""
+    lights: bool = False
 
 
 FORMATS: dict[str, Format] = {
@@ -81,7 +84,7 @@ FORMATS: dict[str, Format] = {
     ),
     "skyc": Format(
         skybrush.write_skyc, skybrush.read_skyc, "skyc", False, 1e-2,
-        "position (cubic pieces) and yaw", "continuous acceleration, tilt and rotors",
+        "position (cubic pieces) and yaw", "continuous acceleration, tilt and rotors", lights=True,
     ),
     "mcap": Format(
         recordings.write_mcap, recordings.read_mcap, "mcap", False, None,
@@ -97,7 +100,7 @@ FORMATS: dict[str, Format] = {
     ),
     "gltf": Format(
         gltf.write_gltf, gltf.read_gltf, "glb", False, 1e-2,
-        "position (cubic splines) and yaw", "continuous acceleration, tilt and rotors",
+        "position (cubic splines) and yaw", "continuous acceleration, tilt and rotors", lights=True,
     ),
 }  # fmt: skip
 assert tuple(FORMATS) == get_args(FormatName)
@@ -116,6 +119,7 @@ class Export:
     yaw_deviation : greatest difference of yaw [rad]
     span : first and last mission time of the ways [s]
     part : words about the part of the flight that the files have; "" for all of it
+    lights : whether the flight has lights, which the format keeps or loses
     """
 
     format: str
@@ -127,6 +131,7 @@ class Export:
     yaw_deviation: float
     span: tuple[float, float]
     part: str
+    lights: bool = False
 
     def __str__(self) -> str:
         what = FORMATS[self.format]
@@ -137,9 +142,11 @@ class Export:
         size = max(1, round(self.size / 1e3))
         # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
         extra = "; yaw is the reference's, and east where it has none" if self.flown else ""
+        kept = ", and lights" if self.lights and what.lights else ""
+        lost = f"lights, {what.lost}" if self.lights and not what.lights else what.lost
         return (
-            f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}; lost "
-            f"{what.lost}{extra}."
+            f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}{kept}; "
+            f"lost {lost}{extra}."
         )
 
 
@@ -197,8 +204,9 @@ def export(
             " (slots are not tracked before or after)" if cut else ""
         )
     return Export(
-        format, path, count, size, flown, off.position, off.yaw, (motion.start, end), part
-    )
+        format, path, count, size, flown, off.position, off.yaw, (motion.start, end), part,
+        has_lights(result),
+    )  # fmt: skip
 
 
 def format_of(name: str) -> Format:

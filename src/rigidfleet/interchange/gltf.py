@@ -1,8 +1,9 @@
 """glTF 2.0 in one binary file (.glb): an animation for Blender and other programs that draw.
 
-Source: the glTF 2.0 specification of Khronos: cubic splines (appendix C), the binary container (section 4). Axes are
-right-handed with y up: (x, y, z) of a mission is (x, z, -y) there. No package is used: those on offer either write no
-animations (trimesh) or only wrap the JSON (pygltflib, which the tests read with).
+Source: the glTF 2.0 specification of Khronos: cubic splines (appendix C), the binary container (section 4); for lights,
+its ratified extension KHR_animation_pointer. Axes are right-handed with y up: (x, y, z) of a mission is (x, z, -y)
+there. No package is used: those on offer either write no animations (trimesh) or only wrap the JSON (pygltflib, which
+the tests read with).
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ import numpy as np
 from rigidfleet.foreign.curves import Curve, with_headings
 from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, headings
 from rigidfleet.math import series, splines
+from rigidfleet.result.lights import fades, has_lights, lights, view
 from rigidfleet.typing import Floats, Ints
 
 _FLOAT, _UNSIGNED = 5126, 5125
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+#: Extension by which lights change, and the camera's vertical angle of view [rad].
+_POINTER, _FOV = "KHR_animation_pointer", 0.6
 #: An octahedron of radius 1: corners and triangles.
 _CORNERS = np.array(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
@@ -57,7 +61,10 @@ class _File:
 
 
 def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
-    """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between."""
+    """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between.
+
+    If the flight has lights, each vehicle shines in its own, seen by a camera in front.
+    """
     file = _File()
     mesh = {
         "attributes": {"POSITION": file.add(_CORNERS, bounds=True)},
@@ -76,23 +83,78 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
             samplers.append(keys | {"interpolation": way})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
         nodes.append({"name": f"agent {agent + 1}", "mesh": 0, "scale": [max(radius, 0.05)] * 3})
-    scene = {
+    scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "rigidfleet"},
         "scene": 0,
         "scenes": [{"name": motion.result.mission.name, "nodes": list(range(len(nodes)))}],
         "nodes": nodes,
         "meshes": [{"primitives": [mesh]}],
         "animations": [{"name": "flight", "samplers": samplers, "channels": channels}],
-        "buffers": [{"byteLength": len(file.data)}],
         "bufferViews": file.views,
         "accessors": file.accessors,
     }
+    if has_lights(motion.result):
+        _light(scene, file, motion)
+    scene["buffers"] = [{"byteLength": len(file.data)}]
     words = json.dumps(scene).encode()
     parts = [(_JSON, words + b" " * (-len(words) % 4)), (_BINARY, bytes(file.data))]
     size = 12 + sum(8 + len(part) for _, part in parts)
     yield struct.pack("<III", _MAGIC, 2, size) + b"".join(
         struct.pack("<II", len(part), kind) + part for kind, part in parts
     )
+
+
+def _light(scene: dict[str, Any], file: _File, motion: Motion) -> None:
+    """Add lights and a camera to a scene: a material for each vehicle, whose emission changes.
+
+    Programs without the extension show the last colour of each that is not black.
+    """
+    result, animation, n = motion.result, scene["animations"][0], motion.n_agents
+    # A change at once takes a millisecond.
+    ends = [t for fade in fades(result) for t in (fade.begin, fade.end + 1e-3)]
+    times = np.unique(np.clip(ends, motion.start, motion.end).round(4))
+    shown = lights(result, times)
+    shown = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # linear
+    last = len(times) - 1 - shown[::-1].any(axis=2).argmax(axis=0)
+    scene["extensionsUsed"] = [_POINTER]
+    black = {"baseColorFactor": [0.0, 0.0, 0.0, 1.0], "metallicFactor": 0.0}
+    scene["materials"] = [
+        {"pbrMetallicRoughness": black, "emissiveFactor": shown[last[i], i].tolist()}
+        for i in range(n)
+    ]
+    (shape,) = scene["meshes"][0]["primitives"]
+    scene["meshes"] = [{"primitives": [shape | {"material": i}]} for i in range(n)]
+    keys = file.add(times - motion.start, bounds=True)
+    for i, node in enumerate(scene["nodes"]):
+        node["mesh"] = i
+        sampler = {"input": keys, "output": file.add(shown[:, i]), "interpolation": "LINEAR"}
+        animation["samplers"].append(sampler)
+        pointer = {_POINTER: {"pointer": f"/materials/{i}/emissiveFactor"}}
+        target = {"path": "pointer", "extensions": pointer}
+        animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
+    azimuth, elevation = view(result)
+    low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
+    far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
+    back = [
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    ]
+    # About y from looking along y of the mission, then down.
+    turn, down = (azimuth + np.pi / 2) / 2, -elevation / 2
+    s, c, sx, cx = np.sin(turn), np.cos(turn), np.sin(down), np.cos(down)
+    place = {
+        "translation": _y_up((low + high) / 2 + far * np.array(back)).tolist(),
+        "rotation": [float(x) for x in (c * sx, s * cx, -s * sx, c * cx)],
+    }
+    scene["cameras"] = [
+        {
+            "type": "perspective",
+            "perspective": {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far},
+        }
+    ]
+    scene["nodes"].append({"name": "front", "camera": 0, **place})
+    scene["scenes"][0]["nodes"].append(n)
 
 
 def read_gltf(data: bytes) -> list[Curve]:
@@ -109,8 +171,9 @@ def read_gltf(data: bytes) -> list[Curve]:
         return found.astype(float).reshape(-1, each)
 
     animation = scene["animations"][0]
+    channels = [x for x in animation["channels"] if "node" in x["target"]]
     curves = []
-    for moved, turned in zip(animation["channels"][::2], animation["channels"][1::2], strict=True):
+    for moved, turned in zip(channels[::2], channels[1::2], strict=True):
         (time, values), (times, quaternions) = (
             [array(animation["samplers"][channel["sampler"]][key]) for key in ("input", "output")]
             for channel in (moved, turned)
