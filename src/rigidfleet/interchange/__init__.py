@@ -21,9 +21,9 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import replacing_folder, write_file
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
 from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights
 
@@ -53,7 +53,7 @@ class Format(NamedTuple):
     """
 
     write: Callable[[Motion, Any], Iterator[bytes]]
-    read: Callable[[bytes], list[Curve]]
+    read: Callable[[bytes], list[Piecewise]]
     suffix: str
     each: bool
     tolerance: float | None
@@ -284,9 +284,7 @@ def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list
     """How far the ways in a file are from those of the vehicles from ``first`` on."""
     start = motion.start if chosen.own_time else 0.0
     return [
-        deviation(
-            motion.knots(first + i).curve(), curve.later(start), motion.result.motors_off[first + i]
-        )
+        deviation(motion.curve(first + i), curve.later(start), motion.result.motors_off[first + i])
         for i, curve in enumerate(chosen.read(data))
     ]
 

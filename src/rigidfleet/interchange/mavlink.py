@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.foreign.curves import through
 from rigidfleet.interchange.curves import Motion
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.setpoints import Setpoints, at_times
 from rigidfleet.typing import Floats
 
@@ -72,7 +73,7 @@ def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
         yield _origin_record(motion, system) + records.tobytes() + disarmed
 
 
-def read_tlog(data: bytes) -> list[Curve]:
+def read_tlog(data: bytes) -> list[Piecewise]:
     """The way in a log: cubics through its positions and velocities."""
     first = 8 + 8 + data[9]
     if data[13] == _ORIGIN:
