@@ -338,6 +338,37 @@ def test_a_show_of_studio_turns_as_it_did_there(tmp_path):
     assert yaw[280] - yaw[80] == pytest.approx(np.radians(260.0))
 
 
+def test_a_show_of_studio_turns_so_in_mavlink(tmp_path):
+    """Read by `assess` and exported, Studio's show asks MAVLink for headings clockwise from north, and their rates."""
+    own = json.loads((Path(__file__).parent / "data" / "skybrush_studio.json").read_text())
+    bent = {"points": [[0, [0, 0, 5], []], [10, [4, 0, 5], [[0, 1, 5], [4, 1, 5]]]], "version": 1}
+    show = show_of(tmp_path / "studio.skyc", own | {"trajectory": bent})
+    assert (
+        main(["assess", str(show), "--limits", "speed=1", "--out", str(tmp_path / "judged")]) == 0
+    )
+    (result,) = (tmp_path / "judged").glob("*.nc")
+    assert main(["export", str(result), "--format", "tlog", "--out", str(tmp_path / "tlog")]) == 0
+    (log,) = (tmp_path / "tlog").iterdir()
+    # Message 84 in MAVLink's common.xml: time [ms], 9 floats of state, yaw and its rate; 18 bytes ahead, 2 after.
+    data, found = log.read_bytes(), []
+    while data:
+        length = data[9]
+        if data[13] == 84:
+            found.append(struct.unpack_from("<I9f2f", data, 14))
+        data = data[8 + 6 + length + 2 :]
+    t, yaw, rate = np.array(found)[:, [0, 10, 11]].T
+    wanted = np.radians(90.0 - studio_rotation(t / 1e3))
+    assert abs(np.angle(np.exp(1j * (yaw - wanted)))).max() < math.radians(0.01)
+    turning = (t > 2100) & (t < 6900)
+    assert np.degrees(rate[turning]) == pytest.approx(-52.0, abs=0.01)
+    again = tmp_path / "again.skyc"
+    assert main(["export", str(result), "--format", "skyc", "--out", str(again)]) == 0
+    _, (drone,) = check_skyc(again)
+    way = np.array(drone["yawControl"]["setpoints"])
+    t = np.linspace(0.0, 10.0, 401)
+    assert np.interp(t, *way.T) == pytest.approx(360.0 - studio_rotation(t), abs=0.5)
+
+
 STILL = {"points": [[0, [0, 0, 1], []], [10, [0, 0, 1], []]], "version": 1}
 
 
@@ -508,6 +539,16 @@ def test_gltf(flight, tmp_path):
     agrees(made, found)
     assert made.deviation <= 1.01e-2
     assert math.degrees(made.yaw_deviation) <= 0.51
+
+
+@pytest.mark.parametrize("name", ["skyc", "gltf", "compressed"])
+@pytest.mark.parametrize("omega", [0.5, 0.9, 3.0])
+def test_yaw_keeps_half_a_degree(flight, tmp_path, name, omega):
+    """Tolerances of fitted yaw, of lines through it and of rounding stay within half a degree in sum."""
+    angle = omega * flight.time[:, None] + 0.5 * np.arange(N)
+    swings = replace(flight, yaw=1.5 * np.sin(angle), yaw_rate=1.5 * omega * np.cos(angle))
+    made = export(swings, tmp_path / f"{name}.x", name, tolerance=0.5)
+    assert 0.1 < math.degrees(made.yaw_deviation) <= 0.5
 
 
 def test_fast_turns_are_kept(flight, tmp_path):

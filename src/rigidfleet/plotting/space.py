@@ -91,7 +91,9 @@ def scene(result: Result) -> Scene:
     return Scene(
         r[thin],
         result.cm[thin],
-        _shots(result, rows),
+        _shots(
+            result, rows[::-1] if has_lights(result) else rows
+        ),  # of two at one place, the later light
         low,
         high,
         floor,
