@@ -91,6 +91,8 @@ UPRIGHT = np.array([[0, 0, 0], [3, 0, 0], [0, 0, 2], [3, 0.2, 2], [1, 0, 1]], dt
         (UPRIGHT[:, [0, 2, 1]], -90, True),  # lying: from above, y upwards
         (np.concatenate([np.eye(3), -np.eye(3)]), -90, False),  # no plane
         (UPRIGHT[:1], -90, False),
+        (np.array([[0, 0, 0], [0, 1, 0], [0, 3, 0]]), 0, False),  # a row along y: from the east
+        (np.array([[0, 0, 0], [0, 0, 1], [0, 0, 3]]), -90, False),  # a pole
     ],
 )
 def test_the_viewer_faces_the_plane(points, azimuth, steep):

@@ -73,14 +73,17 @@ def rgb(colours: tuple[str, ...]) -> Floats:
 
 def view(result: Result) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer, from the flight, who reads the flattest of the lit formations."""
-    best, seen = np.inf, seen_from(np.zeros((0, 3)))
+    best, seen = np.inf, seen_from(np.zeros((1, 3)))
     for phase in range(len(result.phases)):
         formation, k = result.phases[phase].formation, result.samples(phase).stop - 1
         colours = None if formation is None else result.mission.formation_colours(formation)
         if colours is None:
             continue
         points = result.position[k][rgb(colours).any(axis=1)]
-        if np.isfinite(points).all() and (thin := _thickness(points)[0]) < best:
+        if not (len(points) and np.isfinite(points).all()):
+            continue
+        _, wide, thick = _principal(points)[0]
+        if (thin := thick / max(wide, 1e-9)) < best:
             q = result.attitude[k]
             turn = dcm_from_quaternion(q).T if np.isfinite(q).all() else np.eye(3)
             best, seen = thin, seen_from(points, turn @ _FRONT)
@@ -90,20 +93,28 @@ def view(result: Result) -> tuple[float, float]:
 def seen_from(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer who faces the plane of points (n, 3) [m], on the side of ``front`` (3,).
 
-    Without a plane, the viewer is in front; a plane that lies flat is seen from above, y upwards.
+    Of the planes through a line it is the one that faces the front most, without any plane the front itself. A plane
+    that lies flat is seen from above, y upwards.
     """
-    thin, normal = _thickness(points)
-    if thin > _FLAT:
-        normal = np.asarray(front)
-    if abs(normal[2]) > 0.7:
+    ahead = np.asarray(front, dtype=float)
+    extents, axes = _principal(points)
+    normal = axes[2]
+    if extents[1] <= 1e-3 * extents[0]:
+        normal = ahead - ahead @ axes[0] * axes[0]
+    elif extents[2] > _FLAT * extents[1]:
+        normal = ahead
+    if abs(normal[2]) > 0.7 * np.linalg.norm(normal):
         return -np.pi / 2, np.pi / 2
-    x, y, _ = normal * np.copysign(1.0, normal @ front)
+    x, y, _ = normal * np.copysign(1.0, normal @ ahead)
     return float(np.arctan2(y, x)), _LOW
 
 
-def _thickness(points: Floats) -> tuple[float, Floats]:
-    """Extent of points (n, 3) along their thinnest direction, as a share of the second one, and this direction (3,)."""
-    if len(points) < 3:
-        return np.inf, np.zeros(3)
-    _, extents, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    return float(extents[2] / max(extents[1], 1e-3 * extents[0], 1e-9)), axes[2]
+def _principal(points: Floats) -> tuple[Floats, Floats]:
+    """Extents (3,) of points (n, 3) along their principal directions, the greatest first, and these (3, 3) as rows."""
+    about = (
+        np.concatenate([points - points.mean(axis=0), np.zeros((3, 3))])
+        if len(points)
+        else np.zeros((3, 3))
+    )
+    _, extents, axes = np.linalg.svd(about, full_matrices=False)
+    return extents, axes
