@@ -87,7 +87,7 @@ def trajectories(
     time : (K,) [s], increasing
     position : (K, N, 3) [m], world axes (z up)
     velocity, acceleration, jerk : (K, N, 3); each needs those before
-    yaw : (K, N) [rad]
+    yaw : (K, N) [rad], on lines; full turns between two samples do not count
     cubic : without velocities, cubic splines with continuous acceleration (`scipy.interpolate.CubicSpline`) instead of
         lines
     mission : a mission, its name or path: the radii and masses of its vehicles, its limits and obstacles count, instead
@@ -133,7 +133,7 @@ def trajectories(
     first, knots = intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
-    yaws = None if yaw is None else _checked("yaw", yaw, 2)
+    yaws = None if yaw is None else np.unwrap(_checked("yaw", yaw, 2), axis=0)
     if yaws is not None and yaws.shape != shape[:2]:
         raise ResultError(f"yaw has shape {yaws.shape}, expected {shape[:2]}: samples, vehicles.")
     # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
