@@ -159,14 +159,11 @@ def test_gltf_shines(flight, tmp_path):
         assert scene["materials"][i]["emissiveFactor"] == pytest.approx(linear)
     # The camera looks along its own -z, with y up; x, y, z of glTF are x, z, -y of the mission.
     (camera,) = (node for node in scene["nodes"] if "camera" in node)
-    x, y, z, w = camera["rotation"]
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    turn = np.reshape(camera["matrix"], (4, 4))  # column by column
     places = flight.position[-1] @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    seen = (places - camera["translation"]) @ turn
+    seen = (places - turn[3, :3]) @ turn[:3, :3].T
+    assert turn[:3, :3] @ turn[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(turn[:3, :3]) == pytest.approx(1.0)
     assert (seen[:, 2] < 0).all()
     tan = math.tan(scene["cameras"][0]["perspective"]["yfov"] / 2)
     across, up = seen[:, 0] / -seen[:, 2] / tan, seen[:, 1] / -seen[:, 2] / tan

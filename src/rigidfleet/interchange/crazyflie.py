@@ -106,12 +106,8 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
 
 def _compressed(way: Piecewise, tolerance: float, agent: int) -> tuple[bytes, Floats]:
     """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
-    curve = fit(
-        way,
-        tolerance - COMPRESSED_ROUNDING,
-        yaw_tolerance=YAW_TOLERANCE - _TENTH,
-        longest=_LONGEST * _MS,
-    )
+    near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
+    curve = fit(way, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     duration = np.diff(curve.time)
     position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
     # Yaw is of degree 3, like the reference between samples.

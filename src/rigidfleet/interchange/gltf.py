@@ -110,50 +110,36 @@ def _light(scene: dict[str, Any], file: _File, motion: Motion) -> None:
     Programs without the extension show the last colour of each that is not black.
     """
     result, animation, n = motion.result, scene["animations"][0], motion.n_agents
-    # A change at once takes a millisecond.
+    # A change at once takes a millisecond. Samplers are linear where they do not say.
     ends = [t for fade in fades(result) for t in (fade.begin, fade.end + 1e-3)]
     times = np.unique(np.clip(ends, motion.start, motion.end).round(4))
     shown = lights(result, times)
     shown = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # linear
     last = len(times) - 1 - shown[::-1].any(axis=2).argmax(axis=0)
     scene["extensionsUsed"] = [_POINTER]
-    black = {"baseColorFactor": [0.0, 0.0, 0.0, 1.0], "metallicFactor": 0.0}
-    scene["materials"] = [
-        {"pbrMetallicRoughness": black, "emissiveFactor": shown[last[i], i].tolist()}
-        for i in range(n)
-    ]
+    black = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1], "metallicFactor": 0}}
+    colours = shown[last, np.arange(n)].tolist()
+    scene["materials"] = [black | {"emissiveFactor": colour} for colour in colours]
     (shape,) = scene["meshes"][0]["primitives"]
     scene["meshes"] = [{"primitives": [shape | {"material": i}]} for i in range(n)]
     keys = file.add(times - motion.start, bounds=True)
     for i, node in enumerate(scene["nodes"]):
         node["mesh"] = i
-        sampler = {"input": keys, "output": file.add(shown[:, i]), "interpolation": "LINEAR"}
-        animation["samplers"].append(sampler)
+        animation["samplers"].append({"input": keys, "output": file.add(shown[:, i])})
         pointer = {_POINTER: {"pointer": f"/materials/{i}/emissiveFactor"}}
         target = {"path": "pointer", "extensions": pointer}
         animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
     azimuth, elevation = view(result)
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
-    back = [
-        np.cos(elevation) * np.cos(azimuth),
-        np.cos(elevation) * np.sin(azimuth),
-        np.sin(elevation),
-    ]
-    # About y from looking along y of the mission, then down.
-    turn, down = (azimuth + np.pi / 2) / 2, -elevation / 2
-    s, c, sx, cx = np.sin(turn), np.cos(turn), np.sin(down), np.cos(down)
-    place = {
-        "translation": _y_up((low + high) / 2 + far * np.array(back)).tolist(),
-        "rotation": [float(x) for x in (c * sx, s * cx, -s * sx, c * cx)],
-    }
-    scene["cameras"] = [
-        {
-            "type": "perspective",
-            "perspective": {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far},
-        }
-    ]
-    scene["nodes"].append({"name": "front", "camera": 0, **place})
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    ahead = np.array([right[1], -right[0], 0.0])
+    back = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    axes = np.stack([right, np.cross(back, right), back, (low + high) / 2 + far * back])
+    matrix = np.column_stack([_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+    seen = {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far}
+    scene["cameras"] = [{"type": "perspective", "perspective": seen}]
+    scene["nodes"].append({"name": "front", "camera": 0, "matrix": matrix})
     scene["scenes"][0]["nodes"].append(n)
 
 

@@ -91,9 +91,7 @@ def scene(result: Result) -> Scene:
     return Scene(
         r[thin],
         result.cm[thin],
-        _shots(
-            result, rows[::-1] if has_lights(result) else rows
-        ),  # of two at one place, the later light
+        _shots(result, rows),
         low,
         high,
         floor,
@@ -126,6 +124,8 @@ def _shots(result: Result, rows: Any) -> list[int]:
     """
     if not len(rows):
         return []
+    if has_lights(result):  # of two at one place, the later light
+        rows = rows[::-1]
     r = result.position
     about = r[rows] - r[rows].mean(axis=1, keepdims=True)
     size = 2 * float(np.median(np.linalg.norm(about, axis=2).max(axis=1))) or 1e-9
@@ -309,10 +309,16 @@ def _on_screen(ax: Axes3D, points: Floats) -> Floats:
 def _name_axes(fig: Figure, ax: Axes3D, view: Scene) -> None:
     """Name the axes at a fixed distance from them; the distance of matplotlib's own names changes with the zoom."""
     (x0, y0, z0), (x1, y1, z1) = view.low, view.high
+    # Corners of the floor from the left one, as seen; matplotlib draws the ticks of z right or left of these edges.
+    turns = round((ax.azim + 45) / 90)
+    ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    a, b, c = (ring[(turns + k) % 4] for k in range(3))
+    across, deep = ("y [m]", "x [m]") if turns % 2 else ("x [m]", "y [m]")
+    high = a if turns % 2 else c
     edges = {
-        "x [m]": [(x0, y0, z0), (x1, y0, z0)],
-        "y [m]": [(x1, y0, z0), (x1, y1, z0)],
-        "z [m]": [(x1, y1, z0), (x1, y1, z1)],
+        across: [(*a, z0), (*b, z0)],
+        deep: [(*b, z0), (*c, z0)],
+        "z [m]": [(*high, z1), (*high, z0)] if turns % 2 else [(*high, z0), (*high, z1)],
     }
     for name, edge in edges.items():
         a, b = _on_screen(ax, np.array(edge))
@@ -397,19 +403,14 @@ def handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
     from matplotlib.lines import Line2D
 
-    marks = (
-        []
-        if has_lights(result)
-        else [
-            Line2D([], [], **dot(st.GREY, 5, hollow=True), label="start"),
-            Line2D([], [], **dot(st.GREY, 5, marker="s"), label="end"),
-        ]
-    )
-    if view.waypoints:
-        marks.append(Line2D([], [], **_CROSS, label="waypoint"))
+    waypoints = [Line2D([], [], **_CROSS, label="waypoint")] if view.waypoints else []
     if has_lights(result):
-        return marks
-    return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *marks]
+        return waypoints
+    ends = [
+        Line2D([], [], **dot(st.GREY, 5, hollow=True), label="start"),
+        Line2D([], [], **dot(st.GREY, 5, marker="s"), label="end"),
+    ]
+    return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
 @styled
