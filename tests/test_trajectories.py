@@ -208,5 +208,6 @@ def test_yaw_has_its_rate():
     place = np.stack([np.cos(time), np.sin(time), 0 * time], axis=1)[:, None]
     made = rf.trajectories(time, place, cubic=True, yaw=turned[:, None])
     assert made.yaw is not None
+    assert made.yaw_rate is not None
     np.testing.assert_allclose(made.yaw_rate, 1.3, atol=1e-9)
     np.testing.assert_allclose(np.cos(made.yaw[:, 0] - 1.3 * made.time), 1.0)
