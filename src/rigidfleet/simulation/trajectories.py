@@ -97,7 +97,7 @@ def trajectories(
     time : (K,) [s], increasing
     position : (K, N, 3) [m], world axes (z up)
     velocity, acceleration, jerk : (K, N, 3); each needs those before
-    yaw : (K, N) [rad]
+    yaw : (K, N) [rad], on lines; full turns between two samples do not count
     cubic : without velocities, cubic splines with continuous acceleration (`scipy.interpolate.CubicSpline`) instead of
         lines
     mission : a mission, its name or path: the radii and masses of its vehicles, its limits and obstacles count, instead
@@ -139,7 +139,7 @@ def trajectories(
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
     yaws = np.full(shape[:2], np.nan) if yaw is None else _array("yaw", yaw, *shape[:2])
-    x, angle = np.stack(states), yaws[None, ..., None]
+    x, angle = np.stack(states), np.unwrap(yaws, axis=0)[None, ..., None]
     way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
     how = NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
@@ -333,18 +333,20 @@ def _refuse_jumps(curve: Piecewise) -> None:
 
 
 def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
-    """Times (K,) [s], position to jerk (4, K, N, 3) and yaw (K, N) [rad] at the ends of equal parts of pieces (M,).
+    """Times (K,) [s], position to jerk (4, K, N, 3), and yaw and its rate (2, K, N), at ends of equal parts of pieces.
 
-    Where states jump, there are two samples.
+    Where states jump, there are two samples. Where the rate of yaw jumps, it is the mean.
     """
     time, (pieces, n, _, powers) = curve.time, curve.pieces.shape
     together = max(1, _TOGETHER // (4 * n * powers))
     greatest_of = np.abs(curve.pieces[:, :, :3, :4]).max(axis=(0, 1, 2))
     scale = 1.0 + series.derivatives(pad(greatest_of, 4))
     ends = np.append(np.zeros(pieces - 1, dtype=np.bool_), True)  # which pieces have a sample there
+    turn = np.zeros((pieces + 1, n))  # half of the jumps of yaw's rate
     for k in range(0, pieces - 1, together):
-        jumps = curve.part(k, k + together + 1).jumps(4)[..., :3]
-        jumps = np.abs(jumps) > 1e-9 * scale[:, None, None, None]
+        jumps = curve.part(k, k + together + 1).jumps(4)
+        turn[k + 1 : k + 1 + jumps.shape[1]] = 0.5 * jumps[1, ..., 3]
+        jumps = np.abs(jumps[..., :3]) > 1e-9 * scale[:, None, None, None]
         ends[k : k + jumps.shape[1]] |= jumps.any(axis=(0, 2, 3))
     count = parts + ends
     k = np.repeat(np.arange(pieces), count)
@@ -354,12 +356,14 @@ def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
     at[share == 1.0] = time[1:][ends]
     again = np.flatnonzero(ends[:-1]) + 1
     at[first[again]] = np.nextafter(time[again], np.inf)
-    state, yaw = np.empty((4, len(k), n, 3)), np.empty((len(k), n))
+    state, yaw = np.empty((4, len(k), n, 3)), np.empty((2, len(k), n))
     for row in range(0, len(k), together):
         rows = slice(row, row + together)
         after = np.diff(time)[k[rows]] * share[rows]
         x = series.derivatives(series.of_polynomials(curve.pieces[k[rows]], after, 4))
-        state[:, rows], yaw[rows] = x[..., :3], x[0, ..., 3]
+        state[:, rows], yaw[:, rows] = x[..., :3], x[:2, ..., 3]
+    yaw[1, share == 0.0] -= turn[k[share == 0.0]]
+    yaw[1, share == 1.0] += turn[k[share == 1.0] + 1]
     return at, state, yaw
 
 
@@ -423,13 +427,14 @@ def _result(
     names: Sequence[str],
 ) -> Result:
     r, v, a, j = state
-    k, n = yaw.shape
+    k, n = r.shape[:2]
+    turned = np.nan_to_num(yaw, copy=False)
     sizes = {"time": k, "agent": n, "axis": 3, "quaternion": 4, "wrench": 6, "edge": 0}
     nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
     known: dict[str, Any] = {
         "time": time, "phase": np.zeros(k, dtype=np.int64), "position": r, "velocity": v, "acceleration": a,
         "slot_position": r, "slot_velocity": v, "slot_acceleration": a, "slot_jerk": j,
-        "yaw": np.nan_to_num(yaw, copy=False), "yaw_rate": np.zeros((k, n)),
+        "yaw": turned[0], "yaw_rate": turned[1],
         "cm": r.mean(axis=1), "cm_velocity": v.mean(axis=1), "edges": np.zeros((0, 2), dtype=np.int64),
     }  # fmt: skip
     known |= {"cm_reference": known["cm"], "cm_velocity_reference": known["cm_velocity"]}
@@ -446,7 +451,6 @@ def _result(
             (("mission_text",), partial(text_of, mission)),
         ],
     )  # fmt: skip
-    vars(result)["mission"] = (
-        mission  # its text is written where the result is, and need not be read
-    )
+    # Its text is written where the result is, and need not be read.
+    vars(result)["mission"] = mission
     return result
