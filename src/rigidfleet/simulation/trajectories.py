@@ -204,7 +204,8 @@ def judged_as(
     ResultError
         The mission has another number of vehicles.
     """
-    phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": max(duration, 1e-3)}
+    lasting = max(duration, 1e-3)
+    phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": lasting}
     agents: dict[str, Any] = {"position": start.tolist()}
     if mission is not None:
         own = mission if isinstance(mission, Mission) else load_mission(mission)
@@ -227,8 +228,9 @@ def judged_as(
         if ground is not None:
             data["obstacles"] = [{"kind": "ground", "height": ground}]
         agents |= {"radius": radius, "mass": 1.0}
-    step = {"output_step": phase["duration"]} if duration < _STEP else {}
-    return Mission.from_plain(data | step | {"agents": agents, "phases": [phase]}, "the limits")
+    step = min(lasting, max(_STEP, 1e-5 * lasting))  # which nothing flies
+    more = {"output_step": step, "agents": agents, "phases": [phase]}
+    return Mission.from_plain(data | more, "the limits")
 
 
 def of_curve(
