@@ -244,49 +244,55 @@ def _rows(
     if separator == " ":
         lines = (line.replace("\t", " ").strip() for line in lines)
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-    numbers, blocks, faults = [], [], []
-    block: list[list[str]] = []
+    numbers, blocks, faults, line = [], [], [], start
     try:
-        for count, fields in enumerate(reader, start + 1):
-            line = start + reader.line_num
-            if line != count:
+        while block := list(islice(reader, _TOGETHER)):
+            line += len(block)
+            if line != start + reader.line_num:
                 raise csv.Error("a quotation mark is not closed")
-            if len(fields) != width or fields[0][:1] in ("#", ""):
-                fields = _odd_row(texts[line - 1].strip(), fields, width, separator)
-            if fields is None:
-                continue
-            if len(fields) != width:
-                what = (
-                    f"fields, and the names in line {start} are {width}"
-                    if named
-                    else f"numbers, unlike the lines before with {width}"
+            own = range(line - len(block) + 1, line + 1)
+            if not all(len(row) == width and row[0] and row[0][0] != "#" for row in block):
+                odd = [
+                    (k, _row(texts[k - 1].strip(), row, width, separator))
+                    for k, row in zip(own, block, strict=True)
+                ]
+                faults += [
+                    _miscounted(k, texts[k - 1], len(row), width, start * named)
+                    for k, row in odd
+                    if row and len(row) != width
+                ]
+                own, block = (
+                    [k for k, row in odd if row and len(row) == width],
+                    [row for _, row in odd if row and len(row) == width],
                 )
-                faults.append(
-                    Fault(
-                        line,
-                        texts[line - 1].strip(),
-                        f"has {len(fields)} {what}",
-                        "Is the file cut off?",
-                    )
-                )
-                continue
-            numbers.append(line)
-            block.append(fields)
-            if len(block) == _TOGETHER:
-                blocks.append([np.array(x, _TEXT) for x in zip(*block, strict=True)])
-                block = []
+            numbers.append(np.array(own, dtype=np.int64))
+            blocks.append([np.array(x, _TEXT) for x in zip(*block, strict=True)])
     except csv.Error as error:
         raise TableError(
             Fault(start + reader.line_num, "", f"cannot be read: {error}", "Write it again")
         ) from None
-    blocks.append(
-        [np.array(x, _TEXT) for x in zip(*block, strict=True)] or [np.array([], _TEXT)] * width
+    columns = [
+        np.strings.strip(np.concatenate(parts)) for parts in zip(*filter(None, blocks), strict=True)
+    ]
+    return (
+        np.concatenate([*numbers, np.zeros(0, np.int64)]),
+        columns or [np.array([], _TEXT)] * width,
+        texts,
+        faults,
     )
-    columns = [np.strings.strip(np.concatenate(parts)) for parts in zip(*blocks, strict=True)]
-    return np.array(numbers, dtype=np.int64), columns, texts, faults
 
 
-def _odd_row(text: str, fields: list[str], width: int, separator: str) -> list[str] | None:
+def _miscounted(line: int, text: str, count: int, width: int, names: int) -> Fault:
+    """The fault of a row with another number of fields than the names in a line (0 without), or than the other rows."""
+    what = (
+        f"fields, and the names in line {names} are {width}"
+        if names
+        else f"numbers, unlike the lines before with {width}"
+    )
+    return Fault(line, text.strip(), f"has {count} {what}", "Is the file cut off?")
+
+
+def _row(text: str, fields: list[str], width: int, separator: str) -> list[str] | None:
     """The fields of a row that is not like the others; None for an empty line and a comment.
 
     A line that begins with # is a row if it has as many fields as one, or numbers alone behind its first field.

@@ -149,7 +149,12 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
         whole = own is not None and len(own.slots) == count and there.is_relative_to(folder)
         for note in points.notes:
             console.err().print(f"Note: {word}: {note}.")
-        if own is not None and whole and not own.notes and proximity.nearest(own.slots).min() >= spacing:
+        if (
+            own is not None
+            and whole
+            and not own.notes
+            and proximity.nearest(own.slots).min() >= spacing
+        ):
             source, points, by_name = there.relative_to(folder).as_posix(), own, True
         scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
     return show_draft.show(

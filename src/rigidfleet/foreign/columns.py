@@ -302,7 +302,7 @@ def read_tracks(file: Understood, stem: str) -> tuple[list[Track], dict[str, Any
     values = dict(zip(columns, file.numbers(columns).T, strict=True))
     stack = lambda columns, rows: (
         np.column_stack([values[k][rows] for k in columns]) if columns else None
-    )  # noqa: E731
+    )
     groups, identity = dict.fromkeys(sets, np.arange(len(time))), []
     if len(sets) == 1:
         (own,) = sets.values()

@@ -18,8 +18,8 @@ from rigidfleet._common.files import why_not
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.math.piecewise import Piecewise
 
 __all__ = ["Interpolation", "Trajectories", "read_trajectories"]
 
@@ -43,7 +43,7 @@ class Trajectories(NamedTuple):
     """
 
     names: tuple[str, ...]
-    curves: tuple[Curve, ...]
+    curves: tuple[Piecewise, ...]
     assumed: str
     notes: tuple[str, ...] = ()
     read: tuple[dict[str, Any], ...] = ()
@@ -190,7 +190,7 @@ def _of_sequence(group: list[Path], interpolation: Interpolation, units: Units) 
             raise TrajectoryError(f"{path}: is of another kind than {group[0]}.")
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
-        curve = Curve(time, np.concatenate([curve.pieces, after.pieces]))
+        curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
     name = group[0].parent.name
     return Trajectories((name,), (curve,), first.assumed, first.notes, first.read)
 
@@ -227,7 +227,7 @@ def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajecto
     return read
 
 
-def _check_size(name: str, who: str, curve: Curve) -> None:
+def _check_size(name: str, who: str, curve: Piecewise) -> None:
     """Refuse numbers with which no distance can be computed.
 
     Raises
@@ -254,7 +254,7 @@ def _check_size(name: str, who: str, curve: Curve) -> None:
 
 
 def _spans(
-    names: Sequence[str], curves: Sequence[Curve], listed: list[list[Path]], *, exact: bool
+    names: Sequence[str], curves: Sequence[Piecewise], listed: list[list[Path]], *, exact: bool
 ) -> list[str]:
     """A note if vehicles begin or end at different times.
 
@@ -284,7 +284,9 @@ def _spans(
     return []
 
 
-def _common_part(curves: list[Curve]) -> list[Curve]:
+def _common_part(curves: list[Piecewise]) -> list[Piecewise]:
     """The part of all curves in which every vehicle has samples."""
     start, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
-    return [c if c.time[0] == start and c.time[-1] == end else c.cut(start, end) for c in curves]
+    return [
+        c if c.time[0] == start and c.time[-1] == end else c.between(start, end) for c in curves
+    ]

@@ -14,8 +14,8 @@ import numpy as np
 
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.columns import yaws
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.samples import sampled
+from rigidfleet.math.piecewise import Piecewise
 
 _POSE = "geometry_msgs/msg/PoseStamped"
 _BILLION = 1_000_000_000
@@ -23,7 +23,7 @@ _BILLION = 1_000_000_000
 
 def read_poses(
     data: bytes, name: str, interpolation: str
-) -> tuple[tuple[str, ...], tuple[Curve, ...], int | None]:
+) -> tuple[tuple[str, ...], tuple[Piecewise, ...], int | None]:
     """Names of the topics with poses, a curve for each, and the nanoseconds since 1970 from which its times count.
 
     If stamps are dates, times count from the first pose of the recording, otherwise (None) from zero.

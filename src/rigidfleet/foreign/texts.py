@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.foreign.columns import Understood, Units, read_tracks
-from rigidfleet.foreign.curves import NAMES, Curve, through
-from rigidfleet.foreign.pieces import rows_to_curve
+from rigidfleet.foreign.curves import NAMES, rows_to_curve, through
 from rigidfleet.foreign.samples import ASSUMED, sampled
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 
 #: What is between the knots of a table of polynomials.
@@ -23,7 +23,7 @@ class Text(NamedTuple):
     """Names and curves of a table, what is assumed between samples, notes, and what was taken for what."""
 
     names: tuple[str, ...]
-    curves: tuple[Curve, ...]
+    curves: tuple[Piecewise, ...]
     assumed: str
     notes: tuple[str, ...]
     record: dict[str, Any]
@@ -66,7 +66,7 @@ def read_text(data: bytes, path: Path, interpolation: str, words: Units) -> Text
     return Text(names, (*curves,), ASSUMED[interpolation], (*file.notes,), record)
 
 
-def _pieces(file: Understood) -> Curve:
+def _pieces(file: Understood) -> Piecewise:
     """The curve in Crazyswarm2's table: duration [s], 8 coefficients of x, y, z [m] and yaw [rad] a piece, any order.
 
     Raises
@@ -89,12 +89,12 @@ def _pieces(file: Understood) -> Curve:
     return rows_to_curve(rows)
 
 
-def read_polynomial(data: bytes) -> list[Curve]:
+def read_polynomial(data: bytes) -> list[Piecewise]:
     """The curve in a table of `crazyflie.write_polynomial`, from time zero on."""
     return [_pieces(Understood(data, "polynomial"))]
 
 
-def read_table(data: bytes) -> list[Curve]:
+def read_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
     file = Understood(data, "setpoints")

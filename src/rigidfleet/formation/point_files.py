@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.names import quantity_of, understood, unit_of
-from rigidfleet._common.tables import Fault, Table, TableError, parse
+from rigidfleet._common.tables import Fault, TableError, parse
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
 
