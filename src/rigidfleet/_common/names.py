@@ -32,20 +32,21 @@ _AXIS, _HUE = (
 )
 _WORDS = {
     # Beside an axis: a place, a velocity, an acceleration, a jerk, a quaternion; or none of them.
-    "": "p t pos position pose translation location coordinate point local world global odom map rs r wb estimate field "
-        "msg data transform enu state",
+    "": "p t pos position pose translation location coordinate point local world global odom map rs r wb estimate "
+        "field msg data transform enu state",
     "v": "v vel velocity twist linear", "a": "a acc acceleration", "j": "j jerk",
     "q": "q quat quaternion orientation rotation attitude",
-    "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular gyro mag "
-            "torque force thrust gyr ang euler rpy bias w b",
+    "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
+            "gyro mag torque force thrust gyr ang euler rpy bias w b",
     "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
     "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world",
-    "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body rigid "
-             "track sysid mav uri callsign tail craft bot ship rover",
-    "thing": "id name uid uuid object marker label ns namespace child entity node tag target device model actor player "
-             "serial instance hostname key",
+    "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
+             "rigid track sysid mav uri callsign tail craft bot ship rover",
+    "thing": "id name uid uuid object marker label ns namespace child entity node tag target device model actor "
+             "player serial instance hostname key",
     "thing too": "no nr num number system frame index idx subject",
-    "yaw": "yaw psi", "colour": "color colour rgb hex", "latitude": "lat latitude", "longitude": "lon lng long longitude",
+    "yaw": "yaw psi", "colour": "color colour rgb hex", "latitude": "lat latitude",
+    "longitude": "lon lng long longitude",
 }  # fmt: skip
 _IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}

@@ -1,7 +1,4 @@
-"""Tables of text that others wrote: comments, lines before the names, separators, decimal marks, rows.
-
-What a column means is not known here: `names` understands its name.
-"""
+"""Tables of text that others wrote: comments, lines before the names, separators, decimal marks, rows and units."""
 
 from __future__ import annotations
 
@@ -9,25 +6,25 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import unit_of
+from rigidfleet._common.names import quantity_of, understood, unit_of
 from rigidfleet.typing import Floats, Ints
 
 #: Separators in the order in which they are tried, with their names.
 SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "blanks"}
+#: Units without a word of the file or the user.
+DEFAULT = {"time": "s", "length": "m", "angle": "rad"}
 #: Characters that no table has, and that a terminal would obey when a message shows them.
 _CONTROL = re.compile(r"[^\t\n\r\x20-\x7e\xa0-\U0010ffff]")
 #: What follows a row, and is none of its colours.
 _REMARK = re.compile(r"\s+#(?![0-9a-fA-F]{6}\b).*")
-_COMMA, _THOUSANDS = (
-    re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"),
-    re.compile(r"[-+]?[1-9]\d{0,2},\d{3}"),
-)
+_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _TEXT = np.dtypes.StringDType()
 #: Lines among which names are sought, and by which a separator is chosen; rows read together; characters of a line.
 _HEAD, _SAMPLE, _TOGETHER, _LONGEST = 200, 20, 1 << 14, 100_000
@@ -47,35 +44,112 @@ class TableError(ValueError):
 
     def __init__(self, *faults: Fault) -> None:
         self.faults = faults
-        super().__init__(*faults)
+        super().__init__(f"{faults[0].problem}. {faults[0].remedy}")
 
 
-class Table(NamedTuple):
-    """A table of text with K rows.
+def fault(problem: str, remedy: str, line: int = 0, text: str = "") -> TableError:
+    """The error of a single fault."""
+    return TableError(Fault(line, text, problem, remedy))
+
+
+class Table:
+    """A table of text with K rows, whose columns are understood by their names.
 
     Attributes
     ----------
-    names : of the columns, as they are written; empty where the file has none
-    units : of the columns, if a row below the names says them
+    names, kinds : of the columns: as they are written, and the `names.Quantity` that each is
     line : of the names, from 1; of the first row, where there are none
     separator : a key of `SEPARATORS`
     lines : (K,) of the rows, from 1
     columns : texts (K,) of each column
     texts : all lines of the file
-    faults : rows that have another number of fields
+    places : number of the column of each quantity, by kind and vehicle
+    units : of each dimension the word, and where it is from: "" if it is assumed
+
+    Parameters
+    ----------
+    words : units of columns that do not say theirs, by dimension
+    unnamed : names of the columns where the file has none, by their number
+
+    Raises
+    ------
+    TableError
+        The file is no table, has names that are not understood, an unknown unit, or two columns for a quantity.
     """
 
-    names: list[str]
-    units: list[str]
-    line: int
-    separator: str
-    lines: Ints
-    columns: list[np.ndarray]
-    texts: list[str]
-    faults: list[Fault]
+    def __init__(
+        self, data: bytes, unnamed: Mapping[int, list[str]], words: Mapping[str, str] | None = None
+    ) -> None:
+        self.texts, self.words = _lines(data), words or {}
+        self.line, start, self.names, below, self.separator, width = _head(self.texts)
+        self.lines, self.columns, self._faults = _rows(
+            self.texts, start, width, self.separator, self.line
+        )
+        self.named = bool(self.names)
+        if not self.named:
+            if width and width not in unnamed:
+                why = f"has no names of columns that are understood, and {width} numbers"
+                raise fault(
+                    why,
+                    "Begin with a line such as x_m,y_m,z_m, and time_s for trajectories",
+                    self.line,
+                )
+            self.names, below = unnamed[width] if width else [], [""] * width
+        self.kinds = [quantity_of(name) for name in self.names]
+        self.places: dict[tuple[str, str], int] = {}
+        self.units: dict[str, tuple[str, str]] = {}
+        self._factors = [self._unit(k, row) for k, row in enumerate(below)]
+
+    def _unit(self, k: int, below: str) -> float:
+        """Take a column as a quantity, and give the factor of its unit, which a row below the names may say."""
+        name, (kind, said, who), dimension = self.names[k], self.kinds[k], self.kinds[k].dimension
+        if kind in ("", "agent", "thing"):
+            return 1.0
+        first = self.places.setdefault((kind, who), k)
+        if self.names[first] != name or (self.columns[first] != self.columns[k]).any():
+            raise fault(f"has two columns for {kind}: {self.names[first]!r}, {name!r}", "Keep one")
+        option = self.words.get(dimension, "")
+        words = [word for word in (said, below, option, DEFAULT.get(dimension, "")) if word]
+        if not dimension or not words:
+            return 1.0
+        known = [unit_of(word) for word in words[:-1] or words]
+        if known[0] is None or known[0][0] != dimension:
+            raise fault(
+                f"the column {name!r} has the unknown unit {words[0]!r}", "Use s, m and rad"
+            )
+        if any(unit != known[0] for unit in known):
+            raise fault(
+                f"the column {name!r} is in {words[0]!r}, but also in {words[1]!r}", "Remove one"
+            )
+        if kind != "duration":
+            source = "the file" if said or below else "the option" if option else ""
+            self.units.setdefault(dimension, (words[0], source))
+        return known[0][1]
+
+    def place(self, *kinds: str, who: str = "") -> list[int]:
+        """Columns of some quantities; empty unless all are there."""
+        columns = [self.places.get((kind, who), -1) for kind in kinds]
+        return [] if -1 in columns else columns
+
+    def missing(self, *kinds: str) -> TableError:
+        """The error of a table without some quantities."""
+        if self.place("latitude"):
+            return fault(
+                "has latitude and longitude",
+                "Give metres east, north and up of an origin: x_m, y_m, z_m",
+            )
+        missing = ", ".join(kind for kind in kinds if not self.place(kind))
+        why = f"has no column for {missing} among {', '.join(self.names)[:80]}"
+        return fault(why, "Name columns x_m, y_m and z_m, and time_s for trajectories")
+
+    def codes(self, column: int) -> tuple[Ints, list[str]]:
+        """Codes (K,) of a column's texts, and the texts, in the order of their first rows."""
+        known: dict[str, int] = {}
+        codes = [known.setdefault(x, len(known)) for x in self.columns[column].tolist()]
+        return np.array(codes, dtype=np.int64), [*known]
 
     def numbers(self, which: Sequence[int]) -> Floats:
-        """Numbers (K, M) of some columns, all finite.
+        """Numbers (K, M) of some columns, all finite, in s, m and rad.
 
         A comma is a decimal mark if no number has a point, and not all are such that it may separate thousands.
 
@@ -85,25 +159,21 @@ class Table(NamedTuple):
             A field is no finite number, or a row has another number of fields.
         """
         values = np.zeros((len(self.lines), len(which)))
-        faults = {fault.line: fault for fault in self.faults}
-        odd = [k for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
-        fields = {k: [_REMARK.sub("", x).strip() for x in self.columns[k].tolist()] for k in odd}
-        every = [x for own in fields.values() for x in own]
-        commas = [x for x in every if _COMMA.fullmatch(x)]
-        points = any("." in x for x in every) or any(
-            (np.strings.find(self.columns[k], ".") >= 0).any() for k in which
-        )
+        faults = {fault.line: fault for fault in self._faults}
+        odd = [i for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
+        fields = {
+            i: [_REMARK.sub("", x).strip() for x in self.columns[which[i]].tolist()] for i in odd
+        }
+        commas = [x for own in fields.values() for x in own if _COMMA.fullmatch(x)]
+        points = any((np.strings.find(self.columns[k], ".") >= 0).any() for k in which)
         decimal = not points and not all(map(_THOUSANDS.fullmatch, commas))
-        for k, own in fields.items():
+        for i, own in fields.items():
             for row, field in enumerate(own):
                 plain = field.replace(",", ".") if decimal else field
                 if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
-                    values[row, which.index(k)] = float(plain)
+                    values[row, i] = float(plain)
                     continue
-                line, name = (
-                    int(self.lines[row]),
-                    self.names[k] if self.names else f"number {k + 1}",
-                )
+                line, name = int(self.lines[row]), self.names[which[i]]
                 remedy = (
                     "Write decimals with a point"
                     if field in commas
@@ -113,13 +183,7 @@ class Table(NamedTuple):
                 faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), problem, remedy))
         if faults:
             raise TableError(*(faults[line] for line in sorted(faults)))
-        return values
-
-    def codes(self, column: int) -> tuple[Ints, list[str]]:
-        """Codes (K,) of a column's texts, and the texts, in the order of their first rows."""
-        known: dict[str, int] = {}
-        codes = [known.setdefault(x, len(known)) for x in self.columns[column].tolist()]
-        return np.array(codes, dtype=np.int64), [*known]
+        return values * [self._factors[k] for k in which]
 
 
 def _take(fields: np.ndarray, values: Floats) -> bool:
@@ -153,68 +217,67 @@ def split(line: str, separator: str) -> list[str]:
     return plain[:-1] if len(plain) > 1 and not plain[-1] else plain
 
 
-def parse(data: bytes, understood: Callable[[Sequence[str]], int]) -> Table:
-    """A table from a file's content.
-
-    Parameters
-    ----------
-    understood : how many of a line's fields are names of columns; 0 if they are none of a table
+def _lines(data: bytes) -> list[str]:
+    """The lines of a file.
 
     Raises
     ------
     TableError
-        The file is no text, or has a line that cannot be one of a table.
+        It is no text.
     """
     wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
-        why = "is neither text in UTF-8 nor another known format"
-        raise TableError(Fault(0, "", why, "Save a table as UTF-8")) from None
+        raise fault(
+            "is neither text in UTF-8 nor another known format", "Save a table as UTF-8"
+        ) from None
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if odd := _CONTROL.search(text):
-        problem = f"has the control character U+{ord(odd[0]):04X}"
-        raise TableError(Fault(text.count("\n", 0, odd.start()) + 1, "", problem, "Remove it"))
-    texts = text.split("\n")
+        line = text.count("\n", 0, odd.start()) + 1
+        raise fault(f"has the control character U+{ord(odd[0]):04X}", "Remove it", line)
+    return text.split("\n")
+
+
+def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
+    """Line of the names, number of lines before the rows, names, units in a row below them, separator, and width."""
     head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
-        raise TableError(
-            Fault(long, "", "has no names of columns that are understood", "Give shorter lines")
-        )
-    most = lambda line: max(sum(map(is_number, split(line, s))) for s in SEPARATORS)  # noqa: E731
-    first = next((k for k in head if texts[k][0] != "#" and most(texts[k]) > 1), None)
-    start, names, own = _names(
-        texts, [k for k in head if first is None or k < first], first, understood
-    )
+        raise fault("has no names of columns that are understood", "Give shorter lines", long)
+    most = [
+        max(sum(map(is_number, split(texts[k].lstrip("#"), s))) for s in SEPARATORS) for k in head
+    ]
+    rows = [k for k, count in zip(head, most, strict=True) if count > 1]
+    first = next((k for k in rows if texts[k][0] != "#"), len(texts))
+    start, names, own = _names(texts, [k for k in head if k < first], first)
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
-        start = next((k for k in head if most(texts[k].lstrip("#")) > 1), len(texts))
+        start = min(rows, default=len(texts))
     below = [x for x in texts[start : start + _HEAD] if x.strip()]
     below = ([x for x in below if x[0] != "#"] or below)[:_SAMPLE]
     fits = {s: _fitting(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
-    width = len(names) or fits[separator][1]
+    width, line = len(names) or fits[separator][1], start + (not names)
     units, row = (
         [""] * width,
         [x.strip("[]()") for x in split(below[0], separator)] if below else [],
     )
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1
-    if not names and (above := next((k for k in head if k < start and texts[k][0] != "#" and
-                                     len(split(texts[k], separator)) == width), None)) is not None:  # fmt: skip
-        why = f"has no names of columns that are understood: {texts[above].strip()[:60]}"
-        raise TableError(Fault(above + 1, "", why, "Name x, y and z, and for trajectories time"))
-    line = start if names else start + 1
-    return Table(
-        names, units, line, separator, *_rows(texts, start, width, separator, named=bool(names))
-    )
+    above = [k for k in head if not names and k < start and texts[k][0] != "#"]
+    for k in above:
+        if len(split(texts[k], separator)) == width:
+            raise fault(
+                f"has no names of columns that are understood: {texts[k][:60]}",
+                "Name x, y and z",
+                k + 1,
+            )
+    return line, start, names, units, separator, width
 
 
-def _names(
-    texts: list[str], head: list[int], first: int | None, understood: Callable[[Sequence[str]], int]
-) -> tuple[int, list[str], str]:
+def _names(texts: list[str], head: list[int], first: int) -> tuple[int, list[str], str]:
     """Line, from 1, names and separator: of all lines, the one that is understood best."""
-    counts = {len(split(texts[first], s)) for s in SEPARATORS} if first is not None else set()
+    counts = {len(split(line, s)) for line in texts[first : first + 1] for s in SEPARATORS}
     best, names = (False, 0.0), (0, [], "")
     for k in head:
         for separator in reversed(SEPARATORS):
@@ -237,9 +300,9 @@ def _fitting(lines: list[str], width: int, separator: str) -> tuple[int, int]:
 
 
 def _rows(
-    texts: list[str], start: int, width: int, separator: str, *, named: bool
-) -> tuple[Ints, list[np.ndarray], list[str], list[Fault]]:
-    """Lines of the rows, texts of the columns, all lines, and faults; read in blocks, as text takes much memory."""
+    texts: list[str], start: int, width: int, separator: str, names: int
+) -> tuple[Ints, list[np.ndarray], list[Fault]]:
+    """Lines of the rows, texts of the columns, and faults; read in blocks, as rows of texts take much memory."""
     lines = islice(texts, start, None)
     if separator == " ":
         lines = (line.replace("\t", " ").strip() for line in lines)
@@ -247,49 +310,44 @@ def _rows(
     numbers, blocks, faults, line = [], [], [], start
     try:
         while block := list(islice(reader, _TOGETHER)):
-            line += len(block)
-            if line != start + reader.line_num:
+            own = range(line + 1, (line := start + reader.line_num) + 1)
+            if len(own) != len(block):
                 raise csv.Error("a quotation mark is not closed")
-            own = range(line - len(block) + 1, line + 1)
             if not all(len(row) == width and row[0] and row[0][0] != "#" for row in block):
-                odd = [
-                    (k, _row(texts[k - 1].strip(), row, width, separator))
+                odd = {
+                    k: _row(texts[k - 1].strip(), row, width, separator)
                     for k, row in zip(own, block, strict=True)
-                ]
-                faults += [
-                    _miscounted(k, texts[k - 1], len(row), width, start * named)
-                    for k, row in odd
-                    if row and len(row) != width
-                ]
-                own, block = (
-                    [k for k, row in odd if row and len(row) == width],
-                    [row for _, row in odd if row and len(row) == width],
-                )
+                }
+                block = [row for row in odd.values() if row and len(row) == width]
+                own = [k for k, row in odd.items() if row and len(row) == width]
+                for k, count in (
+                    (k, len(row)) for k, row in odd.items() if row and len(row) != width
+                ):
+                    what = (
+                        f"fields, and the names in line {names} are"
+                        if names <= start
+                        else "numbers, unlike the lines before with"
+                    )
+                    faults.append(
+                        Fault(
+                            k,
+                            texts[k - 1].strip(),
+                            f"has {count} {what} {width}",
+                            "Is the file cut off?",
+                        )
+                    )
             numbers.append(np.array(own, dtype=np.int64))
             blocks.append([np.array(x, _TEXT) for x in zip(*block, strict=True)])
     except csv.Error as error:
-        raise TableError(
-            Fault(start + reader.line_num, "", f"cannot be read: {error}", "Write it again")
-        ) from None
+        raise fault(f"cannot be read: {error}", "Write it again", start + reader.line_num) from None
     columns = [
         np.strings.strip(np.concatenate(parts)) for parts in zip(*filter(None, blocks), strict=True)
     ]
     return (
         np.concatenate([*numbers, np.zeros(0, np.int64)]),
         columns or [np.array([], _TEXT)] * width,
-        texts,
         faults,
     )
-
-
-def _miscounted(line: int, text: str, count: int, width: int, names: int) -> Fault:
-    """The fault of a row with another number of fields than the names in a line (0 without), or than the other rows."""
-    what = (
-        f"fields, and the names in line {names} are {width}"
-        if names
-        else f"numbers, unlike the lines before with {width}"
-    )
-    return Fault(line, text.strip(), f"has {count} {what}", "Is the file cut off?")
 
 
 def _row(text: str, fields: list[str], width: int, separator: str) -> list[str] | None:

@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from rigidfleet._common.files import why_not
+from rigidfleet._common.tables import TableError
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
@@ -210,7 +211,7 @@ def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajecto
     if data.startswith(_HDF):
         raise TrajectoryError(f"{name}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
     record: dict[str, Any] = {}
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
     if data.startswith(_ZIP) or path.suffix.lower() == ".skyc":
         names, curves = shows.read_show(data, name)
         assumed = shows.BEZIER
@@ -218,8 +219,16 @@ def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajecto
         names, curves, record["since_1970_ns"] = poses.read_poses(data, name, interpolation)
         assumed = ASSUMED[interpolation]
     else:
-        names, curves, assumed, notes, record = texts.read_text(data, path, interpolation, units)
-    read = Trajectories(names, curves, assumed, notes, (record,))
+        try:
+            names, curves, assumed, notes, record = texts.read_text(
+                data, path, interpolation, units
+            )
+        except TableError as error:
+            line, _, problem, remedy = error.faults[0]
+            place = f"line {line}: " if line else ""
+            ends = "" if remedy.endswith("?") else "."
+            raise TrajectoryError(f"{name}: {place}{problem}. {remedy}{ends}") from None
+    read = Trajectories(tuple(names), tuple(curves), assumed, tuple(notes), (record,))
     if (units.words or units.axes) and "units" not in record:
         raise TrajectoryError(f"{name}: says its units and axes itself. Remove --units and --axes.")
     for who, curve in zip(read.names, read.curves, strict=True):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from rigidfleet.foreign.columns import Understood, Units, read_tracks
+from rigidfleet._common.tables import Table, fault
+from rigidfleet.foreign.columns import Units, parse, read_tracks
 from rigidfleet.foreign.curves import NAMES, rows_to_curve, through
 from rigidfleet.foreign.samples import ASSUMED, sampled
 from rigidfleet.math.piecewise import Piecewise
@@ -19,35 +20,27 @@ POLYNOMIALS = "the polynomials of the file"
 _SHARE, _LEAST = 0.05, 0.05
 
 
-class Text(NamedTuple):
-    """Names and curves of a table, what is assumed between samples, notes, and what was taken for what."""
-
-    names: tuple[str, ...]
-    curves: tuple[Piecewise, ...]
-    assumed: str
-    notes: tuple[str, ...]
-    record: dict[str, Any]
-
-
-def read_text(data: bytes, path: Path, interpolation: str, words: Units) -> Text:
-    """What is in a table of setpoints or of polynomials.
+def read_text(
+    data: bytes, path: Path, interpolation: str, words: Units
+) -> tuple[list[str], list[Piecewise], str, list[str], dict[str, Any]]:
+    """Names and curves of a table, what is assumed between samples, notes, and what was taken for what.
 
     Raises
     ------
-    TrajectoryError
-        The table cannot be read.
+    TableError, TrajectoryError
+        The table cannot be read, or a time does not increase.
     """
-    file = Understood(data, str(path), words)
-    if file.place("duration", "x^0"):
-        curve, names = _pieces(file), file.table.names
-        return Text(
-            (path.stem,),
-            (curve,),
+    table, notes = parse(data, words)
+    if table.place("duration", "x^0"):
+        curve = _pieces(table)
+        return (
+            [path.stem],
+            [curve],
             POLYNOMIALS,
-            (*file.notes,),
-            {"columns": names, "rows": len(curve.pieces)},
+            notes,
+            {"columns": table.names, "rows": len(curve.pieces)},
         )
-    tracks, record = read_tracks(file, path.stem)
+    tracks, record = read_tracks(table, path.stem, words.axes, notes)
     curves, off, fastest = [], 0.0, 0.0
     for track in tracks:
         where = lambda k, track=track: f"line {track.lines[k]}"  # noqa: E731
@@ -59,47 +52,43 @@ def read_text(data: bytes, path: Path, interpolation: str, words: Units) -> Text
             off = max(off, float(np.linalg.norm(track.velocity[1:-1] - between, axis=1).max()))
             fastest = max(fastest, float(np.linalg.norm(between, axis=1).max()))
     if off > _LEAST + _SHARE * fastest:
-        file.notes.append(
+        notes.append(
             f"the velocities of the table are up to {off:.3g} m/s off those of its positions, which count"
         )
-    names = tuple(track.name for track in tracks)
-    return Text(names, (*curves,), ASSUMED[interpolation], (*file.notes,), record)
+    return [track.name for track in tracks], curves, ASSUMED[interpolation], notes, record
 
 
-def _pieces(file: Understood) -> Piecewise:
+def _pieces(table: Table) -> Piecewise:
     """The curve in Crazyswarm2's table: duration [s], 8 coefficients of x, y, z [m] and yaw [rad] a piece, any order.
 
     Raises
     ------
-    TrajectoryError
+    TableError
         A column is missing, or a duration is not positive.
     """
     due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
-    if missing := [kind for kind in due if not file.place(kind)]:
-        raise file.error(
-            f"has no column, or two, for {missing[0]}. A table of polynomials has the columns duration, x^0 to x^7, "
-            "y^0, z^0 and yaw^0 to yaw^7",
-            file.table.line,
-        )
-    lines, rows = file.table.lines, file.numbers(file.place(*due))
+    if missing := [kind for kind in due if not table.place(kind)]:
+        remedy = "A table of polynomials has the columns duration, x^0 to x^7, y^0, z^0 and yaw^0 to yaw^7"
+        raise fault(f"has no column, or two, for {missing[0]}", remedy, table.line)
+    rows = table.numbers(table.place(*due))
     bad = np.flatnonzero(~(rows[:, 0] > 0.0))
     if len(bad):
-        k = int(bad[0])
-        raise file.error(f"the duration is {rows[k, 0]:g} s. Give a positive one", int(lines[k]))
+        why = f"the duration is {rows[bad[0], 0]:g} s"
+        raise fault(why, "Give a positive one", int(table.lines[bad[0]]))
     return rows_to_curve(rows)
 
 
 def read_polynomial(data: bytes) -> list[Piecewise]:
     """The curve in a table of `crazyflie.write_polynomial`, from time zero on."""
-    return [_pieces(Understood(data, "polynomial"))]
+    return [_pieces(Table(data, {}))]
 
 
 def read_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
-    file = Understood(data, "setpoints")
-    every = file.numbers(file.place("time", *axes, "yaw", "yaw_rate"))
-    code, labels = file.table.codes(file.table.names.index("agent"))
+    table = Table(data, {})
+    every = table.numbers(table.place("time", *axes, "yaw", "yaw_rate"))
+    code, labels = table.codes(table.names.index("agent"))
     curves = []
     for agent in sorted(range(len(labels)), key=lambda k: int(labels[k])):
         own = every[code == agent]

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import quantity_of, understood, unit_of
-from rigidfleet._common.tables import Fault, TableError, parse
+from rigidfleet._common.names import quantity_of
+from rigidfleet._common.tables import Fault, Table, TableError, fault
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
 
@@ -25,8 +25,6 @@ _TYPES = {
 }  # fmt: skip
 _AXES, _HUES = ["x", "y", "z"], ["red", "green", "blue"]
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-#: Names of the columns of a table that has none, by their number.
-_UNNAMED = {2: _AXES[:2], 3: _AXES, 4: [*_AXES, "colour"], 6: [*_AXES, *_HUES]}
 
 
 class Points(NamedTuple):
@@ -160,63 +158,44 @@ def _text(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str,
     ValueError
         A column is not understood or there twice, or (TableError) a row has no numbers.
     """
-    table, notes = parse(data, understood), []
+    unnamed = {2: _AXES[:2], 3: _AXES, 6: [*_AXES, *_HUES]}
+    if re.search(rb"#[0-9a-fA-F]{6}\s", data):
+        unnamed[4] = [*_AXES, "colour"]
+    table, notes = Table(data, unnamed), []
     if not table.columns:
-        return np.zeros(0, np.int64), np.zeros((0, 3)), None, ()
-    width = len(table.columns)
-    if not table.names:
-        coloured = any(re.search(r"#\w{6}\b", line) for line in table.texts)
-        if (names := _UNNAMED.get(width)) is None or (width == 4 and not coloured):
-            wanted = "x, y, z (or x, y; or x, y, z, red, green, blue)"
-            raise TableError(Fault(table.line, "", f"has {width} numbers", f"write {wanted}"))
-        if (
-            table.separator == ","
-            and width > 3
-            and any(re.search(r"(^|,)\s*-?0\d", x) for x in table.texts)
-        ):
-            raise ValueError(
-                "has numbers such as 00: if commas are decimal marks, separate numbers by semicolons"
-            )
-        table = table._replace(names=names, units=[""] * width)
-    columns, factors = {}, {}
-    for k, (told, row) in enumerate(zip(table.names, table.units, strict=True)):
-        q = quantity_of(told)
-        if q.who or q.kind not in (*_AXES, *_HUES, "colour", "time"):
-            continue
-        if q.kind in columns:
-            raise ValueError(f"has two columns for {q.kind}: keep one")
-        unit = unit_of(q.unit or row or "m")
-        if q.kind in _AXES and (unit is None or unit[0] != "length"):
-            raise ValueError(
-                f"has the unit {q.unit or row!r} of {told!r}, which is no known length"
-            )
-        columns[q.kind], factors[q.kind] = k, unit[1] if q.kind in _AXES and unit else 1.0
-    if not {"x", "y"} <= columns.keys():
-        raise ValueError(f"has no columns x and y among {', '.join(table.names)[:80]}")
-    used = [kind for kind in (*_AXES, *_HUES) if kind in columns]
-    lines, values = table.lines, table.numbers([columns[kind] for kind in used])
-    if "time" in columns and len(table.codes(columns["time"])[1]) > 1:
-        raise ValueError(
-            "has points of several times: keep the rows of one, or fly it as a trajectory"
+        return table.lines, np.zeros((0, 3)), None, ()
+    if (
+        not table.named
+        and table.separator == ","
+        and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE)
+    ):
+        raise fault(
+            "has numbers such as 00", "if commas are decimal marks, separate numbers by semicolons"
         )
-    points, colours = np.zeros((len(lines), 3)), None
-    for k, kind in enumerate(used):
-        if kind in _AXES:
-            points[:, _AXES.index(kind)] = values[:, k] * factors[kind]
-    if "colour" in columns:
-        colours = tuple(f"#{x.lstrip('#').lower()}" for x in table.columns[columns["colour"]])
+    if not table.place("x", "y"):
+        raise table.missing("x", "y")
+    if (time := table.place("time")) and len(table.codes(time[0])[1]) > 1:
+        raise fault(
+            "has points of several times", "keep the rows of one, or fly it as a trajectory"
+        )
+    axes = [axis for axis in _AXES if table.place(axis)]
+    hues = table.place(*_HUES) if not table.place("colour") else []
+    values = table.numbers(table.place(*axes) + hues)
+    points, colours = np.zeros((len(table.lines), 3)), None
+    points[:, [_AXES.index(axis) for axis in axes]] = values[:, : len(axes)]
+    if written := table.place("colour"):
+        colours = tuple(f"#{x.lstrip('#').lower()}" for x in table.columns[written[0]].tolist())
         if odd := next((x for x in colours if not re.fullmatch(r"#[0-9a-f]{6}", x)), None):
-            raise ValueError(f"has the colour {odd[1:]!r}: write colours as #rrggbb")
-    elif columns.keys() >= {*_HUES}:
-        hues = values[:, [used.index(hue) for hue in _HUES]]
-        shares = hues.max(initial=2.0 * (not hues.size)) <= 1.0
-        decimal = shares and any("." in x for hue in _HUES for x in table.columns[columns[hue]])
-        if shares and not decimal and hues.any():
+            raise fault(f"has the colour {odd[1:]!r}", "write colours as #rrggbb")
+    elif hues:
+        shares = values[:, len(axes) :].max(initial=0.0) <= 1.0
+        decimal = shares and any("." in x for k in hues for x in table.columns[k].tolist())
+        if shares and not decimal and values[:, len(axes) :].any():
             notes.append(
                 "colours are at most 1 of 255; write shares from 0 to 1 with a point (1.0)"
             )
-        colours = _hexadecimal(hues, shares=decimal)
-    return lines, points, colours, tuple(notes)
+        colours = _hexadecimal(values[:, len(axes) :], shares=decimal)
+    return table.lines, points, colours, tuple(notes)
 
 
 def _npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
