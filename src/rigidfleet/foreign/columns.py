@@ -47,6 +47,10 @@ _UNSAID = re.compile(
 )
 
 
+class Doubt(str):
+    """A note on a file whose numbers may mean something else: a verdict tells it, and it is not flown."""
+
+
 class Units(NamedTuple):
     """What a user says of columns that do not say it: units by dimension, and the directions of x, y and z or ""."""
 
@@ -443,13 +447,11 @@ def _doubt(table: Table, tracks: list[Track], notes: list[str], *, axes: bool) -
         remedy = "Name the column time_s or time_ms, or say --units s or ms"
         if step >= _LONGEST:
             raise fault(doubt, remedy)
-        notes.append(f"{doubt}. {remedy}")
+        notes.append(Doubt(f"{doubt}. {remedy}"))
     if (
         not table.units["length"][1]
         and _FAST < fastest <= _FASTEST
         and (place == np.round(place)).all()
     ):
-        notes.append(
-            f"places without a unit are whole numbers, and speeds reach {fastest:.3g} m/s: are they millimetres? Name "
-            "the column x_m or x_mm, or say --units m or mm"
-        )
+        doubt = f"places without a unit are whole numbers, and speeds reach {fastest:.3g} m/s: are they millimetres?"
+        notes.append(Doubt(f"{doubt} Name the column x_m or x_mm, or say --units m or mm"))

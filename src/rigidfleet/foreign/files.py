@@ -27,6 +27,8 @@ __all__ = ["Interpolation", "Trajectories", "read_trajectories"]
 Interpolation = Literal["linear", "cubic"]
 #: Greatest size of a file [bytes], number of files, and coordinate [m] or time [s] of a trajectory.
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
+#: Greatest number of notes on what was read.
+_NOTES = 10
 _ZIP, _MCAP, _HDF = b"PK", b"\x89MCAP0\r\n", b"\x89HDF"
 
 
@@ -106,6 +108,8 @@ def read_trajectories(
     if not exact:
         curves = _common_part(curves)
     notes = [*dict.fromkeys(notes)]
+    if len(notes) > _NOTES:
+        notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
     return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes), _alike(parts))
 
 
@@ -227,7 +231,8 @@ def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajecto
             line, _, problem, remedy = error.faults[0]
             place = f"line {line}: " if line else ""
             ends = "" if remedy.endswith("?") else "."
-            raise TrajectoryError(f"{name}: {place}{problem}. {remedy}{ends}") from None
+            told = f"{name}: {place}{problem}. {remedy}{ends}".replace("?. ", "? ")
+            raise TrajectoryError(told) from None
     read = Trajectories(tuple(names), tuple(curves), assumed, tuple(notes), (record,))
     if (units.words or units.axes) and "units" not in record:
         raise TrajectoryError(f"{name}: says its units and axes itself. Remove --units and --axes.")
