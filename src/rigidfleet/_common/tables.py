@@ -59,7 +59,8 @@ class Table:
     ----------
     names, kinds : of the columns: as they are written, and the `names.Quantity` that each is
     line : of the names, from 1; of the first row, where there are none
-    separator : a key of `SEPARATORS`
+    separator, decimal : a key of `SEPARATORS`, and the decimal mark of numbers; "" until one is no plain number
+    named : whether the file has names
     lines : (K,) of the rows, from 1
     columns : texts (K,) of each column
     texts : all lines of the file
@@ -85,7 +86,7 @@ class Table:
         self.lines, self.columns, self._faults = _rows(
             self.texts, start, width, self.separator, self.line
         )
-        self.named = bool(self.names)
+        self.named, self.decimal = bool(self.names), ""
         if not self.named:
             if width and width not in unnamed:
                 why = f"has no names of columns that are understood, and {width} numbers"
@@ -161,15 +162,19 @@ class Table:
         values = np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
         odd = [i for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
-        fields = {
-            i: [_REMARK.sub("", x).strip() for x in self.columns[which[i]].tolist()] for i in odd
-        }
-        commas = [x for own in fields.values() for x in own if _COMMA.fullmatch(x)]
-        points = any((np.strings.find(self.columns[k], ".") >= 0).any() for k in which)
-        decimal = not points and not all(map(_THOUSANDS.fullmatch, commas))
+        if odd and not self.decimal:
+            every = [
+                _REMARK.sub("", x) for k in self.places.values() for x in self.columns[k].tolist()
+            ]
+            commas = [x for x in every if _COMMA.fullmatch(x)]
+            clear = not all(map(_THOUSANDS.fullmatch, commas)) and not any(
+                "." in x and is_number(x) for x in every
+            )
+            self.decimal = "," if clear else "."
+        fields = {i: [_REMARK.sub("", x) for x in self.columns[which[i]].tolist()] for i in odd}
         for i, own in fields.items():
             for row, field in enumerate(own):
-                plain = field.replace(",", ".") if decimal else field
+                plain = field.replace(self.decimal, ".")
                 if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
                     values[row, i] = float(plain)
                     continue

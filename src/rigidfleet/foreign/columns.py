@@ -202,7 +202,7 @@ def read_tracks(
     )
     if len(sets) == 1:
         place = np.column_stack([values[k] for k in main.place])
-        groups, identity = _vehicles(table, time, place, stem, notes)
+        groups, identity = _vehicles(table, time, place, columns, stem, notes)
     elif any(q.kind == "agent" and len(table.codes(k)[1]) > 1 for k, q in enumerate(table.kinds)):
         why = "has places of several vehicles in a row, and names of vehicles, too"
         raise fault(why, "Keep one of them")
@@ -225,7 +225,8 @@ def read_tracks(
     _doubt(table, tracks, notes, axes=bool(said))
     used = {*columns, *table.place("time"), *identity}
     return tracks, {
-        "rows": len(time), "separator": SEPARATORS[table.separator], "names_in_line": table.line,
+        "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
+        "decimal_mark": table.decimal or ".",
         "columns": [name for k, name in enumerate(table.names) if k in used],
         "ignored": [name for k, name in enumerate(table.names) if k not in used],
         "vehicles_by": [table.names[k] for k in identity],
@@ -272,7 +273,7 @@ def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
 
 
 def _vehicles(
-    table: Table, time: Floats, place: Floats, stem: str, notes: list[str]
+    table: Table, time: Floats, place: Floats, used: list[int], stem: str, notes: list[str]
 ) -> tuple[dict[str, Ints], list[int]]:
     """Rows of each vehicle, and the columns that tell them apart: by their names, or by the rows themselves.
 
@@ -293,7 +294,8 @@ def _vehicles(
             line = table.lines[np.flatnonzero(code == labels.index(""))[0]]
             raise fault(f"{names[k]} is empty", "Name the vehicle", int(line))
         # What numbers the rows, or words for parts of a flight, are no names of vehicles.
-        if kind and not (alone and (_counts(labels, n) or (kind == "thing" and _follow(code)))):
+        is_name = kind in ("agent", "thing")
+        if is_name and not (alone and (_counts(labels, n) or (kind == "thing" and _follow(code)))):
             named.append(k)
         elif len(labels) > 1 and _FLAGS.search(names[k]):
             notes.append(f"the column {names[k]!r} is not read: rows count whatever it says")

@@ -181,6 +181,8 @@ def _text(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str,
     axes = [axis for axis in _AXES if table.place(axis)]
     hues = table.place(*_HUES) if not table.place("colour") else []
     values = table.numbers(table.place(*axes) + hues)
+    if table.decimal == "," and not table.named:
+        notes.append("commas are read as decimal marks")
     points, colours = np.zeros((len(table.lines), 3)), None
     points[:, [_AXES.index(axis) for axis in axes]] = values[:, : len(axes)]
     if written := table.place("colour"):
