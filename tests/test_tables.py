@@ -53,7 +53,7 @@ def dated(clock):
 
 NAMES = [
     "agent", "id", "drone", "vehicle", "name", "uav", "robot", "cf", "body", "rigid_body", "track", "object", "marker",
-    "label", "uid", "sysid", "ns", "frame_id", "child_frame_id", "callsign", "drone_id", "VehicleName", "uav_no", "mav_id",
+    "label", "uid", "sysid", "ns", "frame_id", "child_frame_id", "callsign", "drone_id", "VehicleName", "uav_no",
 ]  # fmt: skip
 SAME = {
     **{f"named by {w}": f"time,{w},x,y,z\n{lines(plain)}" for w in NAMES},
@@ -63,6 +63,8 @@ SAME = {
         for w in NAMES
     },
     "numbered rows": "seq,time,id,x,y,z\n"
+    + "".join(f"{k},{row}\n" for k, row in enumerate(lines(plain).splitlines())),
+    "numbered messages": "id,time,agent,x,y,z\n"
     + "".join(f"{k},{row}\n" for k, row in enumerate(lines(plain).splitlines())),
     "two frames": "time,frame_id,child_frame_id,x,y,z\n"
     + lines(lambda t, i, x, y, z: f"{t},map,cf{i},{x},{y},{z}"),
@@ -132,6 +134,8 @@ SAME = {
     "CR": (HEAD + lines(plain)).replace("\n", "\r"),
     "CRLF": (HEAD + lines(plain)).replace("\n", "\r\n"),
     "a duration": HEAD.strip() + ",duration\n" + lines(lambda *v: plain(*v) + ",0.5"),
+    "a column as pandas repeats it": "time,agent,x,y,z,x.1\n"
+    + lines(lambda *v: f"{plain(*v)},{v[2]}"),
     "a column twice": "time,agent,x,x,y,z\n"
     + lines(lambda t, i, x, y, z: f"{t},{i},{x},{x},{y},{z}"),
 }
@@ -163,7 +167,7 @@ def test_utf_16_is_read(tmp_path):
 
 NOTED = {
     **{
-        f"named by {w}": (f"time,{w},x,y,z\n{lines(plain)}", f"'{w}' is taken for the names")
+        f"named by {w}": (f"time,{w},x,y,z\n{lines(plain)}", f"'{w}' is taken for names")
         for w in ("who", "pilot", "channel")
     },
     "milliseconds since 1970": (
@@ -203,6 +207,11 @@ def test_vehicles_that_take_turns_are_told_apart(tmp_path):
     read = read_trajectories(tmp_path / "t.csv")
     assert read.names == ("a", "b")
     assert any("'pilot' is taken" in note for note in read.notes)
+    row = lambda t, i, x, y, z: f"{t + 0.01 * i},{x + 0.01 * i},{y},{z}"  # noqa: E731
+    (tmp_path / "t.csv").write_text("time,x,y,z\n" + lines(row))
+    assert any(
+        "as if 2 vehicles took turns" in x for x in read_trajectories(tmp_path / "t.csv").notes
+    )
 
 
 REFUSED = {
@@ -226,6 +235,7 @@ REFUSED = {
         "time_s,x,y,z\nms,mm,mm,mm\n0,0,0,1\n1,1,0,1\n",
         "is in 's', but also in 'ms'",
     ),
+    "some units": ("time_s,x_mm,y,z\n0,0,0,1\n1,1,0,1\n", "units for some columns of length only"),
     "no length": ("time_s,x [kg],y,z\n0,0,0,1\n1,1,0,1\n", "unknown unit 'kg'"),
     "the globe": (
         "time,lat,lon,alt\n0,47.4,8.5,480\n1,47.4,8.5,481\n",
@@ -246,6 +256,10 @@ REFUSED = {
     "microseconds": (
         "timestamp,x,y,z\n100000,0,0,10\n200000,5,0,10\n300000,10,0,10\n",
         "times without a unit step by 100000",
+    ),
+    "a vehicle without heights": (
+        "t,x1,y1,x2,y2,z2\n0,0,0,0,3,1\n1,1,0,1,3,1\n",
+        "x1, y1 may be places of another vehicle",
     ),
     "half turns": (
         "t,x,y,z,yaw_deg\n0,0,0,1,0\n1,0,0,1,200\n2,0,0,1,400\n",
@@ -419,8 +433,9 @@ def test_the_verdict_says_what_was_read(tmp_path, capsys):
     assert main(["assess", path, "--explain"]) == PASSED
     said = capsys.readouterr().out
     for words in (
-        "2 vehicles",
-        "0 to 2 s",
+        "vehicles: 2",
+        "end s: 2.0",
+        "rate hz: 2.5",
         "ignored: battery",
         "time s (the file)",
         "enu (assumed)",

@@ -124,7 +124,11 @@ class Table:
             )
         if kind != "duration":
             source = "the file" if said or below else "the option" if option else ""
-            self.units.setdefault(dimension, (words[0], source))
+            first_source = self.units.setdefault(dimension, (words[0], source))[1]
+            if bool(source) != bool(first_source):
+                raise fault(
+                    f"has units for some columns of {dimension} only, unlike {name!r}", "Give all"
+                )
         return known[0][1]
 
     def place(self, *kinds: str, who: str = "") -> list[int]:

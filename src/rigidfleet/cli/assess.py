@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rigidfleet.cli import console, drawing
 from rigidfleet.cli.codes import FAILED, PASSED
@@ -106,8 +105,11 @@ def assess(
     if json:
         console.print_json(verdict.to_dict())
     else:
-        for line in _explanation(verdict.read) if explain else ():
-            console.out().print(line, highlight=False, markup=False, soft_wrap=True)
+        for part in verdict.read if explain else ():
+            for key, value in part.items():
+                words = ", ".join(value) if isinstance(value, list) else f"{value}"
+                line = f"{key.replace('_', ' ')}: {words}"
+                console.out().print(line, highlight=False, markup=False, soft_wrap=True)
         console.out().print(verdict)
     if made is not None:
         from rigidfleet.cli.report import write_report
@@ -124,24 +126,6 @@ def assess(
             console.out().print()
             list_files(made)
     return PASSED if verdict.passed else FAILED
-
-
-def _explanation(read: list[dict[str, Any]]) -> Iterator[str]:
-    """What was read, line by line."""
-    for part in read:
-        rate = part["rows"] / part["vehicles"] / max(1e-9, part["end_s"] - part["begin_s"])
-        yield (
-            f"Read: {part['files']} files, {part['vehicles']} vehicles, {part['begin_s']:g} to {part['end_s']:g} s"
-            f", {part['rows']} rows, about {rate:.3g} a second and vehicle"
-        )
-        for key in ("columns", "ignored", "vehicles_by", "separator", "units", "axes"):
-            if told := part.get(key):
-                plain = (
-                    told
-                    if isinstance(told, str)
-                    else ", ".join(map(" ".join, told.items()) if isinstance(told, dict) else told)
-                )
-                yield f"  {key.replace('_', ' ')}: {plain}"
 
 
 def _limits(limits: list[str]) -> dict[str, float]:

@@ -22,10 +22,14 @@ _ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+
 _CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
 #: Greatest speed of a flight that is doubted if steps are long, and if numbers are whole: from, to [m/s].
 _SLOW, _FAST, _FASTEST = 0.1, 20.0, 100.0
+#: Greatest whole number of a place without a unit that is not doubted [m].
+_WIDE = 500.0
 #: Step of times without a unit from which they are doubted, and from which they are refused [s].
 _LONG, _LONGEST = 1.0, 1000.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
 _SHORTER = 0.5
+#: Numbers of vehicles that may take turns, and rows by which this is seen.
+_TURNS, _FIRST = range(2, 17), 1000
 #: Words for places that are wanted, not those of a vehicle; for what a row may say of itself; for units in a line.
 _ROLES = {
     "ref",
@@ -70,10 +74,10 @@ class Track(NamedTuple):
 
 
 class _Places(NamedTuple):
-    """Columns of a vehicle: its place, by the directions of the axes, its velocity, yaw and quaternion."""
+    """Directions of a vehicle's axes, and the columns of its place, velocity, yaw and quaternion."""
 
-    place: list[int]
     axes: str
+    place: list[int]
     velocity: list[int]
     yaw: list[int]
     quaternion: list[int]
@@ -186,22 +190,15 @@ def read_tracks(
     """
     sets = _sets(table, axes, notes)
     time, since = _times(table, notes)
-    columns = [
-        k
-        for own in sets.values()
-        for part in (own.place, own.velocity, own.yaw, own.quaternion)
-        for k in part
-    ]
+    columns = [k for own in sets.values() for part in own[1:] for k in part]
     values = dict(zip(columns, table.numbers(columns).T, strict=True))
     if not len(time):
         raise fault("has names of columns, but no rows", "Is the file cut off?")
-    main, groups, identity = (
-        next(iter(sets.values())),
-        dict.fromkeys(sets, np.arange(len(time))),
-        [],
-    )
+    stack = lambda part, rows: np.column_stack([values[k][rows] for k in part])  # noqa: E731
+    groups, identity = dict.fromkeys(sets, np.arange(len(time))), []
+    main = next(iter(sets.values()))
     if len(sets) == 1:
-        place = np.column_stack([values[k] for k in main.place])
+        place = stack(main.place, slice(None))
         groups, identity = _vehicles(table, time, place, columns, stem, notes)
     elif any(q.kind == "agent" and len(table.codes(k)[1]) > 1 for k, q in enumerate(table.kinds)):
         why = "has places of several vehicles in a row, and names of vehicles, too"
@@ -209,19 +206,14 @@ def read_tracks(
     tracks = []
     for who, rows in groups.items():
         own = sets.get(who, main)
-        place, velocity, turned = (
-            np.column_stack([values[k][rows] for k in part]) if part else None
-            for part in (own.place, own.velocity, own.quaternion)
-        )
-        yaw = _yaw(table, values[own.yaw[0]][rows], rows, notes) if own.yaw else None
-        if turned is not None and not own.yaw:
-            yaw = yaws(turned)
-        tracks.append(
-            Track(who, table.lines[rows], time[rows], *_in_enu(own.axes, place, velocity, yaw))
-        )
-    said = (
-        "the option" if axes else "the file" if not table.place("x") and main.axes != "enu" else ""
-    )
+        velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
+        if own.yaw:
+            yaw = _yaw(table, values[own.yaw[0]][rows], rows, notes)
+        elif own.quaternion:
+            yaw = yaws(stack(own.quaternion, rows))
+        turned = _in_enu(own.axes, stack(own.place, rows), velocity, yaw)
+        tracks.append(Track(who, table.lines[rows], time[rows], *turned))
+    said = "the option" if axes else "" if main.axes == "enu" and table.place("x") else "the file"
     _doubt(table, tracks, notes, axes=bool(said))
     used = {*columns, *table.place("time"), *identity}
     return tracks, {
@@ -244,31 +236,33 @@ def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
         A place is missing, or some columns may be those of another vehicle; or names of axes contradict the option.
     """
     sets: dict[str, _Places] = {}
+    loose: dict[str, dict[str, int]] = {}
     for who in dict.fromkeys(who for _, who in table.places):
+        ways = [kind for kind, own in table.places if kind in DIRECTIONS and own == who]
         place, turned = table.place(*"xyz", who=who), axes or "enu"
-        velocity = table.place("vx", "vy", "vz", who=who)
-        if not place:
-            ways = [kind for kind, own in table.places if kind in DIRECTIONS and own == who]
-            turned, velocity = "".join(DIRECTIONS[way] for way in ways), []
-            place = table.place(*ways, who=who) if _are_axes(turned) else []
-            if place and sorted(axes or turned) != sorted(turned):
+        if not place and _are_axes("".join(DIRECTIONS[way] for way in ways)):
+            place, turned = table.place(*ways, who=who), "".join(DIRECTIONS[way] for way in ways)
+            if sorted(axes or turned) != sorted(turned):
                 raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
+        kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
-            turns = table.place("yaw", who=who), table.place("qx", "qy", "qz", "qw", who=who)
-            sets[who] = _Places(place, turned, velocity, *turns)
+            sets[who] = _Places(turned, place, *(table.place(*kind, who=who) for kind in kinds))
+        if own := {kind: k for (kind, x), k in table.places.items() if x == who and kind in "xyz"}:
+            loose[who] = own
     flown = {who: own for who, own in sets.items() if who not in _ROLES} or sets
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
         raise table.missing(*"xyz")
-    for who in sets.keys() - flown.keys():
-        names = ", ".join(table.names[k] for k in sets[who].place)
-        first, second = (table.numbers(x.place) for x in (next(iter(flown.values())), sets[who]))
-        if who not in _ROLES and re.search(r"\d", who) and not np.array_equal(first, second):
-            why = f"{names} may be places of another vehicle"
-            raise fault(why, "Name all alike (x1, x2), or give each vehicle its rows")
-        notes.append(
-            f"the columns {names} are not read: if they are of another vehicle, it is not judged"
-        )
+    main = next(iter(flown))
+    for who in loose.keys() - flown.keys():
+        names = ", ".join(table.names[k] for k in loose[who].values())
+        pairs = [(table.places.get((kind, main), -1), k) for kind, k in loose[who].items()]
+        if all((table.columns[i] == table.columns[k]).all() for i, k in pairs):
+            continue
+        if who not in _ROLES and (re.search(r"\d", who) or "" not in sets):
+            remedy = "Give each vehicle its rows, or columns such as x1, y1, z1, x2, y2, z2"
+            raise fault(f"{names} may be places of another vehicle", remedy)
+        notes.append(f"the columns {names} are not read: another vehicle's are not judged")
     return flown
 
 
@@ -282,46 +276,49 @@ def _vehicles(
     TableError
         A name is empty, or a time has two places, or two columns may be the names.
     """
-    names, n, one = table.names, len(time), np.zeros(len(time), np.int64)
-    alone = _increases(time, one)
-    coded = {
-        k: table.codes(k) for k, q in enumerate(table.kinds) if q.kind in ("agent", "thing", "")
-    }
+    names, kinds, n = table.names, [q.kind for q in table.kinds], len(time)
+    part, coded = np.zeros(n, np.int64), {}
+    alone = _increases(time, part)
+    for k, q in enumerate(table.kinds):
+        if k not in used and (not q.dimension or q.kind in DIRECTIONS):
+            coded[k] = table.codes(k)
     named = []
-    for k, (code, labels) in sorted(coded.items(), key=lambda x: table.kinds[x[0]].kind != "agent"):
-        kind = table.kinds[k].kind
-        if "" in labels and kind == "agent":
-            line = table.lines[np.flatnonzero(code == labels.index(""))[0]]
-            raise fault(f"{names[k]} is empty", "Name the vehicle", int(line))
+    for k in sorted(coded, key=lambda k: kinds[k] != "agent"):
+        (code, labels), thing = coded[k], kinds[k] == "thing"
         # What numbers the rows, or words for parts of a flight, are no names of vehicles.
-        is_name = kind in ("agent", "thing")
-        if is_name and not (alone and (_counts(labels, n) or (kind == "thing" and _follow(code)))):
+        counts = np.ptp(time) > 0.0 and _counts(labels, n)
+        if (
+            kinds[k] in ("agent", "thing")
+            and not counts
+            and not (thing and alone and _follow(code))
+        ):
             named.append(k)
-        elif len(labels) > 1 and _FLAGS.search(names[k]):
+            if "" in labels:
+                line = table.lines[np.flatnonzero(code == labels.index(""))[0]]
+                raise fault(f"{names[k]} is empty", "Name the vehicle", int(line))
+        elif len(labels) > 1 and (kinds[k] == "agent" or _FLAGS.search(names[k])):
             notes.append(f"the column {names[k]!r} is not read: rows count whatever it says")
     chosen = next(([k] for k in named if _increases(time, coded[k][0])), named)
-    part = _both(one, *(coded[k][0] for k in chosen))
-    others = {
-        k: _both(part, code)
-        for k, (code, labels) in coded.items()
-        if k not in named and 1 < len(labels) <= n / 2
-    }
-    if _increases(time, part):
-        apart = {
-            k: both
-            for k, both in others.items()
-            if _length(place, both) < _SHORTER * _length(place, part)
-        }
-    else:
+    part = _both(part, *(coded[k][0] for k in chosen))
+    few = [k for k in coded if k not in named and 1 < len(coded[k][1]) <= n / 2]
+    others = {k: _both(part, coded[k][0]) for k in few}
+    if unclear := not _increases(time, part):
         apart = {k: both for k, both in others.items() if _increases(time, both)}
-        if any((both != next(iter(apart.values()))).any() for both in apart.values()):
-            told = ", ".join(names[k] for k in apart)
-            raise fault(f"the columns {told} may name vehicles", "Name one of them agent")
+    else:
+        whole = _SHORTER * _length(place, part)
+        apart = {k: both for k, both in others.items() if _length(place, both) < whole}
+        first, row = place[:_FIRST], np.arange(min(n, _FIRST))
+        whole = _SHORTER * _length(first, 0 * row)
+        turns = [p for p in _TURNS if n > 2 * p and _length(first, row % p) < whole]
+        if turns and not chosen and not apart:
+            doubt = f"rows lie apart as if {turns[0]} vehicles took turns"
+            notes.append(Doubt(f"{doubt}: give them names in a column agent"))
+    if unclear and any((both != next(iter(apart.values()))).any() for both in apart.values()):
+        told = ", ".join(names[k] for k in apart)
+        raise fault(f"the columns {told} may name vehicles", "Name one of them agent")
     for k in [*apart][:1]:
         chosen, part = [*chosen, k], apart[k]
-        notes.append(
-            f"the column {names[k]!r} is taken for the names of vehicles, as its rows lie apart"
-        )
+        notes.append(f"the column {names[k]!r} is taken for names of vehicles: its rows lie apart")
     for k in named:
         if _both(part, coded[k][0]).max() > part.max():
             notes.append(f"the column {names[k]!r} may name vehicles, too, and is not read")
@@ -455,5 +452,5 @@ def _doubt(table: Table, tracks: list[Track], notes: list[str], *, axes: bool) -
         and _FAST < fastest <= _FASTEST
         and (place == np.round(place)).all()
     ):
-        doubt = f"places without a unit are whole numbers, and speeds reach {fastest:.3g} m/s: are they millimetres?"
+        doubt = f"places without a unit reach {np.abs(place).max():.4g} at {fastest:.3g} m/s: are they millimetres?"
         notes.append(Doubt(f"{doubt} Name the column x_m or x_mm, or say --units m or mm"))

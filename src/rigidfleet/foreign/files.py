@@ -142,14 +142,15 @@ def _alike(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
     every: dict[str, dict[str, Any]] = {}
     for part in parts:
         record = {k: v for k, v in part.read[0].items() if k not in ("rows", "since_1970_ns")}
-        begin = min(float(curve.time[0]) for curve in part.curves)
-        end = max(float(curve.time[-1]) for curve in part.curves)
-        new = {"files": 0, "vehicles": 0, "rows": 0, "begin_s": begin, "end_s": end, **record}
-        own = every.setdefault(repr(record), new)
+        nothing = {"files": 0, "vehicles": 0, "rows": 0, "begin_s": np.inf, "end_s": -np.inf}
+        own = every.setdefault(repr(record), nothing | {"rate_hz": 0.0} | record)
         own["files"] += 1
         own["vehicles"] += len(part.names)
         own["rows"] += part.read[0].get("rows", 0)
-        own["begin_s"], own["end_s"] = min(own["begin_s"], begin), max(own["end_s"], end)
+        own["begin_s"] = min(own["begin_s"], *(float(curve.time[0]) for curve in part.curves))
+        own["end_s"] = max(own["end_s"], *(float(curve.time[-1]) for curve in part.curves))
+        seconds = own["vehicles"] * (own["end_s"] - own["begin_s"])
+        own["rate_hz"] = round(own["rows"] / seconds, 6)
     return tuple(every.values())
 
 
