@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from datetime import datetime
 from decimal import Decimal
 from typing import Any, NamedTuple
@@ -20,10 +21,10 @@ _TUM = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 _DATES, _TICKS = (10**9, 4 * 10**9), ("s", "ms", "us", "ns")
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
 _CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
-#: Greatest speed of a flight that is doubted if steps are long, and if numbers are whole: from, to [m/s].
-_SLOW, _FAST, _FASTEST = 0.1, 20.0, 100.0
-#: Greatest whole number of a place without a unit that is not doubted [m].
-_WIDE = 500.0
+#: Greatest speed of a flight that is doubted, if steps are long: below; if numbers are whole: above [m/s].
+_SLOW, _FAST = 0.1, 20.0
+#: Greatest whole number of a place without a unit that is not doubted where all are slower than this [m, m/s].
+_WIDE, _CALM = 500.0, 5.0
 #: Step of times without a unit from which they are doubted, and from which they are refused [s].
 _LONG, _LONGEST = 1.0, 1000.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
@@ -126,9 +127,8 @@ def parse(data: bytes, words: Units) -> tuple[Table, list[str]]:
         notes.append(f"8 numbers a line without names are read as TUM's: {' '.join(_TUM)}")
     before = [line.strip() for line in table.texts[: table.line - 1] if _UNSAID.search(line)]
     if before and words == ({}, ""):
-        notes.append(
-            f"{before[0][:60]!r} is not read: does it say units or axes? Say --units or --axes"
-        )
+        doubt = f"{before[0][:60]!r} is not read: does it say units or axes? Say --units or --axes"
+        notes.append(Doubt(doubt))
     return table, notes
 
 
@@ -214,7 +214,7 @@ def read_tracks(
         turned = _in_enu(own.axes, stack(own.place, rows), velocity, yaw)
         tracks.append(Track(who, table.lines[rows], time[rows], *turned))
     said = "the option" if axes else "" if main.axes == "enu" and table.place("x") else "the file"
-    _doubt(table, tracks, notes, axes=bool(said))
+    notes += map(Doubt, _doubts(table, tracks, axes=bool(said)))
     used = {*columns, *table.place("time"), *identity}
     return tracks, {
         "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
@@ -411,46 +411,37 @@ def _yaw(table: Table, yaw: Floats, rows: Ints, notes: list[str]) -> Floats | No
     return yaw
 
 
-def _doubt(table: Table, tracks: list[Track], notes: list[str], *, axes: bool) -> None:
-    """Note what looks as if it had other units or axes than it says.
+def _doubts(table: Table, tracks: list[Track], *, axes: bool) -> Iterator[str]:
+    """What looks as if it had other units or axes than it says.
 
     Raises
     ------
     TableError
         Times without a unit are too far apart for seconds.
     """
-    place = np.concatenate([track.place for track in tracks])
-    top, bottom = place[:, 2].max(), place[:, 2].min()
+    place, time = (np.concatenate([track[k] for track in tracks]) for k in (3, 2))
+    whole = (place == np.round(place)).all()
+    top, bottom, widest = place[:, 2].max(), place[:, 2].min(), np.abs(place).max()
     if not axes and top <= 0.1 and bottom < -0.5:
-        notes.append(
-            f"all heights are at or below 0, down to {bottom:.4g} m: does z point down? Say --axes ned or enu"
-        )
-    flown = [track for track in tracks if len(track.time) > 1]
-    if not flown:
-        return
+        yield f"all heights are at or below 0, down to {bottom:.4g} m: does z point down? Say --axes ned or enu"
     with np.errstate(all="ignore"):
-        ways = [np.linalg.norm(np.diff(track.place, axis=0), axis=1) for track in flown]
-        steps = [np.diff(track.time) for track in flown]
-        fastest = max(float(np.nanmax(way / step)) for way, step in zip(ways, steps, strict=True))
-    step = float(np.median(np.concatenate(steps)))
-    whole = all((track.time == np.round(track.time)).all() for track in flown)
-    slow = (
-        0.0 < fastest < (10.0 * _SLOW if whole and step >= 10.0 else _SLOW)
-        and max(map(np.sum, ways)) > _SLOW
-    )
-    if not table.units["time"][1] and (step >= _LONGEST or (step >= _LONG and slow)):
-        doubt = (
-            f"times without a unit step by {step:g}: as seconds, speeds reach {fastest:.3g} m/s, as milliseconds "
-            f"{1e3 * fastest:.3g}"
-        )
+        ways = [np.linalg.norm(np.diff(track.place, axis=0), axis=1) for track in tracks]
+    steps = np.concatenate([np.diff(track.time) for track in tracks])
+    step = float(np.median(steps)) if steps.size else 0.0
+    fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
+    slow = 10.0 * _SLOW if step >= 10.0 and (time == np.round(time)).all() else _SLOW
+    moves = 0.0 < fastest < slow and max(map(np.sum, ways)) > _SLOW
+    if not table.units["time"][1] and (step >= _LONGEST or (step >= _LONG and moves)):
+        told = f"as seconds, speeds reach {fastest:.3g} m/s, as milliseconds {1e3 * fastest:.3g}"
         remedy = "Name the column time_s or time_ms, or say --units s or ms"
         if step >= _LONGEST:
-            raise fault(doubt, remedy)
-        notes.append(Doubt(f"{doubt}. {remedy}"))
-    if (
-        not table.units["length"][1]
-        and _FAST < fastest <= _FASTEST
-        and (place == np.round(place)).all()
-    ):
-        doubt = f"places without a unit reach {np.abs(place).max():.4g} at {fastest:.3g} m/s: are they millimetres?"
-        notes.append(Doubt(f"{doubt} Name the column x_m or x_mm, or say --units m or mm"))
+            raise fault(f"times without a unit step by {step:g}: {told}", remedy)
+        yield f"times without a unit step by {step:g}: {told}. {remedy}"
+    likely = fastest > 2.0 * _FAST or (
+        whole and (fastest > _FAST or (widest > _WIDE and fastest < _CALM))
+    )
+    if not table.units["length"][1] and likely:
+        told = (
+            f"places without a unit reach {widest:.4g} at {fastest:.3g} m/s: are they millimetres?"
+        )
+        yield f"{told} Name the column x_m or x_mm, or say --units m or mm"
