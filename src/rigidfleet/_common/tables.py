@@ -253,7 +253,7 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     above = [k for k in head if not names and k < start and texts[k][0] != "#"]
     for k in [k for k in above if len(split(texts[k], separator)) == width]:
         why = f"has no names of columns that are understood: {texts[k][:60]}"
-        raise fault(why, "Name x, y and z", k + 1)
+        raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
     return line, start, names, units, separator, width
 
 
