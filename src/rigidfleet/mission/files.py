@@ -201,19 +201,19 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     try:
-        found = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
+        read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
     except TrajectoryError as error:
         raise _unread(name, "", error) from None
-    for doubt in found.notes:
+    for doubt in read.notes:
         if isinstance(doubt, Doubt):
             raise unread(
                 name, doubt, "say units or axes beside the file: units = 'ms', axes = 'ned'"
             )
-    curves = [curve.later(-curve.time[0]) for curve in found.curves]
-    if found.assumed in ASSUMED.values():
+    curves = [curve.later(-curve.time[0]) for curve in read.curves]
+    if read.assumed in ASSUMED.values():
         curves = [least_jerk(curve) for curve in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
-        why = next((note for note in found.notes if "yaw" in note), "has no yaw")
+        why = next((note for note in read.notes if "yaw" in note), "has no yaw")
         raise unread(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
     return Content([curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves])
 
