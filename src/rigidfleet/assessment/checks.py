@@ -56,9 +56,13 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
         yield from _failures_or_worst(_as_planned(measured, verdict.phases))
+    elif (
+        measured.result.interpolation is not None and measured.mission.limits.separation is not None
+    ):
+        yield _alone(measured)
     if "clearance" in worst:
         yield from _clearances(measured)
-    if not measured.left.all():
+    if not measured.left.all() and measured.mission.first_loss < math.inf:
         yield _lost(measured)
     yield from abandoned(measured)
     limits = measured.mission.limits
@@ -303,6 +307,7 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
         return  # of straight lines, accelerations are not judged at all
     first = np.flatnonzero(np.nextafter(result.time[:-1], np.inf) >= result.time[1:])
     by = np.linalg.norm(result.velocity[first + 1] - result.velocity[first], axis=2)
+    by *= result.left[first] & result.left[first + 1]
     if not by.size or by.max() <= _CORNER:
         return
     k, i = np.unravel_index(int(by.argmax()), by.shape)
@@ -323,6 +328,17 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
         words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
         words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
     return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
+
+
+def _alone(measured: Measurements) -> CheckResult:
+    """Fail a separation that was asked for where there is no second vehicle."""
+    one = measured.result.n_agents == 1
+    words = "is one vehicle alone" if one else "are never two vehicles at one time"
+    words = (
+        f"separation cannot be judged: there {words}. Give the other vehicles, name the column that tells which vehicle"
+        " a row is of, or ask for no separation"
+    )
+    return CheckResult("separation", False, words, None, measured.mission.limits.separation, "m")
 
 
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:

@@ -48,6 +48,7 @@ class Verdict:
     phases : the numbers of each phase, in order of flight
     notes : what else to know of the flight
     uncalled : in which phases a user's controller was not called, so that the verdict is on another law; "" if in none
+    covers : of a flight that others made, whom and what time "passed" covers; "" for a flight of our own
 
     >>> import rigidfleet as rf
     >>> verdict = rf.assess(rf.simulate("square"))
@@ -62,6 +63,7 @@ class Verdict:
     phases: list[PhaseVerdict]
     notes: list[str]
     uncalled: str = ""
+    covers: str = ""
 
     @property
     def passed(self) -> bool:
@@ -100,7 +102,7 @@ class Verdict:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
         told = [found[name].fill(words) for name, words in praise.items() if name in found]
         head = f"Passed: {all_hold(len(judged))}"
-        return f"{head}; {', '.join(told)}." if told else f"{head}."
+        return (f"{head}; {', '.join(told)}." if told else f"{head}.") + self.covers
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""

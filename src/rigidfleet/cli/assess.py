@@ -20,6 +20,8 @@ def assess(
     radius: float | None = None,
     ground: float | None = None,
     interpolation: Literal["cubic", "linear"] | None = None,
+    spans: Literal["refuse", "stand", "away"] | None = None,
+    gaps: Literal["refuse", "bridge"] | None = None,
     out: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -45,6 +47,12 @@ def assess(
         Height of the ground [m]. Default: there is none.
     interpolation : str
         Between samples: cubic (a spline through the positions) or linear. Default: cubic.
+    spans : str
+        Vehicles that begin later than others or end earlier, by more than their usual step: refuse, stand (at their
+        first and last place), or away (not judged then). Default: refuse; shows and polynomials stand.
+    gaps : str
+        Times without samples, longer than ten usual steps of a vehicle: refuse, or bridge (by the curve). Default:
+        refuse.
     out : Path
         Folder for a result, the verdict, a report, a replay and figures. Default: write nothing.
     force : bool
@@ -61,7 +69,7 @@ def assess(
         drawing.prepare()
     given = {
         "mission": mission, "separation": separation, "limits": limits, "radius": radius, "ground": ground,
-        "interpolation": interpolation,
+        "interpolation": interpolation, "spans": spans, "gaps": gaps,
     }  # fmt: skip
     chosen = [key for key, value in given.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
@@ -79,9 +87,11 @@ def assess(
         if mission is not None and own:
             told = f"--{own[0]}: no effect with --mission, which has its own; remove one"
             raise RigidfleetError(told)
-        read = read_trajectories(files, interpolation or "cubic")
+        read = read_trajectories(
+            files, interpolation or "cubic", spans=spans or "refuse", gaps=gaps or "refuse"
+        )
         result = of_curves(
-            read.curves, read.assumed, names=read.names, mission=mission, separation=separation,
+            read.curves, read.assumed, names=read.names, away=read.away, mission=mission, separation=separation,
             limits=_limits(limits or []), radius=radius or 0.0, ground=ground, name=_name(files[0]),
         )  # fmt: skip
         result.statistics["notes"] = list(read.notes)

@@ -20,12 +20,23 @@ from rigidfleet.foreign import poses, shows, texts
 from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.samples import ASSUMED
 
-__all__ = ["Interpolation", "Trajectories", "read_trajectories"]
+__all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]
 
 Interpolation = Literal["linear", "cubic"]
+#: What a vehicle does before its first sample and after its last one, while others have samples.
+Spans = Literal["refuse", "stand", "away"]
+#: What a long gap between two samples of a vehicle is: an error, or time in which the curve is believed.
+Gaps = Literal["refuse", "bridge"]
 #: Greatest size of a file [bytes], number of files, and coordinate [m] or time [s] of a trajectory.
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 _ZIP, _MCAP, _HDF = b"PK", b"\x89MCAP0\r\n", b"\x89HDF"
+#: What files of trajectories in a folder are, by their suffix.
+_KINDS = {".csv": "tables", ".skyc": "shows", ".mcap": "recordings"}
+#: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
+#: positions that are noted.
+_NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
+#: Share of a number that is rounding, and the greatest number of things that a note lists.
+_ROUNDING, _LISTED = 1e-6, 5
 
 
 class Trajectories(NamedTuple):
@@ -34,20 +45,25 @@ class Trajectories(NamedTuple):
     Attributes
     ----------
     names : of the vehicles, in order
-    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown.
-        A vehicle stays where its curve begins or ends before and after it
+    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown
     assumed : the curve that was assumed between the points of the file, in words
     notes : what a reader of the verdict should know, in sentences without a full stop
+    away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
     """
 
     names: tuple[str, ...]
     curves: tuple[Curve, ...]
     assumed: str
     notes: tuple[str, ...] = ()
+    away: bool = False
 
 
 def read_trajectories(
-    files: str | Path | Sequence[str | Path], interpolation: Interpolation = "cubic"
+    files: str | Path | Sequence[str | Path],
+    interpolation: Interpolation = "cubic",
+    *,
+    spans: Spans = "refuse",
+    gaps: Gaps = "refuse",
 ) -> Trajectories:
     """Read the trajectories of all vehicles of one or several files or folders.
 
@@ -58,11 +74,15 @@ def read_trajectories(
         it is a vehicle, and each folder in it a vehicle whose CSVs, in the order of their numbers, follow each other
     interpolation : between samples, ``cubic`` (the cubic spline through the positions, with continuous acceleration) or
         ``linear``; formats of polynomials say themselves what is between
+    spans : what a vehicle does that has samples later than others, or no longer, by more than its usual step: it
+        stands at its first or last place, or is ``away``. Within a step it is not judged where it has no samples.
+        Curves of shows and polynomials stand unless they are to be ``away``
+    gaps : whether a time between two samples of more than ten usual steps is an error, or is bridged by the curve
 
     Raises
     ------
     TrajectoryError
-        A file cannot be read; the message names the file and the line or entry.
+        A file cannot be read, or a part of it is not there; the message names the file and the line or entry.
     ValueError
         The interpolation is unknown.
     """
@@ -71,9 +91,10 @@ def read_trajectories(
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
-    listed = [found for path in paths for found in files_of(path)]
+    listed = [group for path in paths for group in files_of(path)]
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
+    notes = [note for path in paths if path.is_dir() for note in _left_out(path, listed)]
     parts = [_of_sequence(group, interpolation) for group in listed]
     kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
     if len(kinds) > 1:
@@ -82,6 +103,7 @@ def read_trajectories(
             f"{second}: is of another kind than {first}. Give files of one kind for one flight."
         )
     names = [name for part in parts for name in part.names]
+    sources = [group[0] for part, group in zip(parts, listed, strict=True) for _ in part.names]
     if len(set(names)) < len(names):
         names = [f"{group[0].stem}" if len(part.names) == 1 else f"{group[0].stem}/{name}"
                  for part, group in zip(parts, listed, strict=True) for name in part.names]  # fmt: skip
@@ -89,33 +111,116 @@ def read_trajectories(
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
     curves = [curve for part in parts for curve in part.curves]
-    notes = [note for part in parts for note in part.notes]
+    zeroed = [source for source, curve in zip(sources, curves, strict=True)
+              if source.suffix.lower() == ".mcap" and curve.time[0] == 0.0]  # fmt: skip
+    if len({*zeroed}) > 1:
+        raise TrajectoryError(
+            f"{zeroed[-1]}: its times and those of {zeroed[0].name} count from own first poses. Merge the recordings."
+        )
+    notes += [note for part in parts for note in part.notes]
     exact = parts[0].assumed in (texts.POLYNOMIALS, shows.BEZIER)
-    notes += _spans(names, curves, listed, exact=exact)
+    away = spans == "away" or not (exact or spans == "stand")
     if not exact:
-        curves = _common_part(curves)
-    return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes))
+        _check_samples(names, curves, sources, spans, gaps)
+        notes += _gaps(names, curves, away=away) + _frozen(names, curves)
+    notes += _spans(names, curves, away=away)
+    return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes), away)
 
 
 def files_of(path: Path) -> list[list[Path]]:
-    """The files of a path, those of one vehicle that follow each other together."""
+    """The files of a path, those of one vehicle that follow each other together.
+
+    Raises
+    ------
+    TrajectoryError
+        A folder has files of several kinds or none, or a piece of a sequence is missing.
+    """
     if not path.is_dir():
         return [[path]]
-    inside = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=_order)
-    recordings = [p for p in inside if p.suffix == ".mcap"]
-    if recordings:
-        return [[p] for p in recordings]
-    tables = [p for p in inside if p.suffix.lower() == ".csv"]
-    if tables:
-        return [[p] for p in tables]
+    inside = sorted(path.iterdir(), key=_order)
+    kinds = [(name, _with_suffix(inside, suffix)) for suffix, name in _KINDS.items()]
+    kinds = [(name, every) for name, every in kinds if every]
+    if len(kinds) > 1:
+        (one, _), (other, (first, *_)), *_ = kinds
+        raise TrajectoryError(
+            f"{first}: the folder has {one} and {other}. Give files of one kind for one flight."
+        )
+    if kinds:
+        return [[p] for p in kinds[0][1]]
     folders = [p for p in inside if p.is_dir()]
-    groups = [sorted(folder.glob("*.csv"), key=_order) for folder in folders]
+    groups = [_with_suffix(sorted(folder.iterdir(), key=_order), ".csv") for folder in folders]
     if not groups or not all(groups):
         bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
         raise TrajectoryError(
-            f"{bare}: the folder has no .csv and no .mcap. Give a folder with one table a vehicle."
+            f"{bare}: the folder has no .csv, .skyc or .mcap. Give a folder with one table a vehicle."
         )
+    for group in groups:
+        columns = {
+            column for column in zip(*map(_numbers, group), strict=False) if len({*column}) > 1
+        }
+        counts = {(*range(first, first + len(group)),) for first in (0, 1)}
+        if len(group) > 1 and not (len(columns) == 1 and columns <= counts):
+            raise TrajectoryError(
+                f"{group[0].parent}: {_some([p.name for p in group])} are no sequence. Number the tables that a "
+                "vehicle flies one after the other from 0 or 1 on, and leave none out."
+            )
     return groups
+
+
+def _with_suffix(paths: list[Path], suffix: str) -> list[Path]:
+    return [p for p in paths if p.suffix.lower() == suffix and p.is_file()]
+
+
+def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
+    """A note on the files in a folder that are not read.
+
+    Raises
+    ------
+    TrajectoryError
+        One of them may be a further vehicle.
+    """
+    read = {p for group in listed for p in group}
+    rest = [p for p in sorted(path.rglob("*"), key=_order) if p.is_file() and p not in read]
+    for p in rest:
+        if p.suffix.lower() in _KINDS or _is_trajectory(p):
+            raise TrajectoryError(
+                f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
+                "move it out of the folder."
+            )
+    notes = (
+        [f"of '{path.name}', {_some([p.relative_to(path) for p in rest])} is not read"]
+        if rest
+        else []
+    )
+    numbers = sorted(x for (p, *_) in listed if p.parent == path for x in _numbers(p)[-1:])
+    lacking = set(range(numbers[0], numbers[-1])) - set(numbers) if len(numbers) > 2 else set()
+    if lacking and len(lacking) < len(numbers):
+        notes.append(f"of '{path.name}', no file has the number {_some(sorted(lacking))}")
+    return notes
+
+
+def _is_trajectory(path: Path) -> bool:
+    """Whether a file can be read, whatever its name."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(1000)
+        if b"\0" in head and not head.startswith((_ZIP, _MCAP)):
+            return False
+        _of_file(path, "linear")
+    except (OSError, TrajectoryError):
+        return False
+    return True
+
+
+def _some(things: Sequence[object]) -> str:
+    """The first of some things, and how many more there are."""
+    more = f" and {len(things) - _LISTED:,} more" if len(things) > _LISTED else ""
+    return ", ".join(map(str, things[:_LISTED])) + more
+
+
+def _numbers(path: Path) -> list[int]:
+    """Numbers in the name of a file."""
+    return [int(x) for x in re.findall(r"\d+", path.stem) if len(x) < 19]
 
 
 def _order(path: Path) -> list[tuple[int, str]]:
@@ -196,38 +301,100 @@ def _check_size(name: str, who: str, curve: Curve) -> None:
         )
 
 
-def _spans(
-    names: Sequence[str], curves: Sequence[Curve], listed: list[list[Path]], *, exact: bool
-) -> list[str]:
-    """A note if vehicles begin or end at different times.
+def _check_samples(
+    names: Sequence[str], curves: Sequence[Curve], sources: Sequence[Path], spans: Spans, gaps: Gaps
+) -> None:
+    """Refuse samples that leave open where a vehicle is, unless a word for it was given.
 
     Raises
     ------
     TrajectoryError
-        Samples begin or end at times that differ by more than a sample.
+        A vehicle begins or ends by more than its usual step after or before others, or lacks samples in between.
     """
+    begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
+    for name, curve, source in zip(names, curves, sources, strict=True):
+        steps, (first, last) = np.diff(curve.time), curve.time[[0, -1]]
+        usual = float(np.median(steps)) * (1.0 + _ROUNDING)
+        if spans == "refuse" and max(first - begin, end - last) > usual:
+            raise TrajectoryError(
+                f"{source}: {name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s. "
+                "Give all vehicles the same span of time, or say what it does before and after: `assess --spans stand` "
+                "or `--spans away`."
+            )
+        k = int(steps.argmax())
+        if gaps == "refuse" and steps[k] > _LONGEST * usual:
+            raise TrajectoryError(
+                f"{source}: {name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, "
+                f"{steps[k] / usual:.0f} times its usual step. Give the samples, or let the curve bridge the gap: `assess --gaps bridge`."
+            )
+
+
+def _gaps(names: Sequence[str], curves: Sequence[Curve], *, away: bool) -> list[str]:
+    """Notes on the longest gaps between samples, with the least distance of another vehicle there."""
+    every = [
+        (step / usual, i, k)
+        for i, curve in enumerate(curves)
+        for steps in [np.diff(curve.time)]
+        for usual in [np.median(steps)]
+        for k in np.flatnonzero(steps > _NOTED * usual).tolist()
+        for step in [steps[k]]
+    ]
+    notes = []
+    for share, i, k in sorted(every, key=lambda gap: -gap[0])[:_LISTED]:
+        start, end = curves[i].time[k : k + 2]
+        words = f"{names[i]!r} has no sample between {start:g} and {end:g} s, {share:.3g} times its usual step: its"
+        words += " curve is assumed there"
+        t = np.linspace(start, end, 101)
+        nearest = np.inf, 0.0, ""
+        for name, other in zip(names, curves, strict=True):
+            if other is not curves[i]:
+                inside = np.clip(t, other.time[0], other.time[-1])
+                far = np.linalg.norm((other.at(inside) - curves[i].at(t))[:, :3], axis=1)
+                far = np.where((inside == t) | (not away), far, np.inf)
+                nearest = min(nearest, (far.min(), t[far.argmin()], name))
+        if nearest[0] < np.inf:
+            far, when, name = nearest
+            words += f", {far:.3g} m from {name!r} at {when:.3g} s, centre to centre"
+        notes.append(words)
+    more = len(every) - len(notes)
+    return [*notes, f"{more:,} shorter gaps between samples are bridged, too"] if more else notes
+
+
+def _frozen(names: Sequence[str], curves: Sequence[Curve]) -> list[str]:
+    """A note on a vehicle that stands still to the last digit between moves that begin and end at once."""
+    every = []
+    for name, curve in zip(names, curves, strict=True):
+        moves = np.linalg.norm(np.diff(curve.at(curve.time)[:, :3], axis=0), axis=1)
+        moving = np.flatnonzero(moves > 1e-9)
+        fast = moves[moving] > 0.5 * np.median(moves[moving]) if len(moving) else moving > 0
+        for k in np.flatnonzero((np.diff(moving) > _REPEATED) & fast[:-1] & fast[1:]).tolist():
+            start, end = curve.time[moving[k] + 1], curve.time[moving[k + 1]]
+            every.append(f"{name!r} from {start:g} to {end:g} s")
+    if not every:
+        return []
+    return [
+        f"positions repeat to the last digit between moves, {_some(every)}: a hold, or a tracker that lost sight of it"
+    ]
+
+
+def _spans(names: Sequence[str], curves: Sequence[Curve], *, away: bool) -> list[str]:
+    """Notes if vehicles begin or end at different times."""
     starts = np.array([curve.time[0] for curve in curves])
     ends = np.array([curve.time[-1] for curve in curves])
-    if exact:
-        if np.ptp(ends) <= 1e-6 and np.ptp(starts) <= 1e-6:
-            return []
+    begin, end = starts.min(), ends.max()
+    if np.ptp(ends) <= 1e-6 and np.ptp(starts) <= 1e-6:
+        return []
+    if not away:
         return [
-            f"vehicles begin between {starts.min():g} and {starts.max():g} s and end between {ends.min():g} and "
-            f"{ends.max():g} s; each stays at its first and last place outside of its time"
+            f"vehicles begin between {begin:g} and {starts.max():g} s and end between {ends.min():g} and {end:g} s; "
+            "each stays at its first and last place outside of its time"
         ]
-    step = max(float(np.diff(curve.time).max()) for curve in curves)
-    for what, t, late in (("begins", starts, starts.max()), ("ends", ends, ends.min())):
-        far = np.abs(t - late)
-        if far.max() > step:
-            i, j = int(far.argmax()), int(far.argmin())
-            raise TrajectoryError(
-                f"{listed[min(i, len(listed) - 1)][0]}: {names[i]!r} {what} at {t[i]:g} s, and {names[j]!r} at "
-                f"{t[j]:g} s. Give all vehicles the same span of time."
-            )
-    return []
-
-
-def _common_part(curves: list[Curve]) -> list[Curve]:
-    """The part of all curves in which every vehicle has samples."""
-    start, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
-    return [c if c.time[0] == start and c.time[-1] == end else c.cut(start, end) for c in curves]
+    part = [
+        f"{name!r} from {a:.9g} to {b:.9g} s"
+        for name, a, b in zip(names, starts, ends, strict=True)
+        if max(a - begin, end - b) > 1e-6
+    ]
+    apart = int(np.searchsorted(np.sort(starts), ends, side="right").sum())
+    apart = len(names) ** 2 - apart
+    never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
+    return [f"vehicles are judged only where they have data: {_some(part)}{never}"]

@@ -13,7 +13,7 @@ import io
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +32,8 @@ from rigidfleet.mission.text import unread
 
 #: What stands before the digest of a file.
 _DIGEST = "SHA-256 "
+#: What stands before the notes on a file.
+_DOUBTS = ". Note: "
 #: What a text has that may name a file.
 _MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
 #: What is said where a file cannot be found, because a mission is not from a file itself.
@@ -53,10 +55,11 @@ class _Named(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What a file gives: rows of numbers (of trajectories: of each vehicle), and colours of points if it has them."""
+    """What a file gives: rows of numbers (of trajectories: of each vehicle), colours of points if it has them, notes."""
 
     rows: list[Any]
     colours: tuple[str, ...] | None = None
+    notes: Sequence[str] = ()
 
 
 def completed(text: str, path: Path) -> str:
@@ -93,8 +96,10 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     for named in list(_named(data)):
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
-        rows, colours = named.read(content, str(path.parent / name))
+        rows, colours, notes = named.read(content, str(path.parent / name))
         told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
+        if notes:
+            told += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
         named.table[named.becomes] = rows
@@ -115,8 +120,14 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
 
 def digests(text: str) -> str:
     """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
-    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}$", text, re.MULTILINE)
+    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?$", text, re.MULTILINE)
     return "".join(f"{line}\n" for line in dict.fromkeys(found))
+
+
+def doubts(text: str) -> list[str]:
+    """What is said of the files of a mission's text, each with what was read of it."""
+    found = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$", text, re.MULTILINE)
+    return [f"{what}: {notes}" for what, notes in dict.fromkeys(found)]
 
 
 def _names(path: Path, named: _Named) -> list[str]:
@@ -201,12 +212,31 @@ def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
         found = read_trajectories(name)
     except TrajectoryError as error:
         raise _unread(name, "", error) from None
-    curves = [Curve(curve.time - curve.time[0], curve.pieces) for curve in found.curves]
-    if found.assumed in ASSUMED.values():
-        curves = [smoothed(curve) for curve in curves]
+    curves, notes = [*found.curves], [*found.notes]
+    begin, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
+    if found.assumed not in ASSUMED.values():
+        begin = min(c.time[0] for c in curves)
+        curves = [_waiting(c, begin) for c in curves]
+    else:
+        if any((c.time[[0, -1]] != (begin, end)).any() for c in curves):
+            notes.append(
+                f"only the time from {begin:g} to {end:g} s, of which all have data, is flown"
+            )
+        curves = [smoothed(c.cut(begin, end)) for c in curves]
+    curves = [c.later(-begin) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         raise unread(name, "has no yaw", "remove yaw = 'file', or give a file with a yaw")
-    return Content([curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves])
+    rows = [curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves]
+    return Content(rows, notes=notes)
+
+
+def _waiting(curve: Curve, begin: float) -> Curve:
+    """A curve that stands where it begins from a time [s] on."""
+    if curve.time[0] - begin < 1e-6:
+        return curve
+    still = curve.pieces[:1].copy()
+    still[..., 1:] = 0.0
+    return Curve(np.append(begin, curve.time), np.concatenate([still, curve.pieces]))
 
 
 def _heights(data: bytes, name: str) -> Content:

@@ -260,6 +260,13 @@ class Extremes:
         self._list_all()
         self.state = self.size = None  # other vehicles are monitored from now on
 
+    def only(self, left: Bools) -> None:
+        """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
+        self.left[:] = left
+        self._list_all()
+        self._watch_listed(0.0)
+        self.moved[:] = np.inf  # of a large fleet, no pairs are listed yet
+
     def take(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:

@@ -25,7 +25,7 @@ from rigidfleet.math.bernstein import SIZES, bernstein, greatest
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.result import Extremum, PhaseRecord, Result
+from rigidfleet.result import Extremum, PhaseRecord, Result, there
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.typing import Floats
 
@@ -281,7 +281,12 @@ def _told_apart(start: Floats) -> Floats:
 
 
 def of_pieces(
-    pieces: Pieces, interpolation: str, *, names: Sequence[str] = (), **judged: Any
+    pieces: Pieces,
+    interpolation: str,
+    *,
+    names: Sequence[str] = (),
+    spans: Sequence[tuple[float, float]] = (),
+    **judged: Any,
 ) -> Result:
     """A result of piecewise polynomials; see `trajectories`.
 
@@ -289,6 +294,7 @@ def of_pieces(
     ----------
     interpolation : what the curves are, in words
     names : of the vehicles, where they come from
+    spans : from when to when [s] each vehicle is there; empty: always
     judged : see `judged_as`
 
     Raises
@@ -298,8 +304,9 @@ def of_pieces(
     MissionError
         A limit is invalid.
     """
-    if abs(pieces.time[0]) > _CLOCK or pieces.time[0] < 0.0:
-        pieces = Pieces(pieces.time - pieces.time[0], pieces.position, pieces.yaw)
+    zero = float(pieces.time[0])
+    zero *= abs(zero) > _CLOCK
+    pieces = Pieces(pieces.time - zero, pieces.position, pieces.yaw)
     _continuous(pieces)
     n, span = pieces.position.shape[1], float(pieces.time[-1] - pieces.time[0])
     step = max(_STEP, span * n / _SAMPLES)
@@ -308,16 +315,28 @@ def of_pieces(
     pieces = pieces.cut(grid)
     first, last = pieces.states()
     mission = judged_as(first[0, 0], span, **judged)
+    if zero and any(thing.solid.moves for thing in mission.obstacles):
+        raise ResultError(
+            f"the trajectories begin at {zero:.9g} s, and obstacles move from 0 s on. Let both count from one zero."
+        )
     time, state, yaw = _samples(pieces, first, last)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    _put_extremes(record, mission, pieces)
+    spans = [(begin - zero, end - zero) for begin, end in spans]
+    _put_extremes(record, mission, pieces, spans)
     if pieces.position.shape[-1] < 3:  # lines turn at once at samples
         state[2:] = np.nan
-    return _result(mission, record, time, state, yaw, interpolation, names)
+    result = _result(mission, record, time, state, yaw, interpolation, names, spans)
+    result.statistics["clock"] = zero
+    return result
 
 
 def of_curves(
-    curves: Sequence[Curve], interpolation: str, *, names: Sequence[str] = (), **judged: Any
+    curves: Sequence[Curve],
+    interpolation: str,
+    *,
+    names: Sequence[str] = (),
+    away: bool = False,
+    **judged: Any,
 ) -> Result:
     """A result of curves with times of their own; before and after its own, a vehicle stays where it is.
 
@@ -325,6 +344,7 @@ def of_curves(
     ----------
     interpolation, judged : see `of_pieces`
     names : of the vehicles, where they come from
+    away : a vehicle is not judged before and after its own times
 
     Raises
     ------
@@ -350,7 +370,16 @@ def of_curves(
             stay = curve.at(np.array([np.clip(at, curve.time[0], curve.time[-1])]))[0, :3]
             position[outside, i, :, 0] = stay
         yaw[:, i] = curve.at(np.clip(time, curve.time[0], curve.time[-1]))[:, 3]
-    return of_pieces(Pieces(time, position, yaw), interpolation, names=names, **judged)
+    ends = np.array([c.time[[0, -1]] for c in curves])
+    spans = time[np.searchsorted(time, ends - 2.0 * _SAME)].tolist()
+    away &= bool(np.ptp(spans, axis=0).any())
+    return of_pieces(
+        Pieces(time, position, yaw),
+        interpolation,
+        names=names,
+        spans=spans if away else (),
+        **judged,
+    )
 
 
 def _bounded(n: int, times: int) -> None:
@@ -402,8 +431,13 @@ def _samples(pieces: Pieces, first: Floats, last: Floats) -> tuple[Floats, Float
     return time, state, pieces.yaw[k]
 
 
-def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces) -> None:
-    """Give the phase the extremes of the curves, in continuous time."""
+def _put_extremes(
+    record: PhaseRecord,
+    mission: Mission,
+    pieces: Pieces,
+    spans: Sequence[tuple[float, float]],
+) -> None:
+    """Give the phase the extremes of the curves, in continuous time, of each vehicle from when to when it is there."""
     n = mission.n_agents
     extremes = Extremes(mission)
     r, v = (
@@ -417,11 +451,16 @@ def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces) -> None
     powers = pieces.position.shape[-1]
     together = max(1, _TOGETHER // (n * 3 * powers))
     row, best = 0, {}
+    here = there(0.5 * (pieces.time[:-1] + pieces.time[1:]), spans, n)
     for begin in range(0, len(pieces.position), together):
         c = pieces.position[begin : begin + together]
         t, h = pieces.time[begin : begin + len(c)], np.diff(pieces.time[begin : begin + len(c) + 1])
         for k, parts in enumerate(_parts(c, h)):
-            for part in range(parts):
+            if (here[begin + k] != extremes.left).any():
+                _take(extremes, problem, work, state, row)
+                row = 0
+                extremes.only(here[begin + k])
+            for part in range(parts if here[begin + k].any() else 0):
                 width = h[k] / parts
                 x = part * width + width * records.KNOTS
                 x = series.of_polynomials(np.broadcast_to(c[k], (5, *c[k].shape)), x, 2)
@@ -435,6 +474,8 @@ def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces) -> None
                     row = 0
         _accelerations(best, c, t, h, directed=extremes.directed)
     _take(extremes, problem, work, state, row)
+    if spans:
+        extremes.only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(extremes.phase())
     extremes.flight([record])
     record.extremes.update(best)
@@ -487,10 +528,11 @@ def _result(
     yaw: Floats,
     interpolation: str,
     names: Sequence[str],
+    spans: Sequence[tuple[float, float]],
 ) -> Result:
     r, v, a, j = state
     k, n = r.shape[:2]
-    left = np.ones((k, n), dtype=np.bool_)
+    left = there(time, spans, n)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
     close = proximity.Closeness._make(x.copy() for x in close)
     nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
@@ -522,5 +564,6 @@ def _result(
         edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
         separation=close.separation, separation_pair=close.pair, clearance=close.clearance,
         clearance_agent=close.agent, clearance_obstacle=close.obstacle, **unknown, phases=[record],
-        mission_text=mission.text, statistics={"interpolation": interpolation, "names": list(names)},
+        mission_text=mission.text,
+        statistics={"interpolation": interpolation, "names": list(names), "spans": list(spans)},
     )  # fmt: skip
