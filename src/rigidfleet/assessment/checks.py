@@ -55,6 +55,7 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
     worst = verdict.worst
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
+        yield from _flying(measured)
         yield from _failures_or_worst(_as_planned(measured, verdict.phases))
     elif (
         measured.result.interpolation is not None and measured.mission.limits.separation is not None
@@ -320,7 +321,7 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
 
 
 def _separation(measured: Measurements, e: Extreme) -> CheckResult:
-    limit = measured.mission.limits.separation or 0.0
+    limit = measured.mission.limits.separation_always or 0.0
     passed = e.value > 0 and e.value >= limit - SLACK
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
@@ -328,6 +329,22 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
         words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
         words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
     return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
+
+
+def _flying(measured: Measurements) -> Iterator[CheckResult]:
+    """Check the separation of agents of which one is at the altitude from which on it holds."""
+    limits = measured.mission.limits
+    if limits.separation is None or limits.separation_altitude is None:
+        return
+    e, above = measured.worst("separation_flying", None, lambda x: -x), limits.separation_altitude
+    near = f"no agents come within {limits.separation:g} m of each other" if e is None else ""
+    if e is not None:
+        near = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+    words = f"{near} with one at z = {above:g} m or above (limit {limits.separation:g} m)"
+    passed = e is None or e.value >= limits.separation - SLACK
+    yield bounded(
+        "separation_flying", e, "m", limits.separation, words, passed=passed, at_least=True
+    )
 
 
 def _alone(measured: Measurements) -> CheckResult:

@@ -25,6 +25,7 @@ _PRAISE = {
     "shape": "shapes are within {worst}",
     "waypoint_position": "waypoints are met within {worst}",
     "separation": "agents stay {worst} apart",
+    "separation_flying": "{worst} in flight",
     "clearance": "obstacles stay {worst} away in flight",
     "clearance_start": "agents start {worst} above an obstacle",
     "clearance_end": "agents land {worst} above an obstacle",

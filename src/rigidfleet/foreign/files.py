@@ -325,7 +325,8 @@ def _check_samples(
         if gaps == "refuse" and steps[k] > _LONGEST * usual:
             raise TrajectoryError(
                 f"{source}: {name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, "
-                f"{steps[k] / usual:.0f} times its usual step. Give the samples, or let the curve bridge the gap: `assess --gaps bridge`."
+                f"{steps[k] / usual:.0f} times its usual step. Give the samples, or let the curve bridge the gap: "
+                "`assess --gaps bridge`."
             )
 
 

@@ -287,6 +287,43 @@ def lowest_overlap(points, reach, floor, pieces):
 
 
 @compiled
+def shortest_above(curve, own, other, altitude, floor, pieces):
+    """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
+    best, at, top, count, close, rate = floor, -1.0, 0, 0, CLOSE, 0.0
+    for k in range(5):
+        for q in range(3):
+            pieces[0, 3 * k + q] = curve[k, q]
+            close = max(close, _ROUNDING * abs(curve[k, q]))
+        if k > 0:
+            rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    while top >= 0:
+        piece, count = pieces[top], count + 1
+        high, along, middle = -math.inf, math.inf, 0.0
+        for q in range(3):
+            middle += piece[6 + q] * piece[6 + q]
+        middle = math.sqrt(middle)
+        for k in range(5):
+            dot, far = 0.0, 0.0
+            for q in range(3):
+                dot += piece[6 + q] * piece[3 * k + q]
+                far += piece[3 * k + q] * piece[3 * k + q]
+            along = min(along, dot)
+            if k % 4 == 0:
+                x = piece[15] + (piece[16] if k == 4 else 0.0)
+                z = max(point_at(own, x)[2], point_at(other, x)[2])
+                high = max(high, z)
+                if z >= altitude and math.sqrt(far) < best:
+                    best, at = math.sqrt(far), x
+        # Between its ends, a height rises above the higher one by at most half of its greatest change.
+        bound = max(along / middle, 0.0) if middle > 0.0 else 0.0
+        if high + 2.0 * rate * piece[16] < altitude:
+            bound = math.inf
+        best, at, top = refine(bound, best, at, close, count, top, pieces)
+    return best, at
+
+
+@compiled
 def weights(x, out):
     """Bernstein polynomials (5,) of fourth degree at x."""
     y = 1.0 - x

@@ -55,7 +55,7 @@ class _Named(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What a file gives: rows of numbers (of trajectories: of each vehicle), colours of points if it has them, notes."""
+    """What a file gives: rows of numbers (of trajectories: of each vehicle), colours of points if any, and notes."""
 
     rows: list[Any]
     colours: tuple[str, ...] | None = None

@@ -36,7 +36,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on the minimum separation, and on each change of formation in which paths cross."""
     if mission.n_agents < 2:
         return
-    radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
+    radius, limit = mission.fleet.radius, mission.limits.separation_always or 0.0
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
@@ -72,6 +72,21 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 "" if exact else "; straight paths are assumed, as only distances guide the agents"
             )
             yield Remark("fails" if exact else "note", "collision", text + guess)
+
+
+def flying_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+    """Remarks on agents that come too close where both are at the altitude from which on separation holds."""
+    limit, altitude = mission.limits.separation or 0.0, mission.limits.separation_altitude
+    if altitude is None or mission.n_agents < 2:
+        return
+    for planned in found.planned_phases:
+        flying = planned.position[..., 2] >= altitude
+        near, pairs = proximity.separation_of_left(planned.position, mission.fleet.radius, flying)
+        k = int(near.argmin())
+        if near[k] < limit - SLACK:
+            who, t = tuple(pairs[k].tolist()), float(planned.time[k])
+            text = _near(who, float(near[k]), t, planned.phase, limit, exact=planned.exact)
+            yield Remark("fails" if planned.exact else "note", "collision", text)
 
 
 def _near(

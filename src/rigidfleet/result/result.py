@@ -665,7 +665,9 @@ _CHECKED = {
 }
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
-_LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))
+_LEAST = frozenset(
+    ("separation", "separation_below", "separation_flying", "lost", "lowest", "guarantee")
+)
 
 
 def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:

@@ -51,6 +51,7 @@ _NAMES = {
     "separation": records.SEPARATION,
     "lost": records.LOST,
     "separation_below": records.SEPARATION_BELOW,
+    "separation_flying": records.SEPARATION_FLYING,
     "clearance": records.CLEARANCE,
     "geofence": records.GEOFENCE,
     "lowest": records.LOWEST,
@@ -115,11 +116,18 @@ class Extremes:
         self._take_obstacles(mission.obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
+        self.altitude = (
+            math.inf if limits.separation_altitude is None else limits.separation_altitude
+        )
         self.stacks = self.n <= _FEW or limits.separation_below is not None
         #: Whether there are limits by direction: only then is what they limit searched for.
         self.directed = any(getattr(limits, name) is not None for name in DIRECTIONS)
         count = records.QUANTITIES
         self.none = np.full(count, np.inf)
+        # Of a large fleet, pairs are listed that come as near as the limit: what is beyond it is not known.
+        self.reach = limits.separation or 0.0 if self.altitude < math.inf else -math.inf
+        if self.n > _FEW and self.altitude < math.inf:
+            self.none[records.SEPARATION_FLYING] = self.reach
         self.none[records.HORIZONTAL_SPEED :] = np.inf if self.directed else -np.inf
         self.worst, self.when = self.none.copy(), np.zeros(count)
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
@@ -212,8 +220,8 @@ class Extremes:
             found = records.monitor(
                 self.radius, self.boxes, self.fence, size[1], gauge,
                 worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
-                standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-                struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
+                standing=self.standing, low=self.low, pad=PAD, altitude=self.altitude, pairs=self.pairs,
+                columns=self.columns, struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
             )  # fmt: skip
             self.monitor = native.Watch(found)
             if aside:
@@ -451,11 +459,12 @@ class Extremes:
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
+        none = self.none.tolist()
         new = tuple.__new__  # an extremum by its own name takes twice as long
         found = {
             name: new(Extremum, (sign * worst[k], when[k], *who[k]))
             for name, k, sign in _STORED
-            if -math.inf < worst[k] < math.inf
+            if -math.inf < worst[k] < none[k]
         }
         if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
             found["tension"] = tension._replace(value=-tension.value)
@@ -564,6 +573,7 @@ class Extremes:
         size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
         spare = max(_SPARE * float(np.median(near[:, 1])), _LEAST * size, 1.01 * moves, 1e-6)
         least = min(float(separations.min()), float(self.worst[records.SEPARATION]))
+        least = max(least, self.reach)
         pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
         self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
         if self.stacks:
