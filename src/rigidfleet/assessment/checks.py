@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -52,21 +54,19 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
         *_touch_downs(measured, verdict.phases),
     ]
     yield from _failures_or_worst(candidates)
-    worst = verdict.worst
+    worst, limits = verdict.worst, measured.mission.limits
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
-        yield from _flying(measured)
+        if limits.separation is not None and limits.separation_altitude is not None:
+            yield _flying(measured, limits.separation, limits.separation_altitude)
         yield from _failures_or_worst(_as_planned(measured, verdict.phases))
-    elif (
-        measured.result.interpolation is not None and measured.mission.limits.separation is not None
-    ):
-        yield _alone(measured)
+    elif limits.separation is not None and measured.result.interpolation is not None:
+        yield _alone(limits.separation, measured.result.n_agents)
     if "clearance" in worst:
         yield from _clearances(measured)
     if not measured.left.all() and measured.mission.first_loss < math.inf:
         yield _lost(measured)
     yield from abandoned(measured)
-    limits = measured.mission.limits
     if limits.separation_below is not None:
         yield _downwash(measured, limits.separation_below)
     if limits.geofence is not None:
@@ -96,6 +96,15 @@ def _failures_or_worst(candidates: Iterable[CheckResult]) -> Iterator[CheckResul
     for found in by_check.values():
         failed = [finding for finding in found if not finding.passed]
         yield from failed or [max(found, key=lambda f: (f.worst or 0.0) / (f.limit or 1.0))]
+
+
+def _beyond_or_greatest(every: list[tuple[Any, ...]], limit: float) -> list[tuple[Any, ...]]:
+    """Those whose first number is beyond a limit, or else the one whose first number is greatest.
+
+    Words are written for these alone: a flight has many waypoints and phases, and few fail.
+    """
+    greatest = max(every, key=itemgetter(0), default=(-math.inf,))
+    return [x for x in every if x[0] > limit] if greatest[0] > limit else [greatest][: len(every)]
 
 
 def _complete(result: Result) -> CheckResult:
@@ -252,9 +261,8 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = UNITS[name]
-        for p, what, at in points:
-            if (miss := getattr(at, name)) is None:
-                continue
+        misses = [(m, *point) for point in points if (m := getattr(point[2], name)) is not None]
+        for miss, p, what, at in _beyond_or_greatest(misses, limit):
             passed = miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -331,47 +339,42 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
 
 
-def _flying(measured: Measurements) -> Iterator[CheckResult]:
+def _flying(measured: Measurements, limit: float, altitude: float) -> CheckResult:
     """Check the separation of agents of which one is at the altitude from which on it holds."""
-    limits = measured.mission.limits
-    if limits.separation is None or limits.separation_altitude is None:
-        return
-    e, above = measured.worst("separation_flying", None, lambda x: -x), limits.separation_altitude
-    near = f"no agents come within {limits.separation:g} m of each other" if e is None else ""
+    e, words = measured.worst("separation_flying", None, lambda x: -x), "no two agents come as near"
     if e is not None:
-        near = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
-    words = f"{near} with one at z = {above:g} m or above (limit {limits.separation:g} m)"
-    passed = e is None or e.value >= limits.separation - SLACK
-    yield bounded(
-        "separation_flying", e, "m", limits.separation, words, passed=passed, at_least=True
-    )
+        words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+    words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
+    passed = e is None or e.value >= limit - SLACK
+    return bounded("separation_flying", e, "m", limit, words, passed=passed, at_least=True)
 
 
-def _alone(measured: Measurements) -> CheckResult:
+def _alone(limit: float, n: int) -> CheckResult:
     """Fail a separation that was asked for where there is no second vehicle."""
-    one = measured.result.n_agents == 1
-    words = "is one vehicle alone" if one else "are never two vehicles at one time"
+    words = "is one vehicle alone" if n == 1 else "are never two vehicles at one time"
     words = (
-        f"separation cannot be judged: there {words}. Give the other vehicles, name the column that tells which vehicle"
-        " a row is of, or ask for no separation"
+        f"separation cannot be judged (limit {limit:g} m): there {words}. Give the other vehicles, name the column that"
+        " tells which vehicle a row is of, or ask for no separation"
     )
-    return CheckResult("separation", False, words, None, measured.mission.limits.separation, "m")
+    return CheckResult("separation", False, words, None, limit, "m")
 
 
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
     allowed = measured.mission.limits.separation_allowance
-    for record, phase in zip(measured.result.phases, phases, strict=True):
-        e = phase.worst.get("separation")
-        if record.planned is None or e is None:
-            continue
-        planned = record.planned["separation"]
+    every = [
+        (record.planned["separation"] - phase.worst["separation"].value, record, phase)
+        for record, phase in zip(measured.result.phases, phases, strict=True)
+        if record.planned is not None and "separation" in phase.worst
+    ]
+    for off, record, phase in _beyond_or_greatest(every, allowed):
+        e, planned = phase.worst["separation"], (record.planned or {})["separation"]
         words = (
             f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
             f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
         )
-        off = replace(e, value=planned - e.value)
-        yield bounded("separation_as_planned", off, "m", allowed, words)
+        e = replace(e, value=off)
+        yield bounded("separation_as_planned", e, "m", allowed, words)
 
 
 def _clearances(measured: Measurements) -> Iterator[CheckResult]:

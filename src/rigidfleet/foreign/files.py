@@ -17,8 +17,8 @@ import numpy as np
 from rigidfleet._common.files import why_not
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.math.piecewise import Piecewise
 
 __all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]
 
@@ -52,7 +52,7 @@ class Trajectories(NamedTuple):
     """
 
     names: tuple[str, ...]
-    curves: tuple[Curve, ...]
+    curves: tuple[Piecewise, ...]
     assumed: str
     notes: tuple[str, ...] = ()
     away: bool = False
@@ -121,8 +121,7 @@ def read_trajectories(
     exact = parts[0].assumed in (texts.POLYNOMIALS, shows.BEZIER)
     away = spans == "away" or not (exact or spans == "stand")
     if not exact:
-        _check_samples(names, curves, sources, spans, gaps)
-        notes += _gaps(names, curves, away=away) + _frozen(names, curves)
+        notes += _doubts(names, curves, sources, spans, gaps, away=away)
     notes += _spans(names, curves, away=away)
     return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes), away)
 
@@ -192,10 +191,6 @@ def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
         if rest
         else []
     )
-    numbers = sorted(x for (p, *_) in listed if p.parent == path for x in _numbers(p)[-1:])
-    lacking = set(range(numbers[0], numbers[-1])) - set(numbers) if len(numbers) > 2 else set()
-    if lacking and len(lacking) < len(numbers):
-        notes.append(f"of '{path.name}', no file has the number {_some(sorted(lacking))}")
     return notes
 
 
@@ -244,7 +239,7 @@ def _of_sequence(group: list[Path], interpolation: Interpolation) -> Trajectorie
             raise TrajectoryError(f"{path}: is of another kind than {group[0]}.")
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
-        curve = Curve(time, np.concatenate([curve.pieces, after.pieces]))
+        curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
     return Trajectories((group[0].parent.name,), (curve,), first.assumed)
 
 
@@ -275,7 +270,7 @@ def _of_file(path: Path, interpolation: Interpolation) -> Trajectories:
     return read
 
 
-def _check_size(name: str, who: str, curve: Curve) -> None:
+def _check_size(name: str, who: str, curve: Piecewise) -> None:
     """Refuse numbers with which no distance can be computed.
 
     Raises
@@ -301,101 +296,87 @@ def _check_size(name: str, who: str, curve: Curve) -> None:
         )
 
 
-def _check_samples(
-    names: Sequence[str], curves: Sequence[Curve], sources: Sequence[Path], spans: Spans, gaps: Gaps
-) -> None:
-    """Refuse samples that leave open where a vehicle is, unless a word for it was given.
+def _doubts(
+    names: Sequence[str],
+    curves: Sequence[Piecewise],
+    sources: Sequence[Path],
+    spans: Spans,
+    gaps: Gaps,
+    *,
+    away: bool,
+) -> list[str]:
+    """Notes on where samples leave open what a vehicle does: gaps, and a standstill that may be one.
 
     Raises
     ------
     TrajectoryError
-        A vehicle begins or ends by more than its usual step after or before others, or lacks samples in between.
+        A vehicle begins or ends by more than its usual step after or before others, or has a long gap, and ``spans``
+        or ``gaps`` do not say what that is.
     """
     begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
-    for name, curve, source in zip(names, curves, sources, strict=True):
+    holes: list[tuple[float, int, int]] = []
+    frozen: list[str] = []
+    for i, (name, curve, source) in enumerate(zip(names, curves, sources, strict=True)):
         steps, (first, last) = np.diff(curve.time), curve.time[[0, -1]]
-        usual = float(np.median(steps)) * (1.0 + _ROUNDING)
-        if spans == "refuse" and max(first - begin, end - last) > usual:
+        shares = steps / (np.median(steps) * (1.0 + _ROUNDING))
+        if spans == "refuse" and max(first - begin, end - last) * shares[0] > steps[0]:
             raise TrajectoryError(
                 f"{source}: {name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s. "
                 "Give all vehicles the same span of time, or say what it does before and after: `assess --spans stand` "
                 "or `--spans away`."
             )
-        k = int(steps.argmax())
-        if gaps == "refuse" and steps[k] > _LONGEST * usual:
+        k = int(shares.argmax())
+        if gaps == "refuse" and shares[k] > _LONGEST:
             raise TrajectoryError(
                 f"{source}: {name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, "
-                f"{steps[k] / usual:.0f} times its usual step. Give the samples, or let the curve bridge the gap: "
-                "`assess --gaps bridge`."
+                f"{shares[k]:.0f} times its usual step. Give its samples, or let the curve bridge the gap: `assess "
+                "--gaps bridge`."
             )
-
-
-def _gaps(names: Sequence[str], curves: Sequence[Curve], *, away: bool) -> list[str]:
-    """Notes on the longest gaps between samples, with the least distance of another vehicle there."""
-    every = [
-        (step / usual, i, k)
-        for i, curve in enumerate(curves)
-        for steps in [np.diff(curve.time)]
-        for usual in [np.median(steps)]
-        for k in np.flatnonzero(steps > _NOTED * usual).tolist()
-        for step in [steps[k]]
-    ]
-    notes = []
-    for share, i, k in sorted(every, key=lambda gap: -gap[0])[:_LISTED]:
-        start, end = curves[i].time[k : k + 2]
-        words = f"{names[i]!r} has no sample between {start:g} and {end:g} s, {share:.3g} times its usual step: its"
-        words += " curve is assumed there"
-        t = np.linspace(start, end, 101)
-        nearest = np.inf, 0.0, ""
-        for name, other in zip(names, curves, strict=True):
-            if other is not curves[i]:
-                inside = np.clip(t, other.time[0], other.time[-1])
-                far = np.linalg.norm((other.at(inside) - curves[i].at(t))[:, :3], axis=1)
-                far = np.where((inside == t) | (not away), far, np.inf)
-                nearest = min(nearest, (far.min(), t[far.argmin()], name))
-        if nearest[0] < np.inf:
-            far, when, name = nearest
-            words += f", {far:.3g} m from {name!r} at {when:.3g} s, centre to centre"
-        notes.append(words)
-    more = len(every) - len(notes)
-    return [*notes, f"{more:,} shorter gaps between samples are bridged, too"] if more else notes
-
-
-def _frozen(names: Sequence[str], curves: Sequence[Curve]) -> list[str]:
-    """A note on a vehicle that stands still to the last digit between moves that begin and end at once."""
-    every = []
-    for name, curve in zip(names, curves, strict=True):
+        holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
         moves = np.linalg.norm(np.diff(curve.at(curve.time)[:, :3], axis=0), axis=1)
         moving = np.flatnonzero(moves > 1e-9)
         fast = moves[moving] > 0.5 * np.median(moves[moving]) if len(moving) else moving > 0
         for k in np.flatnonzero((np.diff(moving) > _REPEATED) & fast[:-1] & fast[1:]).tolist():
-            start, end = curve.time[moving[k] + 1], curve.time[moving[k + 1]]
-            every.append(f"{name!r} from {start:g} to {end:g} s")
-    if not every:
-        return []
-    return [
-        f"positions repeat to the last digit between moves, {_some(every)}: a hold, or a tracker that lost sight of it"
-    ]
+            start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]
+            frozen.append(f"{name!r} from {start:g} to {stop:g} s")
+    notes = []
+    for share, i, k in sorted(holes, reverse=True)[:_LISTED]:
+        t = np.linspace(*curves[i].time[k : k + 2], 101)
+        place, nearest = curves[i].at(t)[:, :3], (np.inf, 0.0, "")
+        for name, other in zip(names, curves, strict=True):
+            if other is not curves[i]:
+                inside = np.clip(t, *other.time[[0, -1]])
+                far = np.linalg.norm(other.at(inside)[:, :3] - place, axis=1)
+                far[(inside != t) & away] = np.inf
+                nearest = min(nearest, (float(far.min()), float(t[far.argmin()]), name))
+        words = f"{names[i]!r} has no sample between {t[0]:g} and {t[-1]:g} s, {share:.3g} times its usual step: its"
+        words += " curve is assumed there"
+        if nearest[0] < np.inf:
+            words += (
+                f", {nearest[0]:.3g} m from {nearest[2]!r} at {nearest[1]:.3g} s, centre to centre"
+            )
+        notes.append(words)
+    if len(holes) > _LISTED:
+        notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
+    if frozen:
+        words = f"positions repeat to the last digit between moves, {_some(frozen)}"
+        notes.append(f"{words}: a hold, or a tracker that lost sight of it")
+    return notes
 
 
-def _spans(names: Sequence[str], curves: Sequence[Curve], *, away: bool) -> list[str]:
-    """Notes if vehicles begin or end at different times."""
-    starts = np.array([curve.time[0] for curve in curves])
-    ends = np.array([curve.time[-1] for curve in curves])
+def _spans(names: Sequence[str], curves: Sequence[Piecewise], *, away: bool) -> list[str]:
+    """A note if vehicles begin or end at different times."""
+    starts, ends = np.array([curve.time[[0, -1]] for curve in curves]).T
     begin, end = starts.min(), ends.max()
-    if np.ptp(ends) <= 1e-6 and np.ptp(starts) <= 1e-6:
-        return []
-    if not away:
-        return [
-            f"vehicles begin between {begin:g} and {starts.max():g} s and end between {ends.min():g} and {end:g} s; "
-            "each stays at its first and last place outside of its time"
-        ]
     part = [
         f"{name!r} from {a:.9g} to {b:.9g} s"
         for name, a, b in zip(names, starts, ends, strict=True)
         if max(a - begin, end - b) > 1e-6
     ]
-    apart = int(np.searchsorted(np.sort(starts), ends, side="right").sum())
-    apart = len(names) ** 2 - apart
+    if not part:
+        return []
+    if not away:
+        return [f"{_some(part)}: each stays at its first and last place outside of its time"]
+    apart = len(names) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
     never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
     return [f"vehicles are judged only where they have data: {_some(part)}{never}"]

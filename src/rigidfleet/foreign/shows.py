@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import Curve, with_headings
-from rigidfleet.math.bernstein import of_bernstein
+from rigidfleet.foreign.curves import with_headings
+from rigidfleet.math.piecewise import Piecewise
 
 #: What is between the points of a show.
 BEZIER = "the Bezier curves of the show"
@@ -25,12 +25,12 @@ BEZIER = "the Bezier curves of the show"
 #: segment.
 _BYTES, _ENTRY, _INNER = 512 << 20, 64 << 20, 6
 #: Memory [bytes] of the objects of CPython for which a character of JSON may stand (a list, a dictionary, a key, a
-#: number, half a text), and the greatest sum for an entry; the greatest number of coefficients of a show.
+#: number, half a text), and the greatest sum for an entry; the greatest number of coefficients of all curves.
 _BECOMES, _MEMORY = {b"[": 88, b"{": 64, b":": 120, b",": 32, b'"': 33}, 320 << 20
-_NUMBERS = 1 << 25
+_COEFFICIENTS = 1 << 25
 
 
-def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
     """Names and curves of the drones of a show, in the show's time and axes.
 
     Raises
@@ -56,14 +56,14 @@ def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...
         ) from None
 
 
-def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
     show = _json(archive, "show.json", name)
     drones = _get(show, "swarm.drones", list, f"{name}: show.json")
     if not drones:
         raise TrajectoryError(f"{name}: show.json: has no drones.")
     names: list[str] = []
-    curves: list[Curve] = []
-    numbers = 0
+    curves: list[Piecewise] = []
+    room = _COEFFICIENTS
     for k, drone in enumerate(drones, 1):
         where = f"{name}: show.json: drone {k}"
         settings = _get(drone, "settings", dict, where)
@@ -75,11 +75,9 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
         yaw = settings.get("yawControl")
         turned = None if yaw is None else _resolved(archive, yaw, name, f"{where}: yawControl")
         curves.append(_curve(trajectory, turned, f"{name}: {names[-1]}"))
-        numbers += curves[-1].pieces.size
-        if numbers > _NUMBERS:
-            raise TrajectoryError(
-                f"{where}: there are more than {_NUMBERS:,} coefficients. Give fewer points or drones."
-            )
+        room -= curves[-1].pieces.size
+        if room < 0:
+            raise TrajectoryError(f"{where}: is too much beside those before. Give fewer points.")
     if len(set(names)) < len(names):
         names = [f"{who} ({k})" for k, who in enumerate(names, 1)]
     return tuple(names), tuple(curves)
@@ -89,8 +87,7 @@ def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
     try:
         size = archive.getinfo(entry).file_size
         data = archive.read(entry) if size <= _ENTRY else b""
-        memory = sum(data.count(mark) * each for mark, each in _BECOMES.items())
-        if size > _ENTRY or memory > _MEMORY:
+        if size > _ENTRY or sum(data.count(x) * each for x, each in _BECOMES.items()) > _MEMORY:
             raise TrajectoryError(
                 f"{name}: {entry}: has {size >> 20:,} MiB, more than a show needs. Give each drone an entry of its own."
             )
@@ -134,7 +131,7 @@ def _resolved(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> di
     return found
 
 
-def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Curve:
+def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Piecewise:
     points = _get(trajectory, "points", list, where)
     if not points:
         raise TrajectoryError(f"{where}: its trajectory has no points.")
@@ -166,9 +163,9 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
     for k, ((begin, end), between) in enumerate(zip(pairwise(ends), inner, strict=True)):
         middle = _floats(between or np.zeros((0, 3)), (None, 3), lambda k=k: told(k + 1))
         control = np.vstack([begin, middle, end])
-        for axis in range(3):
-            pieces[k, axis, : len(control)] = of_bernstein(control[:, axis], time[k + 1] - time[k])
-    curve = Curve(time + start, pieces)
+        piece = Piecewise.of_bernstein(time[k : k + 2], control.T[None])
+        pieces[k, :3, : len(control)] = piece.pieces[0]
+    curve = Piecewise(time + start, pieces)
     if yaw is None:
         pieces[:, 3] = np.nan
         return curve

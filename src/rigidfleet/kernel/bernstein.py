@@ -299,22 +299,17 @@ def shortest_above(curve, own, other, altitude, floor, pieces):
     pieces[0, 15], pieces[0, 16] = 0.0, 1.0
     while top >= 0:
         piece, count = pieces[top], count + 1
-        high, along, middle = -math.inf, math.inf, 0.0
-        for q in range(3):
-            middle += piece[6 + q] * piece[6 + q]
-        middle = math.sqrt(middle)
+        a, b, c = piece[6], piece[7], piece[8]
+        middle, along, high = math.sqrt(a * a + b * b + c * c), math.inf, -math.inf
         for k in range(5):
-            dot, far = 0.0, 0.0
-            for q in range(3):
-                dot += piece[6 + q] * piece[3 * k + q]
-                far += piece[3 * k + q] * piece[3 * k + q]
-            along = min(along, dot)
+            u, v, w = piece[3 * k], piece[3 * k + 1], piece[3 * k + 2]
+            along = min(along, a * u + b * v + c * w)
             if k % 4 == 0:
-                x = piece[15] + (piece[16] if k == 4 else 0.0)
+                x, far = piece[15] + 0.25 * k * piece[16], math.sqrt(u * u + v * v + w * w)
                 z = max(point_at(own, x)[2], point_at(other, x)[2])
                 high = max(high, z)
-                if z >= altitude and math.sqrt(far) < best:
-                    best, at = math.sqrt(far), x
+                if z >= altitude and far < best:
+                    best, at = far, x
         # Between its ends, a height rises above the higher one by at most half of its greatest change.
         bound = max(along / middle, 0.0) if middle > 0.0 else 0.0
         if high + 2.0 * rate * piece[16] < altitude:

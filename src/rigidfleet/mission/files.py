@@ -22,9 +22,8 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
-from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.curves import curve_to_rows, least_jerk
 from rigidfleet.foreign.files import files_of, read_trajectories
-from rigidfleet.foreign.pieces import curve_to_rows, smoothed
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.formation.point_files import parse_points, read_bytes
 from rigidfleet.mission import bounds
@@ -214,29 +213,17 @@ def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
         raise _unread(name, "", error) from None
     curves, notes = [*found.curves], [*found.notes]
     begin, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
-    if found.assumed not in ASSUMED.values():
-        begin = min(c.time[0] for c in curves)
-        curves = [_waiting(c, begin) for c in curves]
-    else:
+    if found.assumed in ASSUMED.values():
         if any((c.time[[0, -1]] != (begin, end)).any() for c in curves):
-            notes.append(
-                f"only the time from {begin:g} to {end:g} s, of which all have data, is flown"
-            )
-        curves = [smoothed(c.cut(begin, end)) for c in curves]
-    curves = [c.later(-begin) for c in curves]
+            notes.append(f"only the time of which all have data is flown, {begin:g} to {end:g} s")
+        curves = [least_jerk(c.between(begin, end)) for c in curves]
+    else:
+        begin = min(c.time[0] for c in curves)
+        curves = [c.on(np.union1d(begin, c.time), stays=True) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         raise unread(name, "has no yaw", "remove yaw = 'file', or give a file with a yaw")
-    rows = [curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves]
+    rows = [curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves]
     return Content(rows, notes=notes)
-
-
-def _waiting(curve: Curve, begin: float) -> Curve:
-    """A curve that stands where it begins from a time [s] on."""
-    if curve.time[0] - begin < 1e-6:
-        return curve
-    still = curve.pieces[:1].copy()
-    still[..., 1:] = 0.0
-    return Curve(np.append(begin, curve.time), np.concatenate([still, curve.pieces]))
 
 
 def _heights(data: bytes, name: str) -> Content:

@@ -28,7 +28,6 @@ from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
-    flying_remarks,
     limit_remarks,
     separation_remarks,
     thrust_remarks,
@@ -79,7 +78,6 @@ def check(
         *gain_remarks(mission, found),
         *margin_remarks(found),
         *separation_remarks(mission, found),
-        *flying_remarks(mission, found),
         *downwash_remarks(mission, found),
         *assignment_remarks(mission, found),
         *thrust_remarks(mission, found),

@@ -36,13 +36,20 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on the minimum separation, and on each change of formation in which paths cross."""
     if mission.n_agents < 2:
         return
-    radius, limit = mission.fleet.radius, mission.limits.separation_always or 0.0
+    radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
+    lowest = mission.limits.separation_altitude
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
         ends: list[tuple[float, float, tuple[int, ...]]] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
-        separations, pairs = proximity.separation(positions, radius)
+        # Where separation begins at an altitude, agents below it are left to the verdict.
+        flying = (
+            np.ones(positions.shape[:2], np.bool_)
+            if lowest is None
+            else positions[..., 2] >= lowest
+        )
+        separations, pairs = proximity.separation_of_left(positions, radius, flying)
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         bent = planned.leg.reference.knots
@@ -54,7 +61,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             separation, who = certificate.separation, certificate.agents
             crossing = separation, certificate.time, who
             least = min(least, crossing)
-            beyond = separation <= 0 or separation < limit - SLACK
+            beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
             if beyond and separation < min(ends)[0] - SLACK:
                 yield _crossing(mission, planned, crossing, limit)
         for k, at in enumerate(ends):
@@ -72,21 +79,6 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 "" if exact else "; straight paths are assumed, as only distances guide the agents"
             )
             yield Remark("fails" if exact else "note", "collision", text + guess)
-
-
-def flying_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
-    """Remarks on agents that come too close where both are at the altitude from which on separation holds."""
-    limit, altitude = mission.limits.separation or 0.0, mission.limits.separation_altitude
-    if altitude is None or mission.n_agents < 2:
-        return
-    for planned in found.planned_phases:
-        flying = planned.position[..., 2] >= altitude
-        near, pairs = proximity.separation_of_left(planned.position, mission.fleet.radius, flying)
-        k = int(near.argmin())
-        if near[k] < limit - SLACK:
-            who, t = tuple(pairs[k].tolist()), float(planned.time[k])
-            text = _near(who, float(near[k]), t, planned.phase, limit, exact=planned.exact)
-            yield Remark("fails" if planned.exact else "note", "collision", text)
 
 
 def _near(

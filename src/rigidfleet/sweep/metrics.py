@@ -82,6 +82,10 @@ METRICS: dict[str, Metric] = {
 }
 
 
+#: Metrics that are the worst values of checks.
+_OF_CHECKS = "separation_below", "separation_flying", "geofence", "thrust", "tilt", *DIRECTIONS
+
+
 def readable(unit: str) -> str:
     """A unit for display: m/s² for m s-2."""
     words = {"1": "-", "m s-1": "m/s", "m s-2": "m/s²", "deg s-1": "deg/s"}
@@ -111,14 +115,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     for f in verdict.checks:
         if f.worst is None:
             continue
-        if f.check in (
-            "separation_below",
-            "separation_flying",
-            "geofence",
-            "thrust",
-            "tilt",
-            *DIRECTIONS,
-        ):
+        if f.check in _OF_CHECKS:
             worst[f.check] = f.worst
         elif f.check == "rotor_force" and f.limit is not None:
             worst["rotor_share"] = f.worst / f.limit
