@@ -88,9 +88,15 @@ def read_lines(data: bytes, name: str) -> tuple[list[str], str, list[str], list[
 
 
 def numbers(
-    rows: list[str], lines: list[int], comma: str, names: list[str], which: list[int], name: str
+    rows: list[str],
+    lines: list[int],
+    comma: str,
+    names: list[str],
+    which: list[int],
+    name: str,
+    blank: Collection[int] = (),
 ) -> Floats:
-    """The numbers (K, len(which)) of some columns, all finite.
+    """The numbers (K, len(which)) of some columns, all finite; of the ``blank`` ones, empty fields are NaN.
 
     Raises
     ------
@@ -107,6 +113,8 @@ def numbers(
         fields = row.split(comma)
         for k in which:
             told = fields[k].strip()
+            if k in blank and told.lower() in ("", "nan"):
+                continue
             try:
                 # Python alone groups digits by "_".
                 fine = math.isfinite(float(told)) and "_" not in told
@@ -119,7 +127,8 @@ def numbers(
                 raise TrajectoryError(
                     f"{name}: line {line}: {names[k]} is {told[:40] or 'empty'}, not a finite number. {remedy}"
                 )
-    raise TrajectoryError(f"{name}: the numbers cannot be read.")
+    fields = [row.split(comma) for row in rows]
+    return np.array([[float(row[k].strip() or "nan") for k in which] for row in fields])
 
 
 def read_columns(
@@ -160,7 +169,8 @@ def read_columns(
         if (nameless := np.flatnonzero(who == "")).size:
             line = lines[int(nameless[0])]
             raise TrajectoryError(f"{name}: line {line}: agent is empty. Name the vehicle.")
-    values = numbers(rows, lines, comma, names, list(places.values()), name)
+    blank = [k for q, k in places.items() if q in ("x", "y", "z")]
+    values = numbers(rows, lines, comma, names, list(places.values()), name, blank)
     found = {q: values[:, i] * factor[q] for i, q in enumerate(places)}
     return Columns(np.array(lines), found, who)
 

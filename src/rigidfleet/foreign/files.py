@@ -111,12 +111,6 @@ def read_trajectories(
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
     curves = [curve for part in parts for curve in part.curves]
-    zeroed = [source for source, curve in zip(sources, curves, strict=True)
-              if source.suffix.lower() == ".mcap" and curve.time[0] == 0.0]  # fmt: skip
-    if len({*zeroed}) > 1:
-        raise TrajectoryError(
-            f"{zeroed[-1]}: its times and those of {zeroed[0].name} count from own first poses. Merge the recordings."
-        )
     notes += [note for part in parts for note in part.notes]
     exact = parts[0].assumed in (texts.POLYNOMIALS, shows.BEZIER)
     away = spans == "away" or not (exact or spans == "stand")

@@ -84,7 +84,13 @@ def read_setpoints(
         rows = np.split(np.argsort(inverse, kind="stable"), np.cumsum(np.bincount(inverse))[:-1])
         order = np.argsort(first)
         groups = {str(who[k]): rows[k] for k in order.tolist()}
-    curves, off, fastest = [], 0.0, 0.0
+    known = np.isfinite(position).min(axis=1)
+    groups = {who: k[known[k]] for who, k in groups.items()}
+    curves, off, fastest, notes = [], 0.0, 0.0, []
+    if not known.all():
+        notes.append(f"{np.count_nonzero(~known):,} rows without a position are left out")
+    if empty := [who for who, k in groups.items() if not len(k)]:
+        raise TrajectoryError(f"{name}: {empty[0]!r} has no position. Leave it out.")
     for k in groups.values():
         curve = sampled(
             time[k],
@@ -102,7 +108,7 @@ def read_setpoints(
             if interpolation == "cubic" and len(between):
                 off = max(off, float(np.linalg.norm(stated[1:-1] - between, axis=1).max()))
                 fastest = max(fastest, float(np.linalg.norm(between, axis=1).max()))
-    return tuple(groups), tuple(curves), _contradiction(off, fastest)
+    return tuple(groups), tuple(curves), (*notes, *_contradiction(off, fastest))
 
 
 def _contradiction(off: float, fastest: float) -> tuple[str, ...]:
