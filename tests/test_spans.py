@@ -1,4 +1,4 @@
-"""What a verdict on files of others covers: spans, gaps, folders, clocks, and the altitude from which separation holds."""
+"""What a verdict on files of others covers: spans, gaps, folders, clocks, and where separation holds."""
 
 import itertools
 import json
@@ -15,6 +15,7 @@ from rigidfleet.errors import MissionError, TrajectoryError
 from rigidfleet.foreign import shows
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.mission import load_mission
+from rigidfleet.mission.kinds import Follow
 from rigidfleet.simulation.trajectories import of_curves
 from rigidfleet.sweep.metrics import METRICS
 
@@ -197,7 +198,7 @@ def test_a_separation_of_one_vehicle_is_not_passed(tmp_path):
 
 @pytest.mark.parametrize("absent", ["no rows", "nan", "empty"])
 def test_a_gap_is_refused_or_told(absent, tmp_path):
-    """Rows that are not there and rows without a position are the same gap: refused, or bridged and told with a pair."""
+    """Rows that are not there and rows without a position are the same gap: refused, or bridged and told."""
     times = np.arange(0.0, 10.05, 0.1)
     rows = [HEAD]
     for t in times:
@@ -303,7 +304,9 @@ def test_kinds_of_one_folder_are_not_mixed(name, tmp_path):
     """Tables beside a recording or a show are refused."""
     folder = folder_of(tmp_path)
     (folder / name).write_bytes(b"")
-    with pytest.raises(TrajectoryError, match=r"the folder has .* and .*\. Give files of one kind"):
+    with pytest.raises(
+        TrajectoryError, match=r"the folder has files .* and .*\. Give files of one kind"
+    ):
         read_trajectories(folder)
 
 
@@ -513,7 +516,7 @@ def test_our_own_flights_may_park_nearer(tmp_path):
         assert any(remark.level == "fails" for remark in rf.check(path).remarks) is foreseen
     assert "separation_flying" in METRICS
     path.write_text(FLOWN.replace("separation = {limit}\n", ""))
-    with pytest.raises(MissionError, match="separation_altitude.*no effect without separation"):
+    with pytest.raises(MissionError, match=r"separation_altitude.*no effect without separation"):
         load_mission(path)
 
 
@@ -555,8 +558,9 @@ def test_gaps_and_spans_of_flown_files(tmp_path):
             mission = load_mission(path)
             notes = [r.text for r in rf.check(mission).remarks if r.topic == "files"]
             assert any(message in note for note in notes)
-            last = mission.phases[0].curve.time[-1]
-            assert last == pytest.approx(10.0 if name == "short.csv" else 9.9)
+            phase = mission.phases[0]
+            assert isinstance(phase, Follow)
+            assert phase.curve.time[-1] == pytest.approx(10.0 if name == "short.csv" else 9.9)
 
 
 def test_drones_of_a_show_keep_their_times_when_flown(tmp_path):
@@ -575,7 +579,8 @@ def test_drones_of_a_show_keep_their_times_when_flown(tmp_path):
         for name, entry in (entries | {"show.json": {"swarm": {"drones": drones}}}).items():
             archive.writestr(name, json.dumps(entry))
     (tmp_path / "m.toml").write_text(FOLLOW.format(file="late.skyc"))
-    curve = load_mission(tmp_path / "m.toml").phases[0].curve
+    phase = load_mission(tmp_path / "m.toml").phases[0]
+    assert isinstance(phase, Follow)
     np.testing.assert_allclose(
-        curve.at(np.array([2.0, 5.0, 7.0]))[:, :, 2], [[7, 5], [9, 7], [9, 9]]
+        phase.curve.at(np.array([2.0, 5.0, 7.0]))[:, :, 2], [[7, 5], [9, 7], [9, 9]]
     )

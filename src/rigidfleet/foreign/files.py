@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -30,8 +31,8 @@ Gaps = Literal["refuse", "bridge"]
 #: Greatest size of a file [bytes], number of files, and coordinate [m] or time [s] of a trajectory.
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 _ZIP, _MCAP, _HDF = b"PK", b"\x89MCAP0\r\n", b"\x89HDF"
-#: What files of trajectories in a folder are, by their suffix.
-_KINDS = {".csv": "tables", ".skyc": "shows", ".mcap": "recordings"}
+#: Suffixes of files of trajectories in a folder.
+_SUFFIXES = {".csv", ".skyc", ".mcap"}
 #: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
 #: positions that are noted.
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
@@ -110,14 +111,13 @@ def read_trajectories(
     if len(set(names)) < len(names):
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
-    curves = [curve for part in parts for curve in part.curves]
+    curves = tuple(curve for part in parts for curve in part.curves)
     notes += [note for part in parts for note in part.notes]
-    exact = parts[0].assumed in (texts.POLYNOMIALS, shows.BEZIER)
-    away = spans == "away" or not (exact or spans == "stand")
-    if not exact:
-        notes += _doubts(names, curves, sources, spans, gaps, away=away)
-    notes += _spans(names, curves, away=away)
-    return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes), away)
+    sampled = parts[0].assumed in ASSUMED.values()
+    away = spans == "away" or (sampled and spans == "refuse")
+    read = Trajectories(tuple(names), curves, parts[0].assumed, away=away)
+    notes += _doubts(read, sources, spans, gaps) if sampled else []
+    return read._replace(notes=(*notes, *_spans(read)))
 
 
 def files_of(path: Path) -> list[list[Path]]:
@@ -131,37 +131,33 @@ def files_of(path: Path) -> list[list[Path]]:
     if not path.is_dir():
         return [[path]]
     inside = sorted(path.iterdir(), key=_order)
-    kinds = [(name, _with_suffix(inside, suffix)) for suffix, name in _KINDS.items()]
-    kinds = [(name, every) for name, every in kinds if every]
+    kinds = {p.suffix.lower() for p in inside if p.is_file()} & _SUFFIXES
     if len(kinds) > 1:
-        (one, _), (other, (first, *_)), *_ = kinds
         raise TrajectoryError(
-            f"{first}: the folder has {one} and {other}. Give files of one kind for one flight."
+            f"{path}: the folder has files {' and '.join(sorted(kinds))}. Give files of one kind for one flight."
         )
     if kinds:
-        return [[p] for p in kinds[0][1]]
+        return [[p] for p in inside if p.suffix.lower() in kinds and p.is_file()]
     folders = [p for p in inside if p.is_dir()]
-    groups = [_with_suffix(sorted(folder.iterdir(), key=_order), ".csv") for folder in folders]
+    groups = [
+        [p for p in sorted(folder.iterdir(), key=_order) if p.suffix.lower() == ".csv"]
+        for folder in folders
+    ]
     if not groups or not all(groups):
         bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
         raise TrajectoryError(
             f"{bare}: the folder has no .csv, .skyc or .mcap. Give a folder with one table a vehicle."
         )
     for group in groups:
-        columns = {
-            column for column in zip(*map(_numbers, group), strict=False) if len({*column}) > 1
-        }
-        counts = {(*range(first, first + len(group)),) for first in (0, 1)}
-        if len(group) > 1 and not (len(columns) == 1 and columns <= counts):
+        numbers = zip(*(re.findall(r"\d+", p.stem) for p in group), strict=False)
+        counts = [[int(x) for x in column] for column in numbers if len({*column}) > 1]
+        whole = [[*range(first, first + len(group))] for first in (0, 1)]
+        if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
             raise TrajectoryError(
                 f"{group[0].parent}: {_some([p.name for p in group])} are no sequence. Number the tables that a "
                 "vehicle flies one after the other from 0 or 1 on, and leave none out."
             )
     return groups
-
-
-def _with_suffix(paths: list[Path], suffix: str) -> list[Path]:
-    return [p for p in paths if p.suffix.lower() == suffix and p.is_file()]
 
 
 def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
@@ -175,41 +171,22 @@ def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
     read = {p for group in listed for p in group}
     rest = [p for p in sorted(path.rglob("*"), key=_order) if p.is_file() and p not in read]
     for p in rest:
-        if p.suffix.lower() in _KINDS or _is_trajectory(p):
+        hidden = p.suffix.lower() in _SUFFIXES
+        with suppress(TrajectoryError):
+            hidden = hidden or bool(_of_file(p, "linear"))
+        if hidden:
             raise TrajectoryError(
                 f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
                 "move it out of the folder."
             )
-    notes = (
-        [f"of '{path.name}', {_some([p.relative_to(path) for p in rest])} is not read"]
-        if rest
-        else []
-    )
-    return notes
-
-
-def _is_trajectory(path: Path) -> bool:
-    """Whether a file can be read, whatever its name."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(1000)
-        if b"\0" in head and not head.startswith((_ZIP, _MCAP)):
-            return False
-        _of_file(path, "linear")
-    except (OSError, TrajectoryError):
-        return False
-    return True
+    names = _some([p.relative_to(path) for p in rest])
+    return [f"of '{path.name}', {names} is not read"] if rest else []
 
 
 def _some(things: Sequence[object]) -> str:
     """The first of some things, and how many more there are."""
     more = f" and {len(things) - _LISTED:,} more" if len(things) > _LISTED else ""
     return ", ".join(map(str, things[:_LISTED])) + more
-
-
-def _numbers(path: Path) -> list[int]:
-    """Numbers in the name of a file."""
-    return [int(x) for x in re.findall(r"\d+", path.stem) if len(x) < 19]
 
 
 def _order(path: Path) -> list[tuple[int, str]]:
@@ -290,15 +267,7 @@ def _check_size(name: str, who: str, curve: Piecewise) -> None:
         )
 
 
-def _doubts(
-    names: Sequence[str],
-    curves: Sequence[Piecewise],
-    sources: Sequence[Path],
-    spans: Spans,
-    gaps: Gaps,
-    *,
-    away: bool,
-) -> list[str]:
+def _doubts(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -> list[str]:
     """Notes on where samples leave open what a vehicle does: gaps, and a standstill that may be one.
 
     Raises
@@ -307,6 +276,7 @@ def _doubts(
         A vehicle begins or ends by more than its usual step after or before others, or has a long gap, and ``spans``
         or ``gaps`` do not say what that is.
     """
+    names, curves = read.names, read.curves
     begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
     holes: list[tuple[float, int, int]] = []
     frozen: list[str] = []
@@ -327,7 +297,7 @@ def _doubts(
                 "--gaps bridge`."
             )
         holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
-        moves = np.linalg.norm(np.diff(curve.at(curve.time)[:, :3], axis=0), axis=1)
+        moves = np.linalg.norm(np.diff(curve.pieces[:, :3, 0], axis=0), axis=1)
         moving = np.flatnonzero(moves > 1e-9)
         fast = moves[moving] > 0.5 * np.median(moves[moving]) if len(moving) else moving > 0
         for k in np.flatnonzero((np.diff(moving) > _REPEATED) & fast[:-1] & fast[1:]).tolist():
@@ -341,7 +311,7 @@ def _doubts(
             if other is not curves[i]:
                 inside = np.clip(t, *other.time[[0, -1]])
                 far = np.linalg.norm(other.at(inside)[:, :3] - place, axis=1)
-                far[(inside != t) & away] = np.inf
+                far[(inside != t) & read.away] = np.inf
                 nearest = min(nearest, (float(far.min()), float(t[far.argmin()]), name))
         words = f"{names[i]!r} has no sample between {t[0]:g} and {t[-1]:g} s, {share:.3g} times its usual step: its"
         words += " curve is assumed there"
@@ -358,19 +328,19 @@ def _doubts(
     return notes
 
 
-def _spans(names: Sequence[str], curves: Sequence[Piecewise], *, away: bool) -> list[str]:
+def _spans(read: Trajectories) -> list[str]:
     """A note if vehicles begin or end at different times."""
-    starts, ends = np.array([curve.time[[0, -1]] for curve in curves]).T
+    starts, ends = np.array([curve.time[[0, -1]] for curve in read.curves]).T
     begin, end = starts.min(), ends.max()
     part = [
         f"{name!r} from {a:.9g} to {b:.9g} s"
-        for name, a, b in zip(names, starts, ends, strict=True)
+        for name, a, b in zip(read.names, starts, ends, strict=True)
         if max(a - begin, end - b) > 1e-6
     ]
     if not part:
         return []
-    if not away:
+    if not read.away:
         return [f"{_some(part)}: each stays at its first and last place outside of its time"]
-    apart = len(names) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
+    apart = len(starts) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
     never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
     return [f"vehicles are judged only where they have data: {_some(part)}{never}"]
