@@ -432,6 +432,22 @@ def test_drones_that_share_a_large_entry_are_bounded(tmp_path, monkeypatch):
         read_trajectories(path)
 
 
+def test_a_recording_is_bounded_by_what_it_becomes(tmp_path):
+    """Chunks that unpack to gigabytes are one error, before they are unpacked."""
+    writer = pytest.importorskip("mcap.writer")
+    path = tmp_path / "bomb.mcap"
+    with path.open("wb") as stream:
+        made = writer.Writer(stream, chunk_size=100 << 20)
+        made.start()
+        schema = made.register_schema("geometry_msgs/msg/PoseStamped", "ros2msg", b"")
+        channel = made.register_channel("/pose", "cdr", schema)
+        made.add_message(channel, 0, b"\0" * (80 << 20), 0)
+        made.finish()
+    assert path.stat().st_size < 1 << 20
+    with pytest.raises(TrajectoryError, match="unpacks to 80 MiB"):
+        read_trajectories(path)
+
+
 # -- separation in flight ----------------------------------------------------------------------------
 
 _PADS = np.arange(0.0, 36.0, 5.0)
