@@ -79,9 +79,9 @@ def test_a_vehicle_without_data_cuts_no_other(late, tmp_path):
     for spans in ("stand", "away"):
         verdict = judged(path, spans, "bridge", separation=0.5)
         assert not verdict.passed
-        found = separation(verdict)
-        assert found.worst == pytest.approx(0.0, abs=1e-6)
-        assert found.when == pytest.approx(20.0, abs=1e-3)
+        check = separation(verdict)
+        assert check.worst == pytest.approx(0.0, abs=1e-6)
+        assert check.when == pytest.approx(20.0, abs=1e-3)
 
 
 def test_a_coarse_table_does_not_end_a_finer_one(tmp_path):
@@ -370,9 +370,9 @@ def test_one_clock_for_files_and_obstacles(begin, tmp_path):
     times = np.arange(begin, 8.05, 0.1)
     path = table(tmp_path / "t.csv", {"a": (times, line([0, 0, 5], [0, 0, 0]))})
     verdict = judged(path, mission=str(tmp_path / "ball.toml"))
-    found = separation(verdict, "clearance")
-    assert found.worst == pytest.approx(-0.75, abs=1e-6)
-    assert found.when == pytest.approx(2.5, abs=1e-3)
+    check = separation(verdict, "clearance")
+    assert check.worst == pytest.approx(-0.75, abs=1e-6)
+    assert check.when == pytest.approx(2.5, abs=1e-3)
     assert said(verdict, f"at the times of the file, from {begin:g} s on")
 
 
@@ -488,10 +488,10 @@ def test_separation_from_an_altitude_against_dense_samples(n, tmp_path):
             far = np.linalg.norm(a - b, axis=1)[np.maximum(a[:, 2], b[:, 2]) >= altitude]
             least = min(least, far.min(initial=np.inf))
         for limit in (0.9 * least, 1.1 * least):
-            found = judged(
+            check = judged(
                 path, separation=limit, limits={"separation_altitude": altitude}, radius=1e-9
             )
-            check = separation(found, "separation_flying")
+            check = separation(verdict, "separation_flying")
             assert check.passed == (limit < least)
             if check.worst is not None or n < 40 or limit > least:
                 assert check.worst == pytest.approx(least, abs=1e-3)

@@ -85,10 +85,11 @@ def read_trajectories(
     TrajectoryError
         A file cannot be read, or a part of it is not there; the message names the file and the line or entry.
     ValueError
-        The interpolation is unknown.
+        A word is unknown.
     """
-    if interpolation not in get_args(Interpolation):
-        raise ValueError(f"there is no interpolation {interpolation!r}; use linear or cubic")
+    for word, known in ((interpolation, Interpolation), (spans, Spans), (gaps, Gaps)):
+        if word not in get_args(known):
+            raise ValueError(f"there is no {word!r}; use {' or '.join(get_args(known))}")
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")

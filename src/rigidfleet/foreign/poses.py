@@ -73,7 +73,7 @@ def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
         sizes = [x.uncompressed_size for x in records if isinstance(x, Chunk)]
         if sum(sizes) > _BYTES or max(sizes, default=0) > _CHUNK:
             raise TrajectoryError(
-                f"{name}: a chunk of it unpacks to {max(sizes) >> 20} MiB, all to {sum(sizes) >> 20}. Record poses alone."
+                f"{name}: a chunk of it unpacks to {max(sizes) >> 20} MiB, all to {sum(sizes) >> 20}. Record poses."
             )
         for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages():
             if schema is None or schema.name not in (_POSE, "geometry_msgs/PoseStamped"):

@@ -125,8 +125,8 @@ def digests(text: str) -> str:
 
 def doubts(text: str) -> list[str]:
     """What is said of the files of a mission's text, each with what was read of it."""
-    found = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$", text, re.MULTILINE)
-    return [f"{what}: {notes}" for what, notes in dict.fromkeys(found)]
+    lines = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$", text, re.MULTILINE)
+    return [f"{what}: {notes}" for what, notes in dict.fromkeys(lines)]
 
 
 def _names(path: Path, named: _Named) -> list[str]:

@@ -44,16 +44,12 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         ends: list[tuple[float, float, tuple[int, ...]]] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
-        flying = (
-            np.ones(positions.shape[:2], np.bool_)
-            if lowest is None
-            else positions[..., 2] >= lowest
-        )
+        flying = positions[..., 2] >= (-np.inf if lowest is None else lowest)
         separations, pairs = proximity.separation_of_left(positions, radius, flying)
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
-        bent = planned.leg.reference.knots
-        if len(bent) and planned.path_ends is None and (proved := planned.certificate) is not None:
+        bent = len(planned.leg.reference.knots) and planned.path_ends is None and flying.all()
+        if bent and (proved := planned.certificate) is not None:
             ends = [(proved.separation, proved.time, proved.agents)]
         if planned.path_ends is not None:
             certificate = planned.certificate or straight(planned.leg.reference, radius)

@@ -292,8 +292,8 @@ def of_curve(
     _put_extremes(record, mission, Piecewise(curve.time, curve.pieces[:, :, :3]), here)
     if curve.pieces.shape[-1] < 3:  # lines turn at once at samples
         state[2:] = np.nan
-    told = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
-    return _result(mission, record, time, state, yaw, told)
+    facts = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
+    return _result(mission, record, time, state, yaw, facts)
 
 
 def of_curves(
@@ -413,8 +413,9 @@ def _put_extremes(record: PhaseRecord, mission: Mission, curve: Piecewise, here:
 def _take(
     extremes: Extremes, problem: Any, work: Any, state: records.IntegratorState, rows: int
 ) -> None:
-    state.count[4] = rows
-    extremes.take_path(problem, work, state)
+    if rows:
+        state.count[4] = rows
+        extremes.take_path(problem, work, state)
 
 
 def _parts(c: Floats, h: Floats) -> list[int]:
