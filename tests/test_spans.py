@@ -488,7 +488,7 @@ def test_separation_from_an_altitude_against_dense_samples(n, tmp_path):
             far = np.linalg.norm(a - b, axis=1)[np.maximum(a[:, 2], b[:, 2]) >= altitude]
             least = min(least, far.min(initial=np.inf))
         for limit in (0.9 * least, 1.1 * least):
-            check = judged(
+            verdict = judged(
                 path, separation=limit, limits={"separation_altitude": altitude}, radius=1e-9
             )
             check = separation(verdict, "separation_flying")
