@@ -38,7 +38,7 @@ _JUMP = 1e-3
 _MOST, _TOGETHER = 5e8, 4_000_000
 #: Time between samples [s], unless the trajectory itself has more; about so many in all.
 _STEP, _SAMPLES = 0.05, 2_000_000
-#: Where a start is moved to zero: a time of a clock, not of a flight [s].
+#: From where on a start, as one before zero, is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
     1: ASSUMED["linear"],
@@ -272,7 +272,7 @@ def of_curve(
     MissionError
         A limit is invalid.
     """
-    zero = float(curve.time[0]) if abs(curve.time[0]) > _CLOCK else 0.0
+    zero = 0.0 if 0.0 <= curve.time[0] <= _CLOCK else float(curve.time[0])
     curve = curve.later(-zero)
     _continuous(curve)
     n, span = curve.pieces.shape[1], float(curve.time[-1] - curve.time[0])
