@@ -87,6 +87,7 @@ def assess(result: Result | str | Path) -> Verdict:
     verdict = Verdict(
         measured.mission.name, measured.mission.title, [], phases, [], uncalled, covers
     )
+    verdict.read.extend(result.statistics.get("read", []))
     verdict.checks.extend(all_checks(measured, verdict))
     verdict.notes.extend(notes(measured, phases))
     return verdict

@@ -26,6 +26,9 @@ def assess(
     interpolation: Literal["cubic", "linear"] | None = None,
     spans: Literal["refuse", "stand", "away"] | None = None,
     gaps: Literal["refuse", "bridge"] | None = None,
+    units: str | None = None,
+    axes: str | None = None,
+    explain: bool = False,
     out: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -60,6 +63,14 @@ def assess(
     gaps : str
         Times without samples, longer than ten usual steps of a vehicle: refuse, or bridge (by the curve). Default:
         refuse.
+    units : str
+        Units of a table's columns that do not name theirs: of time, length and angle, such as ms,mm,deg. Default:
+        s,m,rad.
+    axes : str
+        Where x, y and z of a table point: enu (east, north, up), ned, or three others of e, n, u, w, s and d. Default:
+        enu.
+    explain : bool
+        Say first what was read: vehicles, span, columns used and ignored, units and axes.
     out : Path
         Folder for a result, the verdict, a report, a replay and figures. Default: write nothing.
     force : bool
@@ -75,9 +86,9 @@ def assess(
     if out is not None:
         drawing.prepare()
     given = {
-        "mission": mission, "separation": separation,
-        "separation_altitude": separation_altitude, "limits": limits, "radius": radius, "ground": ground,
-        "interpolation": interpolation, "spans": spans, "gaps": gaps,
+        "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
+        "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
+        "units": units, "axes": axes,
     }  # fmt: skip
     chosen = [key for key, value in given.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
@@ -97,13 +108,18 @@ def assess(
             raise RigidfleetError(told)
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
         read = read_trajectories(
-            files, interpolation or "cubic", spans=spans or "refuse", gaps=gaps or "refuse"
+            files,
+            interpolation or "cubic",
+            spans=spans or "refuse",
+            gaps=gaps or "refuse",
+            units=units,
+            axes=axes,
         )
         result = of_curves(
             read.curves, read.assumed, names=read.names, away=read.away, mission=mission, separation=separation,
             limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground, name=_name(files[0]),
         )  # fmt: skip
-        result.statistics["notes"] = list(read.notes)
+        result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     verdict = judge(result)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
@@ -113,6 +129,11 @@ def assess(
     if json:
         console.print_json(verdict.to_dict())
     else:
+        for part in verdict.read if explain else ():
+            for key, value in part.items():
+                words = ", ".join(value) if isinstance(value, list) else f"{value}"
+                line = f"{key.replace('_', ' ')}: {words}"
+                console.out().print(line, highlight=False, markup=False, soft_wrap=True)
         console.out().print(verdict)
     if made is not None:
         from rigidfleet.cli.report import write_report

@@ -81,7 +81,7 @@ def design(
 
     keep_existing(out, force=force)
     try:
-        name, (slots, colours) = points_of(shape, agents, size, spacing, font)
+        name, (slots, colours, notes) = points_of(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
         if edges is not None:
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
@@ -106,6 +106,8 @@ def design(
     except ValueError as error:
         raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
     limits = designs.limits(slots)
+    for note in notes:
+        console.err().print(f"Note: {shape}: {note}.")
     if out is not None:
         table = to_csv(slots, colours) if out.suffix.lower() == ".csv" else text
         write_file(out, table.encode())
@@ -223,10 +225,10 @@ def points_of(
             else outlines.text_outlines(words, font or "DejaVu Sans")
         )
         return words or Path(shape).stem, Points(outlines.on_outlines(drawn, agents, spacing), None)
-    points, colours = read_points(shape)
+    points, colours, notes = read_points(shape, repeated=True)
     if agents is not None and agents != len(points):
         kept = outlines.spread(points, agents)
         points = points[kept]
         colours = colours and tuple(colours[k] for k in kept.tolist())
     points = centred(points) if spacing is None else outlines.scaled(points, spacing)
-    return Path(shape).stem, Points(points, colours)
+    return Path(shape).stem, Points(points, colours, notes)

@@ -145,8 +145,11 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
         except ValueError as error:
             raise ValueError(f"{word}: {error}") from None
         folder, there = file.parent.resolve(), path.resolve()
+        own = None if own is not None and own.notes else own  # with fewer points than the file
         source, by_name = word, False
         whole = own is not None and len(own.slots) == count and there.is_relative_to(folder)
+        for note in points.notes:
+            console.err().print(f"Note: {word}: {note}.")
         if own is not None and whole and proximity.nearest(own.slots).min() >= spacing:
             source, points, by_name = there.relative_to(folder).as_posix(), own, True
         scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))

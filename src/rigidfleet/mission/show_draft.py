@@ -78,7 +78,7 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
 
 def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
     """A formation of points, written as numbers, or by the name of their file."""
-    slots, colours = points
+    slots, colours, _ = points
     if by_name:
         return Scene(name, slots, f"slots = {json.dumps(source)}\n")
     lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"
