@@ -235,6 +235,36 @@ def test_short_gaps_are_bridged_and_told(lost, tmp_path):
     )
 
 
+def test_poses_that_are_not_finite_are_gaps(tmp_path):
+    """A recording whose poses are not finite for a second has a gap, as a table has."""
+    pytest.importorskip("mcap")
+    rosbags = pytest.importorskip("rosbags.typesys")
+    from mcap.writer import Writer
+
+    store = rosbags.get_typestore(rosbags.Stores.ROS2_JAZZY)
+    kind = "geometry_msgs/msg/PoseStamped"
+    made = {name.rsplit("/", 1)[1]: store.types[name] for name in (
+        kind, "std_msgs/msg/Header", "builtin_interfaces/msg/Time", "geometry_msgs/msg/Pose",
+        "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion")}  # fmt: skip
+    path = tmp_path / "p.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/a", "cdr", writer.register_schema(kind, "ros2msg", b""))
+        for k in range(100):
+            z = np.nan if 40 <= k < 60 else 2.0
+            pose = made["Pose"](
+                made["Point"](0.1 * k, 0.0, z), made["Quaternion"](0.0, 0.0, 0.0, 1.0)
+            )
+            stamp = made["Time"](k // 10, k % 10 * 10**8)
+            message = made["PoseStamped"](made["Header"](stamp, ""), pose)
+            writer.add_message(channel, k, bytes(store.serialize_cdr(message, kind)), k)
+        writer.finish()
+    with pytest.raises(TrajectoryError, match=r"'/a' has no sample between 3\.9 and 6 s"):
+        judged(path)
+    assert said(judged(path, gaps="bridge"), "'/a' has no sample between 3.9 and 6 s")
+
+
 def test_positions_that_freeze_are_told(tmp_path):
     """A vehicle that stands to the last digit between fast moves may have been lost by its tracker; a hover is not."""
     x = np.where((EVERY > 3) & (EVERY < 7.95), 3.0, EVERY)

@@ -52,9 +52,10 @@ def read_poses(
         time = (
             np.array([row[0] - first for row in rows]) / _BILLION
         )  # whole numbers keep nanoseconds
-        if not np.isfinite(table).all():
-            k = int(np.argmin(np.isfinite(table).all(axis=1)))
-            raise TrajectoryError(f"{name}: {topic}: message {k + 1}: the pose is not finite.")
+        known = np.isfinite(table).all(axis=1)  # the others are gaps
+        if not known.any():
+            raise TrajectoryError(f"{name}: {topic}: no pose is finite. Leave it out.")
+        table, time = table[known], time[known]
         where = lambda k, topic=topic: f"{topic}: message {k + 1}"  # noqa: E731
         offset = 0.0 if dated else first / _BILLION
         curves.append(
