@@ -391,9 +391,10 @@ def test_a_trajectory_without_names_is_tum(tmp_path):
         read = read_trajectories(tmp_path / "t.txt")
         judged_as_meant(read, 1)
         assert bool(read.notes) == (not head)
-    (tmp_path / "t.txt").write_text(rows.replace(" 0 0 0 1", ""))
-    with pytest.raises(rf.RigidfleetError, match="no names of columns"):
-        read_trajectories(tmp_path / "t.txt")
+    for other in (" 0 0 0 2", ""):
+        (tmp_path / "t.txt").write_text(rows.replace(" 0 0 0 1", other))
+        with pytest.raises(rf.RigidfleetError, match="no names of columns"):
+            read_trajectories(tmp_path / "t.txt")
 
 
 def test_files_have_one_clock(tmp_path):

@@ -83,19 +83,14 @@ class Table:
     ) -> None:
         self.texts, self.words = _lines(data), words or {}
         self.line, start, self.names, below, self.separator, width = _head(self.texts)
-        self.lines, self.columns, self._faults = _rows(
-            self.texts, start, width, self.separator, self.line
-        )
+        rows = _rows(self.texts, start, width, self.separator, self.line)
+        self.lines, self.columns, self._faults = rows
         self.named, self.decimal = bool(self.names), ""
-        if not self.named:
-            if width and width not in unnamed:
+        if not self.named and width:
+            if width not in unnamed:
                 why = f"has no names of columns that are understood, and {width} numbers"
-                raise fault(
-                    why,
-                    "Begin with a line such as x_m,y_m,z_m, and time_s for trajectories",
-                    self.line,
-                )
-            self.names, below = unnamed[width] if width else [], [""] * width
+                raise fault(why, "Begin with a line such as time_s,x_m,y_m,z_m", self.line)
+            self.names, below = unnamed[width], [""] * width
         self.kinds = [quantity_of(name) for name in self.names]
         self.places: dict[tuple[str, str], int] = {}
         self.units: dict[str, tuple[str, str]] = {}
@@ -114,21 +109,16 @@ class Table:
         if not dimension or not words:
             return 1.0
         known = [unit_of(word) for word in words[:-1] or words]
+        column = f"the column {name!r}"
         if known[0] is None or known[0][0] != dimension:
-            raise fault(
-                f"the column {name!r} has the unknown unit {words[0]!r}", "Use s, m and rad"
-            )
+            raise fault(f"{column} has the unknown unit {words[0]!r}", "Use s, m and rad")
         if any(unit != known[0] for unit in known):
-            raise fault(
-                f"the column {name!r} is in {words[0]!r}, but also in {words[1]!r}", "Remove one"
-            )
+            raise fault(f"{column} is in {words[0]!r}, but also in {words[1]!r}", "Remove one")
         if kind != "duration":
             source = "the file" if said or below else "the option" if option else ""
             first_source = self.units.setdefault(dimension, (words[0], source))[1]
             if bool(source) != bool(first_source):
-                raise fault(
-                    f"has units for some columns of {dimension} only, unlike {name!r}", "Give all"
-                )
+                raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
         return known[0][1]
 
     def place(self, *kinds: str, who: str = "") -> list[int]:
@@ -139,10 +129,7 @@ class Table:
     def missing(self, *kinds: str) -> TableError:
         """The error of a table without some quantities."""
         if self.place("latitude"):
-            return fault(
-                "has latitude and longitude",
-                "Give metres east, north and up of an origin: x_m, y_m, z_m",
-            )
+            return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
         missing = ", ".join(kind for kind in kinds if not self.place(kind))
         why = f"has no column for {missing} among {', '.join(self.names)[:80]}"
         return fault(why, "Name columns x_m, y_m and z_m, and time_s for trajectories")
@@ -167,17 +154,14 @@ class Table:
         faults = {fault.line: fault for fault in self._faults}
         odd = [i for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
         if odd and not self.decimal:
-            every = [
-                _REMARK.sub("", x) for k in self.places.values() for x in self.columns[k].tolist()
-            ]
-            commas = [x for x in every if _COMMA.fullmatch(x)]
-            clear = not all(map(_THOUSANDS.fullmatch, commas)) and not any(
-                "." in x and is_number(x) for x in every
-            )
-            self.decimal = "," if clear else "."
-        fields = {i: [_REMARK.sub("", x) for x in self.columns[which[i]].tolist()] for i in odd}
-        for i, own in fields.items():
-            for row, field in enumerate(own):
+            columns = [self.columns[k].tolist() for k in self.places.values()]
+            every = [_REMARK.sub("", x) for column in columns for x in column]
+            comma = not all(_THOUSANDS.fullmatch(x) for x in every if _COMMA.fullmatch(x))
+            point = any("." in x and is_number(x) for x in every)
+            self.decimal = "," if comma and not point else "."
+        for i in odd:
+            for row, written in enumerate(self.columns[which[i]].tolist()):
+                field = _REMARK.sub("", written)
                 plain = field.replace(self.decimal, ".")
                 if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
                     values[row, i] = float(plain)
@@ -186,13 +170,10 @@ class Table:
                     values[row, i] = np.nan
                     continue
                 line, name = int(self.lines[row]), self.names[which[i]]
-                remedy = (
-                    "Write decimals with a point"
-                    if field in commas
-                    else "Leave out rows without a position"
-                )
-                problem = f"{name} is {field[:40] or 'empty'}, not a finite number"
-                faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), problem, remedy))
+                why = f"{name} is {field[:40] or 'empty'}, not a finite number"
+                remedy = "Leave out rows without a position"
+                remedy = "Write decimals with a point" if _COMMA.fullmatch(field) else remedy
+                faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
         if faults:
             raise TableError(*(faults[line] for line in sorted(faults)))
         return values * [self._factors[k] for k in which]
@@ -241,9 +222,8 @@ def _lines(data: bytes) -> list[str]:
     try:
         text = data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError:
-        raise fault(
-            "is neither text in UTF-8 nor another known format", "Save a table as UTF-8"
-        ) from None
+        why = "is neither text in UTF-8 nor another known format"
+        raise fault(why, "Save a table as UTF-8") from None
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if odd := _CONTROL.search(text):
         line = text.count("\n", 0, odd.start()) + 1
@@ -256,9 +236,8 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
         raise fault("has no names of columns that are understood", "Give shorter lines", long)
-    most = [
-        max(sum(map(is_number, split(texts[k].lstrip("#"), s))) for s in SEPARATORS) for k in head
-    ]
+    bare = [texts[k].lstrip("#") for k in head]
+    most = [max(sum(map(is_number, split(line, s))) for s in SEPARATORS) for line in bare]
     rows = [k for k, count in zip(head, most, strict=True) if count > 1]
     first = next((k for k in rows if texts[k][0] != "#"), len(texts))
     start, names, own = _names(texts, [k for k in head if k < first], first)
@@ -270,20 +249,14 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     fits = {s: _fitting(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
     width, line = len(names) or fits[separator][1], start + (not names)
-    units, row = (
-        [""] * width,
-        [x.strip("[]()") for x in split(below[0], separator)] if below else [],
-    )
+    row = [x.strip("[]()") for x in split(below[0], separator)] if below else []
+    units = [""] * width
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1
     above = [k for k in head if not names and k < start and texts[k][0] != "#"]
-    for k in above:
-        if len(split(texts[k], separator)) == width:
-            raise fault(
-                f"has no names of columns that are understood: {texts[k][:60]}",
-                "Name x, y and z",
-                k + 1,
-            )
+    for k in [k for k in above if len(split(texts[k], separator)) == width]:
+        why = f"has no names of columns that are understood: {texts[k][:60]}"
+        raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
     return line, start, names, units, separator, width
 
 
@@ -319,47 +292,32 @@ def _rows(
     if separator == " ":
         lines = (line.replace("\t", " ").strip() for line in lines)
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    what = f"fields, and the names in line {names} are {width}"
+    what = what if names <= start else f"numbers, unlike the lines before with {width}"
     numbers, blocks, faults, line = [], [], [], start
     try:
         while block := list(islice(reader, _TOGETHER)):
-            own = range(line + 1, (line := start + reader.line_num) + 1)
+            own = list(range(line + 1, (line := start + reader.line_num) + 1))
             if len(own) != len(block):
                 raise csv.Error("a quotation mark is not closed")
             if not all(len(row) == width and row[0] and row[0][0] != "#" for row in block):
-                odd = {
-                    k: _row(texts[k - 1].strip(), row, width, separator)
+                read = [
+                    _row(texts[k - 1].strip(), row, width, separator)
                     for k, row in zip(own, block, strict=True)
-                }
-                block = [row for row in odd.values() if row and len(row) == width]
-                own = [k for k, row in odd.items() if row and len(row) == width]
-                for k, count in (
-                    (k, len(row)) for k, row in odd.items() if row and len(row) != width
-                ):
-                    what = (
-                        f"fields, and the names in line {names} are"
-                        if names <= start
-                        else "numbers, unlike the lines before with"
-                    )
-                    faults.append(
-                        Fault(
-                            k,
-                            texts[k - 1].strip(),
-                            f"has {count} {what} {width}",
-                            "Is the file cut off?",
-                        )
-                    )
-            numbers.append(np.array(own, dtype=np.int64))
+                ]
+                for k, row in zip(own, read, strict=True):
+                    if row and len(row) != width:
+                        why = f"has {len(row)} {what}"
+                        faults.append(Fault(k, texts[k - 1].strip(), why, "Is the file cut off?"))
+                own = [k for k, row in zip(own, read, strict=True) if row and len(row) == width]
+                block = [row for row in read if row and len(row) == width]
+            numbers += own
             blocks.append([np.array(x, _TEXT) for x in zip(*block, strict=True)])
     except csv.Error as error:
         raise fault(f"cannot be read: {error}", "Write it again", start + reader.line_num) from None
-    columns = [
-        np.strings.strip(np.concatenate(parts)) for parts in zip(*filter(None, blocks), strict=True)
-    ]
-    return (
-        np.concatenate([*numbers, np.zeros(0, np.int64)]),
-        columns or [np.array([], _TEXT)] * width,
-        faults,
-    )
+    parts = [*zip(*filter(None, blocks), strict=True)] or [[np.array([], _TEXT)]] * width
+    columns = [np.strings.strip(np.concatenate(part)) for part in parts]
+    return np.array(numbers, dtype=np.int64), columns, faults
 
 
 def _row(text: str, fields: list[str], width: int, separator: str) -> list[str] | None:

@@ -124,6 +124,11 @@ def parse(data: bytes, words: Units) -> tuple[Table, list[str]]:
     if not table.columns:
         raise fault("is empty", "Give a table with a line of names")
     if not table.named:
+        turned = np.linalg.norm(table.numbers(range(4, 8)), axis=1)
+        if (np.abs(turned - 1.0) > 0.01).any():
+            raise fault(
+                "has no names of columns", "Begin with a line such as time_s,x_m,y_m,z_m", 1
+            )
         notes.append(f"8 numbers a line without names are read as TUM's: {' '.join(_TUM)}")
     before = [line.strip() for line in table.texts[: table.line - 1] if _UNSAID.search(line)]
     if before and words == ({}, ""):
