@@ -424,7 +424,16 @@ def test_another_zero_is_no_clock_of_obstacles(begin, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the peak of memory from /proc")
-@pytest.mark.parametrize("text", ["[],", '{"a":{}},', '"",', "0,", "[[0]],", '{"abcdefg":1},'])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[],",
+        *(
+            pytest.param(x, marks=pytest.mark.long)
+            for x in ('{"a":{}},', '"",', "0,", "[[0]],", '{"abcdefg":1},')
+        ),
+    ],
+)
 def test_a_show_is_bounded_by_what_it_becomes(text, tmp_path):
     """However JSON is filled, a small archive is one error, within half a gigabyte and some seconds."""
     path = tmp_path / "bomb.skyc"
@@ -449,15 +458,15 @@ def test_a_show_is_bounded_by_what_it_becomes(text, tmp_path):
 def test_drones_that_share_a_large_entry_are_bounded(tmp_path, monkeypatch):
     """A show whose drones all refer to one entry becomes no larger than a show may."""
     path = tmp_path / "shared.skyc"
-    points = [[k, [0, 0, 1], []] for k in range(1001)]
+    points = [[k, [0, 0, 1], []] for k in range(201)]
     drones = [{"settings": {"trajectory": {"$ref": "./t.json#"}}}] * 20
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("t.json", json.dumps({"points": points}))
         archive.writestr("show.json", json.dumps({"swarm": {"drones": drones}}))
     assert len(read_trajectories(path).curves) == 20
     monkeypatch.setattr(
-        shows, "_COEFFICIENTS", 10 * 8000
-    )  # 1000 pieces of 4 channels and 2 powers each
+        shows, "_COEFFICIENTS", 10 * 1600
+    )  # 200 pieces of 4 channels and 2 powers each
     with pytest.raises(TrajectoryError, match="drone 11: is too much beside those before"):
         read_trajectories(path)
 
@@ -512,7 +521,7 @@ def test_separation_from_an_altitude_against_dense_samples(n, tmp_path):
     path = table(tmp_path / "t.csv", vehicles)
     t = np.linspace(0.0, 10.0, 20_001)
     places = [line(starts[i], v[i])(t) for i in range(n)]
-    for altitude in (-3.0, 0.0, 4.0):
+    for altitude in (-3.0, 0.0, 4.0) if n < 40 else (0.0,):
         least = np.inf
         for a, b in itertools.combinations(places, 2):
             far = np.linalg.norm(a - b, axis=1)[np.maximum(a[:, 2], b[:, 2]) >= altitude]
