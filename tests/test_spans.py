@@ -615,7 +615,7 @@ def test_gaps_and_spans_of_flown_files(tmp_path):
             assert any(message in note for note in notes)
             phase = mission.phases[0]
             assert isinstance(phase, Follow)
-            assert phase.curve.time[-1] == pytest.approx(10.0 if name == "short.csv" else 9.9)
+            assert phase.pieces.time[-1] == pytest.approx(10.0 if name == "short.csv" else 9.9)
 
 
 def test_drones_of_a_show_keep_their_times_when_flown(tmp_path):
@@ -637,5 +637,5 @@ def test_drones_of_a_show_keep_their_times_when_flown(tmp_path):
     phase = load_mission(tmp_path / "m.toml").phases[0]
     assert isinstance(phase, Follow)
     np.testing.assert_allclose(
-        phase.curve.at(np.array([2.0, 5.0, 7.0]))[:, :, 2], [[7, 5], [9, 7], [9, 9]]
+        phase.pieces.at(np.array([2.0, 5.0, 7.0]))[:, :, 2], [[7, 5], [9, 7], [9, 9]]
     )

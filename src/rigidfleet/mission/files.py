@@ -212,17 +212,17 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     try:
-        found = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
+        read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
     except TrajectoryError as error:
         raise _unread(name, "", error) from None
-    for doubt in found.notes:
+    for doubt in read.notes:
         if isinstance(doubt, Doubt):
             raise unread(
                 name, doubt, "say units or axes beside the file: units = 'ms', axes = 'ned'"
             )
-    curves, notes = [*found.curves], [*found.notes]
+    curves, notes = [*read.curves], [*read.notes]
     begin, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
-    if found.assumed in ASSUMED.values():
+    if read.assumed in ASSUMED.values():
         if any((c.time[[0, -1]] != (begin, end)).any() for c in curves):
             notes.append(f"only the time of which all have data is flown, {begin:g} to {end:g} s")
         curves = [least_jerk(c.between(begin, end)) for c in curves]
@@ -230,7 +230,7 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
         begin = min(c.time[0] for c in curves)
         curves = [c.on(np.union1d(begin, c.time), stays=True) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
-        why = next((note for note in found.notes if "yaw" in note), "has no yaw")
+        why = next((note for note in read.notes if "yaw" in note), "has no yaw")
         raise unread(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
     rows = [curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves]
     return Content(rows, notes=notes)

@@ -534,7 +534,7 @@ class Follow(Cruising):
         return data
 
     @cached_property
-    def curve(self) -> Piecewise:
+    def pieces(self) -> Piecewise:
         """All trajectories as one from 0 [s]: pieces (K, N, 4, P) [m, rad].
 
         Raises

@@ -424,7 +424,7 @@ def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float |
                 collector.add((*where, i), problem, remedy, None)
                 return
     try:
-        _ = p.curve
+        _ = p.pieces
     except ValueError as error:
         collector.add(where, str(error), "give all vehicles the same times, or fewer", None)
 
