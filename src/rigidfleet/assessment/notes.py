@@ -50,6 +50,10 @@ def _of_others(measured: Measurements) -> Iterator[str]:
         f"others made this flight: what is judged is its curve, {how}, also between samples; forces, thrust and "
         "attitudes are not known"
     )
+    if zero := result.statistics.get("clock"):
+        yield f"times count from {zero:.9g} s, the first of the file"
+    if any(thing.solid.moves for thing in measured.mission.obstacles):
+        yield f"obstacles that move are where they are at the times of the file, from {result.time[0]:.6g} s on"
     radius, e = measured.mission.fleet.radius, measured.worst("separation", None, lambda x: -x)
     if e is not None and np.ptp(radius) == 0.0:
         far = value(e.value + 2.0 * float(radius[0]), "m")
@@ -97,7 +101,7 @@ def _fallen(measured: Measurements) -> Iterator[str]:
     """Note where each lost vehicle falls."""
     grounds = [o.height for o in measured.mission.obstacles if o.kind == "ground"]
     radius = measured.mission.agents.radius
-    for i in np.flatnonzero(~measured.left[-1]):
+    for i in np.flatnonzero(~measured.left[-1] & (measured.mission.lost_at < np.inf)):
         r = measured.result.position[:, i]
         words = f"agent {i + 1}, lost at {measured.mission.lost_at[i]:.2f} s,"
         down = r[:, 2] <= max(grounds) + radius[i] if grounds else np.zeros(len(r), dtype=np.bool_)
