@@ -407,3 +407,112 @@ def test_a_show_of_fewer_points_than_vehicles(tmp_path, monkeypatch, capsys):
     mission = load_mission(tmp_path / "s.toml")
     assert written_slots(mission, "logo").shape == (16, 3)
     assert assess(simulate(mission)).passed
+
+
+def write_points(path, points):
+    """A file of points, with names of its columns."""
+    path.parent.mkdir(exist_ok=True)
+    rows = [",".join(map(repr, map(float, row))) for row in points]
+    path.write_text("\n".join(["x,y,z", *rows, ""]))
+
+
+#: Six places on a circle of 4 m radius, upright, and six in a row.
+RING = [(4 * np.cos(a), 0.0, 4 * np.sin(a)) for a in np.arange(6) * np.pi / 3]
+ROW = [(3.0 * k, 0.0, 0.0) for k in range(6)]
+
+
+@pytest.mark.parametrize(
+    "names", [("a/x.csv", "b/x.csv"), ("a/pads.csv", "b/x.csv"), ("a/pads.csv", "b/pads.csv")]
+)
+def test_formations_of_one_name_are_both_kept(tmp_path, monkeypatch, names):
+    """`new --show` flies every file of points, also if two have one name, or that of the formation on the ground."""
+    monkeypatch.chdir(tmp_path)
+    for name, points in zip(names, (RING, ROW), strict=True):
+        write_points(tmp_path / name, points)
+    asked = [
+        "new",
+        "s",
+        "--show",
+        "--agents",
+        "6",
+        "--spacing",
+        "2",
+        "--formations",
+        ",".join(names),
+    ]
+    assert main(asked) == 0
+    mission = load_mission(tmp_path / "s.toml")
+    flown = [p.formation for p in mission.phases if getattr(p, "formation", None)]
+    assert len(flown) == 3
+    for name, points in zip(flown, (RING, ROW), strict=False):
+        slots = written_slots(mission, name)
+        np.testing.assert_allclose(
+            slots - slots.mean(0), np.array(points) - np.mean(points, 0), atol=1e-9
+        )
+    assert mission.formations[flown[2]].shape == "grid"  # back on the ground
+    again = [
+        "new",
+        "t",
+        "--show",
+        "--agents",
+        "6",
+        "--formations",
+        f"{names[1]},{names[0]},{names[1]}",
+    ]
+    assert main(again) == 0
+    assert len(load_mission(tmp_path / "t.toml").formations) == 3  # a formation that returns is one
+
+
+@pytest.mark.parametrize("verb", [["new", "m", "--show"], ["new", "m", "--shape"], ["design"]])
+def test_a_scale_is_said(tmp_path, monkeypatch, capsys, verb):
+    """Points too near for the spacing are enlarged; the scale, the sizes and the two points are said and written."""
+    monkeypatch.chdir(tmp_path)
+    places = [(1.0 * k, 0.0, 0.0) for k in range(5)] + [(4.0, 0.0, 0.5)]
+    write_points(tmp_path / "p.csv", places)
+    verb = [*verb, "--formations"] if verb[-1] == "--show" else verb
+    more = ["--edges", "none"] if verb == ["design"] else []
+    assert main([*verb, "p.csv", "--spacing", "2", *more]) == 0
+    shown = capsys.readouterr()
+    text = shown.out if verb == ["design"] else (tmp_path / "m.toml").read_text()
+    said = "scaled by 4, from 4 m to 16 m across: points 5 and 6 are 0.5 m apart, to become 2 m"
+    assert said in text
+    assert said in shown.out + shown.err
+
+
+@pytest.mark.parametrize("case", ["one", "pairs", "grid"])
+@pytest.mark.parametrize(
+    "verb", [["new", "m", "--show", "--formations"], ["new", "m", "--shape"], ["design"]]
+)
+def test_near_duplicates_do_not_make_giants(tmp_path, monkeypatch, capsys, case, verb):
+    """Points that are nearly repeated are named, and no formation of a kilometre comes of one of thirty metres."""
+    monkeypatch.chdir(tmp_path)
+    circle = [(15 * np.cos(a), 0.0, 15 * np.sin(a)) for a in np.arange(50) * np.pi / 25]
+    grid = [(x, 0.0, z) for x in range(7) for z in range(7)]
+    points = {
+        "one": [*circle, (15.0, 0.0, 0.03)],
+        "pairs": [*circle, *((x, 0.03, z) for x, _, z in circle)],
+        "grid": [*grid, (3.05, 0.0, 3.0)],
+    }[case]
+    write_points(tmp_path / "p.csv", points)
+    more = ["--edges", "none"] if verb == ["design"] else []
+    assert main([*verb, "p.csv", "--spacing", "2", *more]) != 0
+    error = " ".join(capsys.readouterr().err.split())
+    assert "would be scaled by" in error
+    assert "points 1 and 51" in error or (case == "grid" and "points 25 and 50" in error)
+    assert not (tmp_path / "m.toml").exists()
+
+
+@pytest.mark.parametrize("option", ["--shape", "--formations"])
+def test_new_missions_of_points(tmp_path, monkeypatch, option):
+    """A new mission without a show forms the points of a file, of its own sizes, and passes; likewise words."""
+    monkeypatch.chdir(tmp_path)
+    write_points(tmp_path / "ring 1.csv", RING)
+    assert main(["new", "m", option, "ring 1.csv"]) == 0
+    mission = load_mission(tmp_path / "m.toml")
+    np.testing.assert_allclose(written_slots(mission, "ring 1"), RING, atol=1e-9)
+    result = simulate(mission)
+    assert assess(result).passed
+    r = result.position[-1] - result.position[-1].mean(axis=0)
+    np.testing.assert_allclose(np.linalg.norm(r, axis=1), 4.0, atol=0.05)
+    assert main(["new", "w", option, "text:HI", "--agents", "24", "--spacing", "2"]) == 0
+    assert assess(simulate(load_mission(tmp_path / "w.toml"))).passed

@@ -81,7 +81,7 @@ def design(
 
     keep_existing(out, force=force)
     try:
-        name, (slots, colours) = points_of(shape, agents, size, spacing, font)
+        name, (slots, colours), notes = points_of(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
         if edges is not None:
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
@@ -99,7 +99,8 @@ def design(
             if len(slots) <= _COMPARED:
                 kinds["all pairs"] = complete_graph(len(slots))
         chosen = [] if edges == "none" else edges or kinds["designed"]
-        text = designs.mission_fragment(name, slots, chosen, reach)
+        text = "".join(f"# {note}\n" for note in notes)
+        text += designs.mission_fragment(name, slots, chosen, reach)
         if colours is not None:
             text += f"colour = {dumps(colours)}\n"
         judged = {what: compare_graph(slots, graph) for what, graph in kinds.items()}
@@ -111,7 +112,8 @@ def design(
         write_file(out, table.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
-        console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
+        data = {"name": name, "toml": text, "limits": limits, "graphs": found, "notes": notes}
+        console.print_json(data)
         return PASSED
     table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "class")
     table.columns[0].no_wrap = True
@@ -119,6 +121,8 @@ def design(
         table.add_row(what, *cells)
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
+    for note in notes:
+        output.print(f"{name}: {note}", soft_wrap=True, markup=False)
     if kinds:
         output.print(table)
     if limits and kinds:
@@ -186,19 +190,25 @@ def points_of(
     size: list[float] | None = None,
     spacing: float | None = None,
     font: str | None = None,
-) -> tuple[str, Any]:
-    """Name and `formation.point_files.Points` of a named shape, of a file of points or a drawing, or of words.
+) -> tuple[str, Any, list[str]]:
+    """Name and `formation.point_files.Points` of a named shape, of a file of points or a drawing, or of words; notes.
+
+    The notes say what of a drawing is left out, and by how much, and why, points are scaled.
 
     Raises
     ------
     ValueError
         The shape does not suit the number of agents or sizes, or an option is missing or has no effect.
     """
+    import numpy as np
+
     from rigidfleet.formation import outlines
     from rigidfleet.formation.point_files import Points, read_points
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.math.rigid_body import centred
+    from rigidfleet.mission.findings import near_shape
 
+    notes: list[str] = []
     words = shape.removeprefix("text:") if shape.startswith("text:") else None
     if font is not None and words is None:
         raise ValueError("--font has no effect without text:WORDS; remove it")
@@ -209,9 +219,11 @@ def points_of(
             raise ValueError("--spacing has no effect on a named shape; use --size")
         if agents is None and len(form.agents) > 1:
             raise ValueError(f"takes {agents_taken(shape)}; give --agents")
-        return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None)
+        return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None), notes
     if words is None and not Path(shape).exists():
-        raise ValueError(f"is neither a shape nor a file; shapes: {', '.join(SHAPES)}")
+        if Path(shape).suffix or len(Path(shape).parts) > 1:
+            raise ValueError("no such file")
+        raise ValueError(f"is neither a shape nor a file: {near_shape(shape)}")
     if size is not None:
         raise ValueError("--size has no effect on a file or on words; use --spacing")
     if words is not None or Path(shape).suffix.lower() == ".svg":
@@ -222,11 +234,20 @@ def points_of(
             if words is None
             else outlines.text_outlines(words, font or "DejaVu Sans")
         )
-        return words or Path(shape).stem, Points(outlines.on_outlines(drawn, agents, spacing), None)
+        points = outlines.on_outlines(drawn, agents, spacing)
+        wide, _, high = np.ptp(points, axis=0)
+        notes.append(
+            f"{wide:,.4g} m wide and {high:,.4g} m high, the nearest two points {spacing:g} m apart"
+        )
+        return words or Path(shape).stem, Points(points, None), notes
     points, colours = read_points(shape)
+    kept = np.arange(len(points))
     if agents is not None and agents != len(points):
         kept = outlines.spread(points, agents)
         points = points[kept]
         colours = colours and tuple(colours[k] for k in kept.tolist())
-    points = centred(points) if spacing is None else outlines.scaled(points, spacing)
-    return Path(shape).stem, Points(points, colours)
+    if spacing is None:
+        return Path(shape).stem, Points(centred(points), colours), notes
+    scaled = outlines.scaled(points, spacing)
+    notes += outlines.scale_in_words(points, scaled, kept)
+    return Path(shape).stem, Points(scaled, colours), notes

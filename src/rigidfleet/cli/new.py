@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -15,6 +16,10 @@ from rigidfleet.cli.check import facts
 from rigidfleet.cli.codes import PASSED
 from rigidfleet.cli.outputs import keep_existing
 from rigidfleet.errors import RigidfleetError
+
+if TYPE_CHECKING:
+    from rigidfleet.formation.point_files import Points
+    from rigidfleet.mission.draft import Scene
 
 
 def new(
@@ -43,6 +48,7 @@ def new(
     name : str
         Name of the mission, written to NAME.toml, or the path of the file.
     shape : str
+        A file of points (CSV, NPY or PLY), a drawing (SVG), text:WORDS, or one of
         line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, shells,
         helix, tetrahedron, octahedron, icosahedron or dodecahedron.
     agents : int
@@ -61,7 +67,7 @@ def new(
         Formations of a show, separated by commas: shapes, files of points, drawings (SVG) or text:WORDS.
         Default: sphere,helix.
     spacing : float
-        Distance of neighbours in a show [m]. Default: 2.
+        Distance of the nearest two vehicles [m] in a show (default: 2) or in points, which are scaled to it.
     force : bool
         Overwrite an existing file.
     quiet : bool
@@ -70,6 +76,7 @@ def new(
         Print a description of the mission as JSON. Ask no questions.
     """
     from rigidfleet._common.files import write_file
+    from rigidfleet.formation.shapes import SHAPES
     from rigidfleet.mission import Mission, draft
     from rigidfleet.mission.files import completed
     from rigidfleet.preflight.check import check as preflight
@@ -86,14 +93,23 @@ def new(
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     keep_existing(file, force=force, other="give another name")
+    notes: list[str] = []
     try:
         if show:
-            text = _show(
-                file, asked, formations or "sphere,helix", 2.0 if spacing is None else spacing
-            )
-        elif formations is not None or spacing is not None:
-            raise ValueError("--formations and --spacing are for a show: add --show")
+            spacing = 2.0 if spacing is None else spacing
+            text = _show(file, asked, formations or "sphere,helix", spacing, notes)
         else:
+            if formations is not None:
+                if shape is not None or "," in formations or formations in SHAPES:
+                    raise ValueError("--formations has more than points, as for a show: add --show")
+                asked["shape"] = formations
+            word = asked.get("shape")
+            if spacing is not None and word is None:
+                raise ValueError("--spacing has no effect without points; use --size")
+            if spacing is not None or (word is not None and word not in SHAPES):
+                if size is not None:
+                    raise ValueError("--size has no effect on points; use --spacing")
+                asked["shape"] = _scene(file, word or "", asked.pop("agents", None), spacing, notes)
             text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
@@ -105,58 +121,89 @@ def new(
         )
     write_file(file, text.encode())
     if json:
-        console.print_json({"file": str(file)} | facts(mission))
+        console.print_json({"file": str(file), "notes": notes} | facts(mission))
     elif not quiet:
+        for note in notes:
+            console.out().print(note, soft_wrap=True, markup=False)
         console.out().print(f"{file}: {mission.size_in_words}", soft_wrap=True)
         console.out().print(f"To fly it: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
 
-def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) -> str:
-    """Text of a show; points in the folder of the mission are written by the name of their file.
+def _show(
+    file: Path, asked: dict[str, Any], formations: str, spacing: float, notes: list[str]
+) -> str:
+    """Text of a show; ``notes`` takes what is to be said of its points.
 
     Raises
     ------
     ValueError
         An option has no effect on a show, or a formation cannot be made.
     """
-    from rigidfleet.cli.design import points_of
     from rigidfleet.formation.shapes import SHAPES
-    from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
 
     options = {"shape": "--shape", "size": "--size", "waypoints": "--to"}
     if unused := " and ".join(option for key, option in options.items() if key in asked):
         raise ValueError(f"{unused}: no effect on a show; use --formations and --spacing")
-    agents, scenes = asked.pop("agents", None), []
+    agents = asked.pop("agents", None)
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
-        files = [w for w in words if Path(w).suffix.lower() in _POINTS and Path(w).exists()]
-        agents = len(points_of(files[0], None)[1].slots) if files else _SHOWN
-    for word in words:
-        path = Path(word)
-        if word in SHAPES or not (word.startswith("text:") or path.exists()):
-            scenes.append(show_draft.scene(word, agents, spacing))
-            continue
-        try:
-            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else None
-            count = agents if own is None else min(agents, len(own.slots))
-            name, points = points_of(word, count, spacing=spacing)
-        except ValueError as error:
-            raise ValueError(f"{word}: {error}") from None
-        folder, there = file.parent.resolve(), path.resolve()
-        source, by_name = word, False
-        whole = own is not None and len(own.slots) == count and there.is_relative_to(folder)
-        if own is not None and whole and proximity.nearest(own.slots).min() >= spacing:
-            source, points, by_name = there.relative_to(folder).as_posix(), own, True
-        scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
+        counts = (len(points.slots) for word in words if (points := _file_points(word)))
+        agents = next(counts, _SHOWN)
+    scenes = [
+        show_draft.scene(word, agents, spacing)
+        if word in SHAPES
+        else _scene(file, word, agents, spacing, notes)
+        for word in words
+    ]
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
     )
 
 
-#: Files of points, and the number of agents of a show without any.
-_POINTS, _SHOWN = (".csv", ".npy", ".ply", ".txt"), 100
+def _scene(
+    file: Path, word: str, agents: int | None, spacing: float | None, notes: list[str]
+) -> Scene:
+    """A formation of a file, of words or of a named shape, for a mission; ``notes`` takes what is to be said of it.
+
+    Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
+
+    Raises
+    ------
+    ValueError
+        It cannot be made.
+    """
+    from rigidfleet.cli.design import points_of
+    from rigidfleet.math import proximity
+    from rigidfleet.mission import show_draft
+
+    try:
+        own = _file_points(word)
+        count = agents if own is None or agents is None else min(agents, len(own.slots))
+        folder, there = file.parent.resolve(), Path(word).resolve()
+        whole = own is not None and count in (None, len(own.slots)) and there.is_relative_to(folder)
+        if own and whole and (spacing or 0.0) <= proximity.nearest(own.slots).min() < math.inf:
+            source = there.relative_to(folder).as_posix()
+            return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
+        name, points, said = points_of(word, count, spacing=spacing)
+    except ValueError as error:
+        raise ValueError(f"{word}: {error}") from None
+    notes += [f"{word}: {note}" for note in said]
+    return show_draft.points_scene(name, points, word, notes=said)
+
+
+def _file_points(word: str) -> Points | None:
+    """The points of a file; None for a drawing, words, or what is no file."""
+    from rigidfleet.formation.point_files import read_points
+    from rigidfleet.formation.shapes import SHAPES
+
+    is_points = word not in SHAPES and Path(word).suffix.lower() != ".svg" and Path(word).is_file()
+    return read_points(word) if is_points else None
+
+
+#: Number of agents of a show without any file of points.
+_SHOWN = 100
 
 
 def _ask(name: str) -> tuple[str, dict[str, Any]]:

@@ -18,6 +18,8 @@ from rigidfleet.typing import Floats, Ints
 
 #: Points of an outline among which is chosen, as a multiple of those asked for, and rounds of improvement.
 _DENSE, _ROUNDS = 20, 30
+#: Typical distance of neighbours beyond which two points are too near to scale all by them, as a multiple of theirs.
+_UNEVEN = 10.0
 #: Steps in which a curve is measured.
 _STEPS = 200
 #: Greatest number of points of an outline.
@@ -115,6 +117,34 @@ def scaled(points: ArrayLike, spacing: float) -> Floats:
     if len(p) < 2:
         raise ValueError("a single point has no spacing")
     return (p - p.mean(axis=0)) * (spacing / float(proximity.nearest(p).min()))
+
+
+def scale_in_words(points: Floats, scaled: Floats, numbers: Ints) -> list[str]:
+    """By how much points (N, 3) [m], which have numbers (N,) in their file, are scaled, and why; none if by 1.
+
+    Raises
+    ------
+    ValueError
+        They become larger than points with such a spacing would have to be: a few of them lie too near to each other.
+    """
+    nearest, whom = KDTree(points).query(points, 2)
+    one = int(nearest[:, 1].argmin())
+    least, typical = float(nearest[one, 1]), float(np.median(nearest[:, 1]))
+    before, after = (float(np.ptp(p, axis=0).max()) for p in (points, scaled))
+    if abs(after - before) <= 1e-9 * before:
+        return []
+    spacing = least * after / before
+    pair = f"points {numbers[one] + 1} and {numbers[whom[one, 1]] + 1}"
+    told = (
+        f"scaled by {after / before:.3g}, from {before:,.4g} m to {after:,.4g} m across: {pair} are {least:.3g} m"
+        f" apart, to become {spacing:.3g} m"
+    )
+    if typical > _UNEVEN * least or after > 2.0 * len(points) * spacing:
+        raise ValueError(
+            f"would be {told}, while points typically stand {typical:.3g} m apart; remove one of the two, or ask for"
+            " fewer agents, for which the points that spread most evenly are kept"
+        )
+    return [told]
 
 
 def spread(points: Floats, count: int) -> Ints:

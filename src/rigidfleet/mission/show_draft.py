@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,12 +17,12 @@ from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
     MOST_AGENTS,
+    Scene,
     aligned,
     blend_time,
     output_step,
     shape_known,
 )
-from rigidfleet.typing import Floats
 
 #: Mass of a vehicle of a show [kg], greatest radius [m], and that as a share of the spacing.
 _MASS, _RADIUS, _SLIM = 0.3, 0.15, 1 / 8
@@ -35,21 +34,6 @@ _ASKED = 0.9
 _SHOWN, _SETTLED = 4.0, 1.0
 #: Rise of a turn of a helix, in spacings.
 _RISE = 1.5
-
-
-class Scene(NamedTuple):
-    """A formation of a show.
-
-    Attributes
-    ----------
-    name : of the formation
-    slots : (N, 3) [m]
-    table : lines of its table, `shape` and `size`, or `slots`
-    """
-
-    name: str
-    slots: Floats
-    table: str
 
 
 def scene(shape: str, agents: int, spacing: float) -> Scene:
@@ -76,14 +60,17 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
     return Scene(shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n')
 
 
-def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
-    """A formation of points, written as numbers, or by the name of their file."""
+def points_scene(
+    name: str, points: Points, source: str, *, by_name: bool = False, notes: Sequence[str] = ()
+) -> Scene:
+    """A formation of points, written as numbers, with notes on them as comments, or by the name of their file."""
     slots, colours = points
     if by_name:
         return Scene(name, slots, f"slots = {json.dumps(source)}\n")
     lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"
     rows = "".join(f"    {row},\n" for row in np.round(slots + 0.0, 6).tolist())
-    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n{lights}")
+    about = "".join(f"# {note}\n" for note in (f"points of {json.dumps(source)}", *notes))
+    return Scene(name, slots, f"{about}slots = [\n{rows}]\n{lights}")
 
 
 def _rested(one: Scene, agents: int) -> Scene:
@@ -124,7 +111,14 @@ def show(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = scene(ground, agents, spacing)._replace(name="pads")
-    scenes = [_rested(one, agents) for one in scenes]
+    tables, named = {"pads": pads}, []
+    for one in (_rested(one, agents) for one in scenes):
+        key, k = one.name, 2
+        while key == "pads" or tables.get(key, one).table != one.table:
+            key, k = f"{one.name} {k}", k + 1
+        tables[key] = one._replace(name=key)
+        named.append(tables[key])
+    scenes = named
     for one in scenes:
         if len(one.slots) != agents:
             raise ValueError(f"'{one.name}' has {len(one.slots)} points for {agents} agents")
@@ -135,7 +129,6 @@ def show(
     height = max(_LOWEST, math.ceil(max(-one.slots[:, 2].min() for one in scenes) + _ALOFT))
     start = radius + _STANDS
     climb = blend_time(height - start)
-    tables = {one.name: one for one in (pads, *scenes)}
     places, lasts, phases, taken = pads.slots, 2.0 * climb, [], set[str]()
     for k, one in enumerate([*scenes, pads]):
         slots = one.slots - one.slots.mean(axis=0)
