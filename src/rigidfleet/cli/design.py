@@ -112,8 +112,8 @@ def design(
         write_file(out, table.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
-        data = {"name": name, "toml": text, "limits": limits, "graphs": found, "notes": notes}
-        console.print_json(data)
+        data = {"name": name, "toml": text, "limits": limits, "graphs": found}
+        console.print_json(data | {"notes": notes})
         return PASSED
     table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "class")
     table.columns[0].no_wrap = True
@@ -208,8 +208,7 @@ def points_of(
     from rigidfleet.math.rigid_body import centred
     from rigidfleet.mission.findings import near_shape
 
-    notes: list[str] = []
-    words = shape.removeprefix("text:") if shape.startswith("text:") else None
+    words, notes = shape.removeprefix("text:") if shape.startswith("text:") else None, list[str]()
     if font is not None and words is None:
         raise ValueError("--font has no effect without text:WORDS; remove it")
     if shape in SHAPES:
@@ -236,18 +235,15 @@ def points_of(
         )
         points = outlines.on_outlines(drawn, agents, spacing)
         wide, _, high = np.ptp(points, axis=0)
-        notes.append(
-            f"{wide:,.4g} m wide and {high:,.4g} m high, the nearest two points {spacing:g} m apart"
-        )
+        notes += [
+            f"{wide:,.4g} m wide, {high:,.4g} m high: the nearest two are {spacing:g} m apart"
+        ]
         return words or Path(shape).stem, Points(points, None), notes
     points, colours = read_points(shape)
     kept = np.arange(len(points))
     if agents is not None and agents != len(points):
         kept = outlines.spread(points, agents)
-        points = points[kept]
-        colours = colours and tuple(colours[k] for k in kept.tolist())
-    if spacing is None:
-        return Path(shape).stem, Points(centred(points), colours), notes
-    scaled = outlines.scaled(points, spacing)
-    notes += outlines.scale_in_words(points, scaled, kept)
-    return Path(shape).stem, Points(scaled, colours), notes
+        points, colours = points[kept], colours and tuple(colours[k] for k in kept.tolist())
+    slots = centred(points) if spacing is None else outlines.scaled(points, spacing)
+    notes += outlines.scale_in_words(points, slots, kept)
+    return Path(shape).stem, Points(slots, colours), notes

@@ -6,7 +6,7 @@ import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
@@ -16,10 +16,6 @@ from rigidfleet.cli.check import facts
 from rigidfleet.cli.codes import PASSED
 from rigidfleet.cli.outputs import keep_existing
 from rigidfleet.errors import RigidfleetError
-
-if TYPE_CHECKING:
-    from rigidfleet.formation.point_files import Points
-    from rigidfleet.mission.draft import Scene
 
 
 def new(
@@ -99,17 +95,12 @@ def new(
             spacing = 2.0 if spacing is None else spacing
             text = _show(file, asked, formations or "sphere,helix", spacing, notes)
         else:
-            if formations is not None:
-                if shape is not None or "," in formations or formations in SHAPES:
-                    raise ValueError("--formations has more than points, as for a show: add --show")
-                asked["shape"] = formations
-            word = asked.get("shape")
-            if spacing is not None and word is None:
-                raise ValueError("--spacing has no effect without points; use --size")
-            if spacing is not None or (word is not None and word not in SHAPES):
-                if size is not None:
-                    raise ValueError("--size has no effect on points; use --spacing")
-                asked["shape"] = _scene(file, word or "", asked.pop("agents", None), spacing, notes)
+            if formations is not None and (shape or "," in formations or formations in SHAPES):
+                raise ValueError("--formations has more than points, as for a show: add --show")
+            word = formations or asked.get("shape", draft.shape_for(agents))
+            if word not in SHAPES or spacing is not None:
+                count, sizes = asked.pop("agents", None), asked.pop("size", None)
+                asked["shape"] = _scene(file, word, count, spacing, notes, sizes)
             text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
@@ -163,9 +154,14 @@ def _show(
 
 
 def _scene(
-    file: Path, word: str, agents: int | None, spacing: float | None, notes: list[str]
-) -> Scene:
-    """A formation of a file, of words or of a named shape, for a mission; ``notes`` takes what is to be said of it.
+    file: Path,
+    word: str,
+    agents: int | None,
+    spacing: float | None,
+    notes: list[str],
+    size: Any = None,
+) -> Any:
+    """A formation (`draft.Scene`) of a file or of words for a mission; ``notes`` takes what is to be said of it.
 
     Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
 
@@ -178,28 +174,28 @@ def _scene(
     from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
 
-    try:
-        own = _file_points(word)
-        count = agents if own is None or agents is None else min(agents, len(own.slots))
-        folder, there = file.parent.resolve(), Path(word).resolve()
-        whole = own is not None and count in (None, len(own.slots)) and there.is_relative_to(folder)
-        if own and whole and (spacing or 0.0) <= proximity.nearest(own.slots).min() < math.inf:
+    folder, there, own = file.parent.resolve(), Path(word).resolve(), _file_points(word)
+    if own is not None and there.is_relative_to(folder) and size is None:
+        enough = (spacing or 0.0) <= proximity.nearest(own.slots).min() < math.inf
+        if enough and (agents or math.inf) >= len(own.slots):
             source = there.relative_to(folder).as_posix()
             return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
-        name, points, said = points_of(word, count, spacing=spacing)
+    try:
+        agents = agents if own is None or agents is None else min(agents, len(own.slots))
+        name, points, said = points_of(word, agents, size, spacing)
     except ValueError as error:
         raise ValueError(f"{word}: {error}") from None
     notes += [f"{word}: {note}" for note in said]
     return show_draft.points_scene(name, points, word, notes=said)
 
 
-def _file_points(word: str) -> Points | None:
-    """The points of a file; None for a drawing, words, or what is no file."""
+def _file_points(word: str) -> Any:
+    """The `Points` of a file; None for a drawing, words, or what is no file."""
     from rigidfleet.formation.point_files import read_points
-    from rigidfleet.formation.shapes import SHAPES
 
-    is_points = word not in SHAPES and Path(word).suffix.lower() != ".svg" and Path(word).is_file()
-    return read_points(word) if is_points else None
+    return (
+        read_points(word) if Path(word).suffix.lower() != ".svg" and Path(word).is_file() else None
+    )
 
 
 #: Number of agents of a show without any file of points.
