@@ -229,7 +229,7 @@ def points_of(
         if agents is None or spacing is None:
             raise ValueError("an outline needs --agents and --spacing")
         drawn = (
-            outlines.svg_outlines(shape)
+            outlines.svg_outlines(shape, notes)
             if words is None
             else outlines.text_outlines(words, font or "DejaVu Sans")
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 
@@ -20,44 +19,37 @@ from rigidfleet.typing import Floats, Ints
 _DENSE, _ROUNDS = 20, 30
 #: Typical distance of neighbours beyond which two points are too near to scale all by them, as a multiple of theirs.
 _UNEVEN = 10.0
-#: Steps in which a curve is measured.
-_STEPS = 200
 #: Greatest number of points of an outline.
 _MOST = 5000
 
 
-def svg_outlines(path: str | Path) -> list[Floats]:
+def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Floats]:
     """Outlines (K, 2) of the shapes of an SVG drawing as polygons, y up; a closed one ends where it begins.
+
+    Shapes are those that a browser draws. Strokes are drawn by their middle lines, fills by their edges; ``notes``
+    takes what is not drawn.
 
     Raises
     ------
     ValueError
         The file is no SVG drawing, or has no outline.
     RigidfleetError
-        svgpathtools is not installed, or (MissionError) the file cannot be read.
+        svgelements is not installed, or (MissionError) the file cannot be read.
     """
     try:
-        import svgpathtools
+        from rigidfleet.formation.drawings import Drawing
     except ImportError:
         raise RigidfleetError(
-            "Drawings need svgpathtools. Install it: pip install svgpathtools."
+            "Drawings need svgelements. Install it: pip install svgelements."
         ) from None
-    text = read_bytes(path)
+    data = read_bytes(path)
     try:
-        paths = svgpathtools.Document(io.StringIO(text.decode("utf-8-sig"))).paths()
-        parts = [part for found in paths for part in found.continuous_subpaths()]
+        drawing = Drawing(data)
     except Exception as error:  # its parsers raise errors of many kinds
         raise ValueError(f"is no SVG drawing: {' '.join(str(error).split())}") from None
-    found = []
-    for part in parts:
-        ends = [np.array([segment.point(x) for x in _steps(segment)]) for segment in part]
-        z = np.concatenate([[part[0].start], *(end[1:] for end in ends)])
-        found.append(np.column_stack([z.real, -z.imag]))
-    return _drawn(found)
-
-
-def _steps(segment: object) -> Floats:
-    return np.linspace(0.0, 1.0, 2 if type(segment).__name__ == "Line" else _STEPS)
+    if notes is not None:
+        notes += [f"{what} ({n}x)" if n > 1 else what for what, n in drawing.notes.items()]
+    return _drawn([x * (1.0, -1.0) for x in drawing.outlines])
 
 
 def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
