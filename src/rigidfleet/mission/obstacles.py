@@ -13,7 +13,7 @@ from pydantic import Field
 
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
-from rigidfleet.mission.files import NOT_A_FILE
+from rigidfleet.mission.files import FILL, NOT_A_FILE, without_data
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.values import (
     Angle,
@@ -44,6 +44,11 @@ class Solid(Part):
     @abstractmethod
     def form(self) -> Form:
         """The shape, where its keys place it."""
+
+    @property
+    def carries(self) -> bool:
+        """Whether it counts as ground where it is below a vehicle: terrain does, and a box at rest (a roof)."""
+        return isinstance(self, Box | Heights) and not self.zone and not len(self.motion[1])
 
     @property
     def corners(self) -> tuple[float, ...] | None:
@@ -245,6 +250,11 @@ class Ground(Part):
         return False
 
     @property
+    def carries(self) -> bool:
+        """A ground is what vehicles stand on."""
+        return True
+
+    @property
     def corners(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m] of a box that is infinite except at the top."""
         return (*(-math.inf,) * 3, math.inf, math.inf, self.height)
@@ -316,6 +326,8 @@ def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> None:
         problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
         remedy = "give two rows or more, all of the same length, two or more"
         collector.add((*path, "heights"), problem, remedy, None)
+    elif why := without_data(thing.heights):
+        collector.add((*path, "heights"), why, FILL, None)
     elif count > bounds.HEIGHTS:
         problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"
         collector.add((*path, "heights"), problem, "use a coarser grid", None)
