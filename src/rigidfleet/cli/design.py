@@ -48,7 +48,8 @@ def design(
     ----------
     shape : str
         A named shape; a file of points (CSV, NPY or PLY) with x, y, z of one agent per line; a drawing (SVG); or
-        text:WORDS. Drawings and words stand upright, x to the east and z up.
+        text:WORDS, in outlines, or strokes:WORDS, in single strokes. Drawings and words stand upright, x to the east
+        and z up.
     agents : int
         Number of agents. Default: as many as the shape needs, or the file has.
     size : float
@@ -56,7 +57,7 @@ def design(
     spacing : float
         Distance of the nearest two agents of a file or of words [m], which are scaled to it.
     font : str
-        Font of text:WORDS. Default: DejaVu Sans.
+        Font of text:WORDS (default: DejaVu Sans) or of strokes:WORDS (default: futural).
     extra : str
         Number of additional, redundant edges, or "complete" for all pairs.
     sensing_range : float
@@ -208,9 +209,11 @@ def points_of(
     from rigidfleet.math.rigid_body import centred
     from rigidfleet.mission.findings import near_shape
 
-    words, notes = shape.removeprefix("text:") if shape.startswith("text:") else None, list[str]()
-    if font is not None and words is None:
-        raise ValueError("--font has no effect without text:WORDS; remove it")
+    kind, _, words = shape.partition(":")
+    letters = {"text": outlines.text_outlines, "strokes": outlines.stroke_outlines}.get(kind)
+    notes: list[str] = []
+    if font is not None and letters is None:
+        raise ValueError("--font has no effect without text:WORDS or strokes:WORDS; remove it")
     if shape in SHAPES:
         form = SHAPES[shape]
         count = form.agents.start if agents is None else agents
@@ -219,26 +222,23 @@ def points_of(
         if agents is None and len(form.agents) > 1:
             raise ValueError(f"takes {agents_taken(shape)}; give --agents")
         return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None), notes
-    if words is None and not Path(shape).exists():
+    if letters is None and not Path(shape).exists():
         if Path(shape).suffix or len(Path(shape).parts) > 1:
             raise ValueError("no such file")
         raise ValueError(f"is neither a shape nor a file: {near_shape(shape)}")
     if size is not None:
         raise ValueError("--size has no effect on a file or on words; use --spacing")
-    if words is not None or Path(shape).suffix.lower() == ".svg":
+    if letters is not None or Path(shape).suffix.lower() == ".svg":
         if agents is None or spacing is None:
             raise ValueError("an outline needs --agents and --spacing")
-        drawn = (
-            outlines.svg_outlines(shape, notes)
-            if words is None
-            else outlines.text_outlines(words, font or "DejaVu Sans")
-        )
+        own = [] if font is None else [font]
+        drawn = letters(words, *own) if letters else outlines.svg_outlines(shape, notes)
         points = outlines.on_outlines(drawn, agents, spacing)
         wide, _, high = np.ptp(points, axis=0)
         notes += [
             f"{wide:,.4g} m wide, {high:,.4g} m high: the nearest two are {spacing:g} m apart"
         ]
-        return words or Path(shape).stem, Points(points, None), notes
+        return words if letters else Path(shape).stem, Points(points, None), notes
     points, colours = read_points(shape)
     kept = np.arange(len(points))
     if agents is not None and agents != len(points):

@@ -44,7 +44,7 @@ def new(
     name : str
         Name of the mission, written to NAME.toml, or the path of the file.
     shape : str
-        A file of points (CSV, NPY or PLY), a drawing (SVG), text:WORDS, or one of
+        A file of points (CSV, NPY or PLY), a drawing (SVG), text:WORDS or strokes:WORDS, or one of
         line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, shells,
         helix, tetrahedron, octahedron, icosahedron or dodecahedron.
     agents : int
@@ -60,7 +60,8 @@ def new(
     show : bool
         Write a show: take off from a grid, go through formations, return and land.
     formations : str
-        Formations of a show, separated by commas: shapes, files of points, drawings (SVG) or text:WORDS.
+        Formations of a show, separated by commas: shapes, files of points, drawings (SVG), text:WORDS
+        or strokes:WORDS (letters of single strokes).
         Default: sphere,helix.
     spacing : float
         Distance of the nearest two vehicles [m] in a show (default: 2) or in points, which are scaled to it.

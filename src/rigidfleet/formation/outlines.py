@@ -73,6 +73,36 @@ def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
     return _drawn([np.array(x) for x in path.to_polygons(closed_only=False)])
 
 
+def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
+    """Lines (K, 2) of words in a font of single strokes (Hershey, 1967), of height about 1, as polygons.
+
+    Raises
+    ------
+    ValueError
+        There is no such font, a letter is not in it, or the words have no outline.
+    RigidfleetError
+        Hershey-Fonts is not installed.
+    """
+    try:
+        from HersheyFonts import HersheyFonts
+    except ImportError:
+        raise RigidfleetError(
+            "Words of strokes need Hershey-Fonts. Install it: pip install Hershey-Fonts."
+        ) from None
+    letters = HersheyFonts()
+    if font not in letters.default_font_names:
+        raise ValueError(
+            f"there is no font {font!r}; fonts: {', '.join(letters.default_font_names)}"
+        )
+    letters.load_default_font(font)
+    letters.normalize_rendering(1.0)
+    if missing := "".join(x for x in words if x not in letters.all_glyphs):
+        raise ValueError(f"has letters that {font!r} lacks: {missing}")
+    return _drawn(
+        [np.array(x, dtype=np.float64) for x in map(list, letters.strokes_for_text(words))]
+    )
+
+
 def _drawn(outlines: list[Floats]) -> list[Floats]:
     found = [x for x in outlines if len(x) > 1 and np.isfinite(x).all() and np.ptp(x, axis=0).any()]
     if not found:
