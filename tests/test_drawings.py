@@ -5,6 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from rigidfleet import assess, load_mission, simulate
 from rigidfleet.cli.app import main
@@ -225,7 +226,7 @@ def test_near_duplicates_do_not_make_giants(tmp_path, monkeypatch, capsys, case,
 
 @pytest.mark.parametrize("option", ["--shape", "--formations"])
 def test_new_missions_of_points(tmp_path, monkeypatch, option):
-    """A new mission without a show forms the points of a file, of its own sizes, and passes; likewise words."""
+    """A new mission of points needs no `--show`: it forms those of a file in their own size, or words, and passes."""
     monkeypatch.chdir(tmp_path)
     write_points(tmp_path / "ring 1.csv", RING)
     assert main(["new", "m", option, "ring 1.csv"]) == 0
@@ -233,7 +234,35 @@ def test_new_missions_of_points(tmp_path, monkeypatch, option):
     np.testing.assert_allclose(written_slots(mission, "ring 1"), RING, atol=1e-9)
     result = simulate(mission)
     assert assess(result).passed
-    r = result.position[-1] - result.position[-1].mean(axis=0)
-    np.testing.assert_allclose(np.linalg.norm(r, axis=1), 4.0, atol=0.05)
-    assert main(["new", "w", option, "text:HI", "--agents", "24", "--spacing", "2"]) == 0
-    assert assess(simulate(load_mission(tmp_path / "w.toml"))).passed
+    shown = result.position[np.searchsorted(result.time, result.phases[1].t_end) - 1]
+    np.testing.assert_allclose(np.linalg.norm(shown - shown.mean(axis=0), axis=1), 4.0, atol=0.05)
+    for words in "text:HI", "strokes:HI":
+        assert main(["new", "w", option, words, "--agents", "24", "--spacing", "2", "--force"]) == 0
+        assert assess(simulate(load_mission(tmp_path / "w.toml"))).passed
+
+
+def test_words_of_single_strokes():
+    """Sixty points of FLY lie, 2 m apart, on all strokes of Hershey's Simplex Roman, as its table has them."""
+    # Corners of F, L and Y, and the widths of the letters, by the numbers of the Hershey fonts (NBS, 1967).
+    strokes = [(4, 21, 4, 0), (4, 21, 17, 21), (4, 11, 12, 11)]
+    strokes += [(22, 21, 22, 0), (22, 0, 34, 0)]
+    strokes += [(36, 21, 44, 11), (44, 11, 44, 0), (52, 21, 44, 11)]
+    p = outlines.on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)[:, [0, 2]]
+    assert KDTree(p).query(p, 2)[0][:, 1].min() == pytest.approx(2.0)
+    a, b = np.array(strokes, dtype=float).reshape(-1, 2, 2).transpose(1, 0, 2)
+    p = (p - p.min(axis=0)) * (21.0 / np.ptp(p[:, 1])) + [4.0, 0.0]
+    share = np.clip(
+        np.einsum("psa,sa->ps", p[:, None] - a, b - a) / ((b - a) ** 2).sum(axis=1), 0, 1
+    )
+    off = np.linalg.norm(a + share[..., None] * (b - a) - p[:, None], axis=2)
+    assert off.min(axis=1).max() < 0.02
+    assert set(off.argmin(axis=1)) == set(range(len(strokes)))  # no stroke is left out
+
+
+def test_letters_that_are_not_in_the_font(tmp_path, capsys):
+    """Letters without strokes are named, and nothing is written without them."""
+    out = tmp_path / "x.csv"
+    for words, error in (("strokes:Füße", "lacks: üß"), ("strokes: ", "has no outline")):
+        assert main(["design", words, "--agents", "9", "--spacing", "1", "--out", str(out)]) != 0
+        assert error in capsys.readouterr().err
+    assert not out.exists()

@@ -91,17 +91,15 @@ def new(
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     keep_existing(file, force=force, other="give another name")
     notes: list[str] = []
+    if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
+        show, formations = True, formations or asked.pop("shape")
     try:
         if show:
             spacing = 2.0 if spacing is None else spacing
             text = _show(file, asked, formations or "sphere,helix", spacing, notes)
+        elif formations is not None or spacing is not None:
+            raise ValueError("--formations and --spacing are for a show: add --show")
         else:
-            if formations is not None and (shape or "," in formations or formations in SHAPES):
-                raise ValueError("--formations has more than points, as for a show: add --show")
-            word = formations or asked.get("shape", draft.shape_for(agents))
-            if word not in SHAPES or spacing is not None:
-                count, sizes = asked.pop("agents", None), asked.pop("size", None)
-                asked["shape"] = _scene(file, word, count, spacing, notes, sizes)
             text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
@@ -132,7 +130,6 @@ def _show(
     ValueError
         An option has no effect on a show, or a formation cannot be made.
     """
-    from rigidfleet.formation.shapes import SHAPES
     from rigidfleet.mission import show_draft
 
     options = {"shape": "--shape", "size": "--size", "waypoints": "--to"}
@@ -143,26 +140,14 @@ def _show(
     if agents is None:
         counts = (len(points.slots) for word in words if (points := _file_points(word)))
         agents = next(counts, _SHOWN)
-    scenes = [
-        show_draft.scene(word, agents, spacing)
-        if word in SHAPES
-        else _scene(file, word, agents, spacing, notes)
-        for word in words
-    ]
+    scenes = [_scene(file, word, agents, spacing, notes) for word in words]
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
     )
 
 
-def _scene(
-    file: Path,
-    word: str,
-    agents: int | None,
-    spacing: float | None,
-    notes: list[str],
-    size: Any = None,
-) -> Any:
-    """A formation (`draft.Scene`) of a file or of words for a mission; ``notes`` takes what is to be said of it.
+def _scene(file: Path, word: str, agents: int, spacing: float, notes: list[str]) -> Any:
+    """A formation of a show of a shape, a file or words; ``notes`` takes what is to be said of it.
 
     Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
 
@@ -172,18 +157,20 @@ def _scene(
         It cannot be made.
     """
     from rigidfleet.cli.design import points_of
+    from rigidfleet.formation.shapes import SHAPES
     from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
 
+    if word in SHAPES:
+        return show_draft.scene(word, agents, spacing)
     folder, there, own = file.parent.resolve(), Path(word).resolve(), _file_points(word)
-    if own is not None and there.is_relative_to(folder) and size is None:
-        enough = (spacing or 0.0) <= proximity.nearest(own.slots).min() < math.inf
-        if enough and (agents or math.inf) >= len(own.slots):
-            source = there.relative_to(folder).as_posix()
-            return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
+    count = agents if own is None else min(agents, len(own.slots))
+    whole = own is not None and count == len(own.slots) and there.is_relative_to(folder)
+    if own and whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
+        source = there.relative_to(folder).as_posix()
+        return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
     try:
-        agents = agents if own is None or agents is None else min(agents, len(own.slots))
-        name, points, said = points_of(word, agents, size, spacing)
+        name, points, said = points_of(word, count, spacing=spacing)
     except ValueError as error:
         raise ValueError(f"{word}: {error}") from None
     notes += [f"{word}: {note}" for note in said]

@@ -66,8 +66,8 @@ class Drawing:
         self.notes.update(
             f"{key} is not followed: all is drawn" for key in re.findall(_IGNORED, text)
         )
-        drawn = svg.SVG.parse(io.StringIO(text), ppi=96, width=size[0], height=size[1])
-        for element in drawn.elements():
+        page = svg.SVG.parse(io.StringIO(text), ppi=96, width=size[0], height=size[1])
+        for element in page.elements():
             if isinstance(element, svg.Shape | svg.Text | svg.Image):
                 self._draw(element)
 

@@ -90,10 +90,6 @@ def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
             "Words of strokes need Hershey-Fonts. Install it: pip install Hershey-Fonts."
         ) from None
     letters = HersheyFonts()
-    if font not in letters.default_font_names:
-        raise ValueError(
-            f"there is no font {font!r}; fonts: {', '.join(letters.default_font_names)}"
-        )
     letters.load_default_font(font)
     letters.normalize_rendering(1.0)
     if missing := "".join(x for x in words if x not in letters.all_glyphs):
@@ -138,7 +134,9 @@ def scaled(points: ArrayLike, spacing: float) -> Floats:
         raise ValueError(f"a spacing must be a positive length [m], not {spacing:g}")
     if len(p) < 2:
         raise ValueError("a single point has no spacing")
-    return (p - p.mean(axis=0)) * (spacing / float(proximity.nearest(p).min()))
+    if not (least := float(proximity.nearest(p).min())) > 0.0:
+        raise ValueError("two points are the same: nothing scales them apart")
+    return (p - p.mean(axis=0)) * (spacing / least)
 
 
 def scale_in_words(points: Floats, scaled: Floats, numbers: Ints) -> list[str]:
@@ -149,24 +147,23 @@ def scale_in_words(points: Floats, scaled: Floats, numbers: Ints) -> list[str]:
     ValueError
         They become larger than points with such a spacing would have to be: a few of them lie too near to each other.
     """
-    nearest, whom = KDTree(points).query(points, 2)
-    one = int(nearest[:, 1].argmin())
-    least, typical = float(nearest[one, 1]), float(np.median(nearest[:, 1]))
-    before, after = (float(np.ptp(p, axis=0).max()) for p in (points, scaled))
+    nearest, whom = (x[:, 1] for x in KDTree(points).query(points, 2))
+    one, typical = int(nearest.argmin()), float(np.median(nearest))
+    least, before, after = nearest[one], np.ptp(points, axis=0).max(), np.ptp(scaled, axis=0).max()
     if abs(after - before) <= 1e-9 * before:
         return []
     spacing = least * after / before
-    pair = f"points {numbers[one] + 1} and {numbers[whom[one, 1]] + 1}"
-    told = (
+    pair = f"points {numbers[one] + 1} and {numbers[whom[one]] + 1}"
+    words = (
         f"scaled by {after / before:.3g}, from {before:,.4g} m to {after:,.4g} m across: {pair} are {least:.3g} m"
         f" apart, to become {spacing:.3g} m"
     )
     if typical > _UNEVEN * least or after > 2.0 * len(points) * spacing:
         raise ValueError(
-            f"would be {told}, while points typically stand {typical:.3g} m apart; remove one of the two, or ask for"
+            f"would be {words}, while points typically stand {typical:.3g} m apart; remove one of the two, or ask for"
             " fewer agents, for which the points that spread most evenly are kept"
         )
-    return [told]
+    return [words]
 
 
 def spread(points: Floats, count: int) -> Ints:

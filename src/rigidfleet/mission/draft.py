@@ -6,11 +6,9 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission.findings import near_shape
@@ -37,25 +35,10 @@ _ALL_PAIRS, MOST_AGENTS = 40, 2000
 _COLUMN = 34
 
 
-class Scene(NamedTuple):
-    """A formation of a new mission.
-
-    Attributes
-    ----------
-    name : of the formation
-    slots : (N, 3) [m]
-    table : lines of its table, `shape` and `size`, or `slots`
-    """
-
-    name: str
-    slots: Floats
-    table: str
-
-
 def draft(
     name: str,
     *,
-    shape: str | Scene | None = None,
+    shape: str | None = None,
     agents: int | None = None,
     size: Sequence[float] = (SIZE,),
     mass: float = MASS,
@@ -71,8 +54,7 @@ def draft(
 
     Parameters
     ----------
-    shape : a name in `rigidfleet.formation.shapes.SHAPES`, or a formation of points, which has its own number and
-        size; by default a shape that suits the number of agents
+    shape : a name in `rigidfleet.formation.shapes.SHAPES`; by default one that suits the number of agents
     agents : number of agents; by default as many as the shape needs
     size : edge length of the shape [m], or its three sizes
     mass : mass of each agent [kg]
@@ -86,21 +68,18 @@ def draft(
         The shape is unknown or does not suit the number of agents or sizes; there are too many agents; a number is
         not finite; or a waypoint is too close to the ground.
     """
-    if isinstance(shape, Scene):
-        one, n = shape, len(shape.slots)
-    else:
-        shape = shape_for(agents) if shape is None else shape
-        shape_known(shape)
-        one, n = None, agents_for(shape) if agents is None else agents
+    if shape is None:
+        shape = shape_for(agents)
+    shape_known(shape)
+    n = agents_for(shape) if agents is None else agents
     if n > MOST_AGENTS:
         raise ValueError(f"{n} agents are too many: a new mission has at most {MOST_AGENTS}")
     if not np.isfinite([thrust_limit or 0.0, mass, *size, *np.ravel(waypoints or ())]).all():
         raise ValueError("masses, sizes, limits and waypoints must be finite")
-    one = one or _shaped(str(shape), size, n)
-    slots = one.slots - (one.slots.mean(axis=0) if one is shape else 0.0)
+    slots = shapes.slots(shape, list(size) * (3 if _is_box(shape, size) else 1), n)
     nearest = float(proximity.nearest(slots).min()) if n > 1 else SIZE
     radius = min(RADIUS, nearest / 4)
-    start, below = _start(slots, min(_APART, nearest), 0 if one is shape else _FEW)
+    start, below = _start(slots, min(_APART, nearest))
     low = float(-slots[:, 2].min()) + radius
     height = max(5.0, math.ceil(np.ptp(slots[:, 2]) + 3.0))
     if waypoints is None:
@@ -108,8 +87,8 @@ def draft(
     for number, waypoint in enumerate(waypoints, start=1):
         if waypoint[2] < low:
             raise ValueError(
-                f"waypoint {number} is at z = {waypoint[2]:g} m, but the {one.name} reaches {low:.3g} m below its"
-                f" centre: use z = {math.ceil(low + 0.5)} m or higher"
+                f"waypoint {number} is at z = {waypoint[2]:g} m, but the {shape} reaches {low:.3g} m below its centre:"
+                f" use z = {math.ceil(low + 0.5)} m or higher"
             )
     centre = start.mean(axis=0)
     aloft = np.array([centre[0], centre[1], height])
@@ -120,21 +99,22 @@ def draft(
     climb, flights = _time(aloft - centre), _flights(aloft, waypoints)
     lasts = climb + blend + _SETTLE + sum(time for _, time in flights) + _HOLD
     limit = math.ceil(LIFT * mass * 9.81) if thrust_limit is None else thrust_limit
-    title = f"{n} vehicles fly as a {one.name}" if n > 1 else "One vehicle flies"
-    title = " ".join(title.split())  # a name may have line breaks
+    extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
+    if _is_box(shape, size):
+        extent = json.dumps([float(size[0])] * 3)
     head = _HEAD.format(
         name=json.dumps(name, ensure_ascii=False),
-        title=json.dumps(title, ensure_ascii=False),
-        what=title,
+        title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
         file=file or f"{name}.toml",
         mass=f"{mass:g}",
         start=_rows(start),
         radius=f"{radius:.3g}",
         thrust=f"{limit:g}",
-        key=toml_key(one.name),
-        table=one.table,
-        shape=json.dumps(one.name),
+        shape=shape,
+        size=extent,
         edges="" if n <= _ALL_PAIRS else _NO_EDGES,
+        takes=shapes.agents_taken(shape),
+        text=shapes.SHAPES[shape].text,
         separation=f"{min(0.5, nearest / 6):.3g}",
         # In a small spatial shape, or one of many agents, some agents pass below others in any case.
         below="" if below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0) else "# ",
@@ -168,25 +148,15 @@ def agents_for(shape: str) -> int:
     return usual.get(shape, taken.start)
 
 
-def _shaped(shape: str, size: Sequence[float], n: int) -> Scene:
-    """A named shape of a size, or of three sizes, [m]."""
-    size = [float(x) for x in size] * (
-        3 if len(size) == 1 and shapes.SHAPES[shape].sizes == 3 else 1
-    )
-    written = json.dumps(size) if len(size) > 1 else f"{size[0]:g}"
-    return Scene(
-        shape,
-        shapes.slots(shape, size, n),
-        f"# {shapes.agents_taken(shape)}: {shapes.SHAPES[shape].text}\n"
-        f'shape = "{shape}"                 # or slots = [[x, y, z], ...], one per agent [m]\n'
-        f"size = {written}                          # [m]\n",
-    )
+def _is_box(shape: str, size: Sequence[float]) -> bool:
+    """Whether one size is given for a shape with three sizes."""
+    return len(size) == 1 and shapes.SHAPES[shape].sizes == 3
 
 
-def _start(slots: Floats, apart: float, few: int) -> tuple[Floats, bool]:
+def _start(slots: Floats, apart: float) -> tuple[Floats, bool]:
     """Return start positions (N, 3) [m] on the ground, and whether each is below, or beside the point below, its slot.
 
-    Where slots lie above each other, up to ``few`` agents move outwards until there is room; more agents start on a
+    Where slots lie above each other, up to `_FEW` agents move outwards until there is room; more agents start on a
     grid.
     """
     n = len(slots)
@@ -194,10 +164,9 @@ def _start(slots: Floats, apart: float, few: int) -> tuple[Floats, bool]:
     ground = np.array([0.0, 0.0, 0.3])
     if n == 1 or proximity.nearest(across).min() >= apart * (1 - 1e-9):
         return across + ground, True
-    if n > few:
+    if n > _FEW:
         # Straight paths to the nearest slots need this spacing (docs/many.md).
-        where = "grid" if n in shapes.SHAPES["grid"].agents else "line"
-        return shapes.slots(where, max(_WIDE, apart), n) + ground, False
+        return shapes.slots("grid", max(_WIDE, apart), n) + ground, False
     order = np.argsort(slots[:, 2], kind="stable")
     placed: list[Floats] = []
     start = np.empty_like(slots)
@@ -258,7 +227,7 @@ def _rows(values: Floats) -> str:
 
 
 _HEAD = """\
-# {what}.
+# {title}.
 #
 # Change any number, then check the mission and fly it:
 #     rigidfleet check {file}
@@ -267,7 +236,7 @@ _HEAD = """\
 
 schema_version = 1
 name = {name}                   # results are written to flights/NAME
-title = {title}
+title = "{title}"
 smoothness = "jerk"               # acceleration and jerk are continuous; "lqr": the legs of the paper
 {keys}
 [agents]
@@ -277,8 +246,10 @@ position = [                      # [m] initial positions
 radius = {radius}                     # [m] radius of the sphere around each agent; spheres must not touch
 thrust_limit = {thrust}                # [N] of each agent; the verdict fails if thrust exceeds it
 
-[formations.{key}]
-{table}{edges}
+[formations.{shape}]              # {takes}: {text}
+shape = "{shape}"                 # or slots = [[x, y, z], ...], one per agent [m]
+size = {size}                          # [m]
+{edges}
 # To change to another shape in flight, add a table [formations.NAME] and a phase with
 #     kind = "reshape", formation = "NAME", duration = 6.0
 
@@ -308,7 +279,7 @@ duration = {climb}
 
 [[phases]]                        # take the formation
 kind = "establish"
-formation = {shape}
+formation = "{shape}"
 {blend}duration = {establish}
 """
 

@@ -475,7 +475,8 @@ class Mission(Contents):
     @cached_property
     def roofs(self) -> Solids:
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
-        return joined([o.solid for o in self.obstacles if o.carries and o.kind != "ground"])
+        things = (o for o in self.obstacles if o.kind in ("box", "heights") and not o.zone)
+        return joined([o.solid for o in things if not o.solid.moves])
 
     def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.

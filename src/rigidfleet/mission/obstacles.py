@@ -46,11 +46,6 @@ class Solid(Part):
         """The shape, where its keys place it."""
 
     @property
-    def carries(self) -> bool:
-        """Whether it counts as ground where it is below a vehicle: terrain does, and a box at rest (a roof)."""
-        return isinstance(self, Box | Heights) and not self.zone and not len(self.motion[1])
-
-    @property
     def corners(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m] of a box along the world's axes at rest; None for all others."""
         return None
@@ -248,11 +243,6 @@ class Ground(Part):
     def zone(self) -> bool:
         """A ground is no zone."""
         return False
-
-    @property
-    def carries(self) -> bool:
-        """A ground is what vehicles stand on."""
-        return True
 
     @property
     def corners(self) -> tuple[float, ...] | None:

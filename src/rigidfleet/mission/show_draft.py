@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +18,12 @@ from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
     MOST_AGENTS,
-    Scene,
     aligned,
     blend_time,
     output_step,
     shape_known,
 )
+from rigidfleet.typing import Floats
 
 #: Mass of a vehicle of a show [kg], greatest radius [m], and that as a share of the spacing.
 _MASS, _RADIUS, _SLIM = 0.3, 0.15, 1 / 8
@@ -34,6 +35,21 @@ _ASKED = 0.9
 _SHOWN, _SETTLED = 4.0, 1.0
 #: Rise of a turn of a helix, in spacings.
 _RISE = 1.5
+
+
+class Scene(NamedTuple):
+    """A formation of a show.
+
+    Attributes
+    ----------
+    name : of the formation
+    slots : (N, 3) [m]
+    table : lines of its table, `shape` and `size`, or `slots`
+    """
+
+    name: str
+    slots: Floats
+    table: str
 
 
 def scene(shape: str, agents: int, spacing: float) -> Scene:
@@ -111,14 +127,12 @@ def show(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = scene(ground, agents, spacing)._replace(name="pads")
-    tables, named = {"pads": pads}, []
-    for one in (_rested(one, agents) for one in scenes):
+    tables, scenes = {"pads": pads}, [_rested(one, agents) for one in scenes]
+    for i, one in enumerate(scenes):
         key, k = one.name, 2
         while key == "pads" or tables.get(key, one).table != one.table:
             key, k = f"{one.name} {k}", k + 1
-        tables[key] = one._replace(name=key)
-        named.append(tables[key])
-    scenes = named
+        scenes[i] = tables[key] = one._replace(name=key)
     for one in scenes:
         if len(one.slots) != agents:
             raise ValueError(f"'{one.name}' has {len(one.slots)} points for {agents} agents")

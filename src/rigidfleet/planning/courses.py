@@ -290,14 +290,14 @@ def _grounds(mission: Mission, now: PhaseState) -> Floats:
     assert now.goal is not None
     assert now.slots is not None
     r = now.goal.r + now.slots @ now.goal.T
-    found = mission.height_at(*r.T)
-    left = np.ones(len(r), dtype=np.bool_) if now.lost is None else ~now.lost
-    if len(off := np.flatnonzero(left & ~np.isfinite(found))):
+    heights = mission.height_at(*r.T)
+    flying = np.ones(len(r), dtype=np.bool_) if now.lost is None else ~now.lost
+    if len(off := np.flatnonzero(flying & ~np.isfinite(heights))):
         x, y, _ = r[off[0]]
         problem = f"needs a ground, and none is below agent {off[0] + 1} at ({x:.1f}, {y:.1f}) m"
         remedy = "add [[obstacles]] with kind = 'ground', or more terrain"
         raise MissionError([Finding(mission.origin, "phases", None, problem, remedy)])
-    return np.where(left, found, found[left].min())
+    return np.where(flying, heights, heights[flying].min())
 
 
 def height(mission: Mission, now: PhaseState) -> float:
@@ -306,7 +306,7 @@ def height(mission: Mission, now: PhaseState) -> float:
     assert now.slots is not None
     left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
     below = now.goal.r[2] + now.slots @ now.goal.T[:, 2] - mission.fleet.radius
-    return float((below - _grounds(mission, now))[left].min()) - ABOVE
+    return float(below[left].min() - _grounds(mission, now).min()) - ABOVE
 
 
 def _led(

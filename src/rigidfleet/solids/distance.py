@@ -356,12 +356,12 @@ def column(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
 
 def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
     """Height [m] of the highest of all solids, boxes and height maps at rest, below points; minus infinity: none."""
-    found = x * 0.0 - math.inf
+    height = x * 0.0 - math.inf
     for b in range(s.kind.shape[0]):
         low, top = column(x, y, b, s)
         on = (low <= top) & (z >= low) & ((z >= top - _DEEP) | (s.kind[b] == HEIGHTS))
-        found = choose(on, np.maximum(found, top), found)
-    return found
+        height = choose(on, np.maximum(height, top), height)
+    return height
 
 
 # -- many boxes ----------------------------------------------------------------------------------------
