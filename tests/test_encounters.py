@@ -151,3 +151,18 @@ def test_check_refuses_a_start_towards_a_wall():
         ends = [[0.75, 0, 0], [-9, 0, 0]]
         said = remarks(swap(ends, ends, agents=agents, obstacles=[wall]))
         assert ["wall" for x in said if "'wall'" in x.text] == names
+
+
+@pytest.mark.parametrize(
+    ("tables", "level"),
+    [
+        ({}, "note"),
+        ({"avoidance": {"separation": 0.3, "guard": False}}, "fails"),
+        ({"avoidance": {"separation": 0.3}, "limits": {"separation": 0.4}}, "fails"),
+        ({"avoidance": {}, "limits": {"separation": 0.3}}, "note"),
+    ],
+)  # fmt: skip
+def test_check_leaves_ways_that_meet_to_the_guard(tables, level):
+    """Planned paths that meet are no failure where the guard keeps all that the limit needs, and are one elsewhere."""
+    found = rf.check(swap(*LEVEL["a pair"], **tables))
+    assert {remark.level for remark in found.remarks if remark.topic == "collision"} == {level}

@@ -353,12 +353,13 @@ def test_two_that_meet_between_samples_collide():
 def test_a_flight_that_is_interrupted_or_fails_is_watched_to_its_end():
     """What has flown before a flight ends is judged like any other."""
 
-    def stop(progress: Any) -> None:
-        if progress.t > 1.2:
-            raise KeyboardInterrupt
-
     def buzz(t: float, r: Any, v: Any) -> Any:
         return np.full_like(r, 1e-3 * math.sin(1e3 * t) if t < 1.5 else math.nan)
+
+    def stop(t: float, r: Any, v: Any) -> Any:
+        if t > 1.2:
+            raise KeyboardInterrupt
+        return buzz(t, r, v)
 
     mission = two(integrator={"rtol": 1e-12, "atol": 1e-14})
     with pytest.raises(FlightError) as failed:
@@ -367,7 +368,7 @@ def test_a_flight_that_is_interrupted_or_fails_is_watched_to_its_end():
     x = failed.value.result.phases[0].extremes["separation"]
     assert x.value == pytest.approx(-0.4, abs=1e-4)
     with pytest.raises(FlightInterrupted) as caught:
-        simulate(mission, force=buzz, progress=stop)
+        simulate(mission, force=stop)
     assert caught.value.result.phases[0].extremes["separation"] == x
     singular = simulate(load_mission("line-singular"))
     assert not singular.complete

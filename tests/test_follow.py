@@ -7,10 +7,10 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 import rigidfleet as rf
-from rigidfleet.foreign.curves import Curve
-from rigidfleet.foreign.pieces import joined, smoothed
+from rigidfleet.foreign.curves import least_jerk
 from rigidfleet.kernel.problem import SHAPE, Reference
 from rigidfleet.kernel.references import blend_slots
+from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.planning.derivatives import way_series
 
 SLOTS = [[2.0, 0.0, 0.0], [-1.0, 1.7, 0.0], [-1.0, -1.7, 0.0]]
@@ -250,9 +250,9 @@ def test_files_that_are_not_there(tmp_path, file):
 
 def test_trajectories_are_joined_at_all_knots():
     """Curves with knots of their own agree with themselves at any time, and stay where they end."""
-    one = smoothed(Curve(np.array([0.0, 1.0, 3.0]), np.arange(24.0).reshape(2, 4, 3)))
-    two = Curve(np.array([0.0, 2.0]), np.arange(8.0).reshape(1, 4, 2))
-    knots, pieces = joined([one, two])
+    one = least_jerk(Piecewise(np.array([0.0, 1.0, 3.0]), np.arange(24.0).reshape(2, 4, 3)))
+    two = Piecewise(np.array([0.0, 2.0]), np.arange(8.0).reshape(1, 4, 2))
+    knots, pieces = join([one, two])
     np.testing.assert_array_equal(knots, [0.0, 1.0, 2.0, 3.0])
     for t in (0.3, 1.7, 2.5):
         k = int(t)

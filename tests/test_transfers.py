@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.spatial.distance import pdist
 
-from rigidfleet.math import splines
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.planning.certificate import CLOSE, of_ways
 from rigidfleet.planning.transfers import Transfer, least_duration, transfer
 
@@ -91,7 +91,7 @@ def test_vehicles_that_keep_their_distance_need_no_search():
     v = np.stack(
         [np.stack([-np.sin(time + a), np.cos(time + a), 0 * time], 1) for a in (0.0, np.pi)], 1
     )
-    proof = of_ways(time, splines.septic_pieces(time, np.stack([x, v, -x, -v])))
+    proof = of_ways(*Piecewise.hermite(time, np.stack([x, v, -x, -v])))
     assert 2.0 - 2 * CLOSE <= proof.separation <= 2.0
 
 

@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.math import lqr, series, splines
+from rigidfleet.math import lqr, series
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints
 
 HEADER = (
@@ -91,30 +92,33 @@ def at_times(given: Setpoints, wanted: Floats) -> Setpoints:
     time, count, n = given.time, len(wanted), given.yaw.shape[1]
     if len(time) == 1:
         return given
-    later = np.append(np.nextafter(time[:-1], np.inf) < time[1:], True)
-    # Pieces between samples of a phase; none is as narrow as a switch.
-    ends = np.flatnonzero(later[:-1])
-    low = ends[np.searchsorted(time[ends], np.nextafter(wanted, np.inf), side="right") - 1]
-    after = wanted - time[low]
     state = np.empty((count, *given.state.shape[1:]))
     yaw, yaw_rate = np.empty((count, n)), np.empty((count, n))
-    step = max(1, 200_000 // n)
-    for first in range(0, count, step):  # in blocks, to save memory
-        rows = slice(first, first + step)
-        k, x = low[rows], after[rows]
-        state[rows] = _between(time, given.state, k, x)
-        angle = np.stack([given.yaw, given.yaw_rate], axis=1)[..., None]
-        angle = _between(time, angle, k, x)[..., 0]
-        yaw[rows], yaw_rate[rows] = angle[:, 0], angle[:, 1]
+    for i in range(n):
+        x = curve(given, i).states(wanted, 4)
+        state[:, :, i] = x[..., :3].swapaxes(0, 1)
+        yaw[:, i], yaw_rate[:, i] = x[:2, :, 3]
     return Setpoints(wanted, state, yaw, yaw_rate)
 
 
-def _between(time: Floats, x: Floats, low: Ints, after: Floats) -> Floats:
-    """Derivatives (K, m, ...) at times ``after`` [s] sample ``low`` (K,), by polynomials that meet x (n, m, ...)."""
-    begin, end = (x[k].swapaxes(0, 1) for k in (low, low + 1))
-    pieces = splines.hermite(time[low + 1] - time[low], begin, end)
-    found = series.of_polynomials(pieces, after, x.shape[1])
-    return series.derivatives(found).swapaxes(0, 1)
+def curve(given: Setpoints, agent: int) -> Piecewise:
+    """The way of an agent, from 0: pieces (k, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
+    first, knots = intervals(given.time)
+    state = given.state[:, :, agent].swapaxes(0, 1)
+    yaw = np.stack([given.yaw[:, agent], given.yaw_rate[:, agent]])[..., None]
+    position, turned = (
+        Piecewise.of_ends(knots, x[:, first], x[:, first + 1]) for x in (state, yaw)
+    )
+    return position.beside(turned)
+
+
+def intervals(time: Floats) -> tuple[Ints, Floats]:
+    """Samples (k,) that begin an interval, which the next one ends, and the knots (k + 1,) [s] between intervals.
+
+    Two samples that are one representable number apart, as at a switch of phases, are one knot with two states.
+    """
+    first = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
+    return first, np.append(time[first[:1]], time[first + 1])
 
 
 def csv(given: Setpoints, first: int = 1) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 
@@ -91,6 +93,15 @@ def _failures_or_worst(candidates: Iterable[CheckResult]) -> Iterator[CheckResul
     for found in by_check.values():
         failed = [finding for finding in found if not finding.passed]
         yield from failed or [max(found, key=lambda f: (f.worst or 0.0) / (f.limit or 1.0))]
+
+
+def _beyond_or_greatest(every: list[tuple[Any, ...]], limit: float) -> list[tuple[Any, ...]]:
+    """Those whose first number is beyond a limit, or else the one whose first number is greatest.
+
+    Words are written for these alone: a flight has many waypoints and phases, and few fail.
+    """
+    greatest = max(every, key=itemgetter(0), default=(-math.inf,))
+    return [x for x in every if x[0] > limit] if greatest[0] > limit else [greatest][: len(every)]
 
 
 def _complete(result: Result) -> CheckResult:
@@ -247,9 +258,8 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = UNITS[name]
-        for p, what, at in points:
-            if (miss := getattr(at, name)) is None:
-                continue
+        misses = [(m, *point) for point in points if (m := getattr(point[2], name)) is not None]
+        for miss, p, what, at in _beyond_or_greatest(misses, limit):
             passed = miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -328,17 +338,19 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
     allowed = measured.mission.limits.separation_allowance
-    for record, phase in zip(measured.result.phases, phases, strict=True):
-        e = phase.worst.get("separation")
-        if record.planned is None or e is None:
-            continue
-        planned = record.planned["separation"]
+    every = [
+        (record.planned["separation"] - phase.worst["separation"].value, record, phase)
+        for record, phase in zip(measured.result.phases, phases, strict=True)
+        if record.planned is not None and "separation" in phase.worst
+    ]
+    for off, record, phase in _beyond_or_greatest(every, allowed):
+        e, planned = phase.worst["separation"], (record.planned or {})["separation"]
         words = (
             f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
             f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
         )
-        off = replace(e, value=planned - e.value)
-        yield bounded("separation_as_planned", off, "m", allowed, words)
+        e = replace(e, value=off)
+        yield bounded("separation_as_planned", e, "m", allowed, words)
 
 
 def _clearances(measured: Measurements) -> Iterator[CheckResult]:

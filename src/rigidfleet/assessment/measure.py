@@ -227,13 +227,12 @@ class Measurements:
         """The worst values of each phase, at its samples or between them, by name."""
         found: list[dict[str, Extreme]] = [{} for _ in self.samples]
         for name, quantity in self.measured.items():
-            sense, ranks = SENSE[name], self.rank[name]
+            sense, ranks, alone = SENSE[name], self.rank[name], name not in self.told
             for k, phase in enumerate(self.result.phases):
                 x, rank, worst = phase.extremes.get(name), ranks[k], None
                 if x is not None and rank < sense(x.value):
                     worst = self.recorded(name, x, phase.name)
                 elif rank != -math.inf:
-                    alone = name not in self.told
                     worst = self.worst_sample(quantity, self.samples[k], alone=alone)
                 if worst is not None:
                     found[k][name] = worst
@@ -442,8 +441,8 @@ class Measurements:
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
             flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
-            waypoint=self.waypoints.get(index) if finished else None,
-            stay=self.stays.get(index) if finished else None,
+            waypoint=self.misses.get(("target", index)) if finished else None,
+            stay=self.misses.get(("stay", index)) if finished else None,
             through=tuple(self.passed(index)),
             worst=self.worst_of[index],
         )
@@ -548,25 +547,22 @@ class Measurements:
         return after if abs(time[after] - t) < abs(time[before] - t) else before
 
     @cached_property
-    def waypoints(self) -> dict[int, Waypoint]:
-        """Miss of each phase with a target, at the target's time, or at the end of a phase that settles earlier."""
-        return self._misses([phase.target for phase in self.result.phases])
+    def misses(self) -> dict[tuple[str, int], Waypoint]:
+        """Miss of the ``target`` of each phase that has one, and of its place to ``stay`` at its end.
 
-    @cached_property
-    def stays(self) -> dict[int, Waypoint]:
-        """How far each phase that promises to stay is off its place at its end."""
-        return self._misses([phase.stay for phase in self.result.phases])
-
-    def _misses(self, every: Sequence[dict[str, Any] | None]) -> dict[int, Waypoint]:
-        """Miss of a target of each phase, if it has one.
-
-        Where no formation is held, each vehicle has a place of its own: the vehicle furthest from it counts.
+        A target is due at its time, or at the end of a phase that settles earlier. Where no formation is held, each
+        vehicle has a place of its own: the vehicle furthest from it counts.
         """
         result = self.result
-        targets = [(k, x) for k in self.flown if (x := every[k]) is not None]
+        targets = [
+            ((what, k), x)
+            for k in self.flown
+            for what in ("target", "stay")
+            if (x := getattr(result.phases[k], what)) is not None
+        ]
         if not targets:
             return {}
-        at = [self.nearest(target["time"], k) for k, target in targets]
+        at = [self.nearest(target["time"], k) for (_, k), target in targets]
         miss: dict[str, dict[int, float]] = {}
         for name, values in (
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
@@ -585,7 +581,7 @@ class Measurements:
                 off = map(math.dist, rows, asked.values())
             miss[name] = dict(zip(asked, off, strict=True))
         for i, off in miss["position"].items():
-            if result.phases[targets[i][0]].formation is None:
+            if result.phases[targets[i][0][1]].formation is None:
                 own = float(np.fmax.reduce(self.off_slot[at[i]]))
                 # With a vehicle lost, the centre of those left says nothing of their places.
                 miss["position"][i] = max(off, own) if self.left[at[i]].all() else own

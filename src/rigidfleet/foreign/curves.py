@@ -1,100 +1,79 @@
-"""Ways of vehicles as polynomials: what files of other programs are read as, and written from."""
+"""Ways of vehicles with the channels x, y, z [m] and yaw [rad]: what files of others are read as, and written from.
+
+Yaw is NaN where a format does not have it.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from rigidfleet.math import series, splines
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
 #: Names of the channels of a curve.
 NAMES = ("x", "y", "z", "yaw")
+CHANNELS = len(NAMES)
 
 
-class Curve(NamedTuple):
-    """The way of one vehicle, piece by piece.
-
-    Attributes
-    ----------
-    time : (n + 1,) ends of the pieces [s]
-    pieces : (n, 4, P) coefficients of x, y, z [m] and yaw [rad] in ascending powers of the time since the beginning of
-        a piece; yaw is NaN where a format does not have it
-    """
-
-    time: Floats
-    pieces: Floats
-
-    def at(self, t: Floats) -> Floats:
-        """Position [m] and yaw [rad] (K, 4) at times (K,) [s]; the first and last piece go on beyond the ends."""
-        k = np.clip(np.searchsorted(self.time, t, side="right") - 1, 0, len(self.pieces) - 1)
-        return values(self.pieces[k], t - self.time[k])
-
-    def later(self, start: float) -> Curve:
-        """The same way, begun later [s]."""
-        return Curve(self.time + start, self.pieces)
-
-    def cut(self, start: float, end: float) -> Curve:
-        """The part of the way from a start to an end [s] within it."""
-        first = int(np.searchsorted(self.time, start, side="right")) - 1
-        last = int(np.searchsorted(self.time, end, side="left"))
-        time = np.concatenate([[start], self.time[first + 1 : last], [end]])
-        pieces = self.pieces[first:last].copy()
-        moved = series.of_polynomials(
-            pieces[:1], np.array([start - self.time[first]]), pieces.shape[2]
-        )
-        pieces[:1] = np.moveaxis(moved, 0, -1)
-        return Curve(time, pieces)
-
-
-def values(pieces: Floats, after: Floats) -> Floats:
-    """Values (K, 4) of pieces (K or 1, 4, P) at times (K,) [s] since they began."""
-    found = np.zeros((len(after), pieces.shape[1]))
-    for k in range(pieces.shape[2] - 1, -1, -1):  # Horner
-        found = found * after[:, None] + pieces[:, :, k]
-    return found
-
-
-def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Curve:
+def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:
     """The way through states (m, K, 3) at times (K,) [s]: m derivatives of position are met, 4, 2, or 1 (lines).
 
-    Yaw (2, K) [rad, rad/s] or (1, K) is met in the same way; without it, yaw is NaN.
+    Yaw (2, K) [rad, rad/s] or (1, K) is met in the same way; without it, yaw is NaN. A single state stays for a second.
     """
+    angle = np.full((1, len(time)), np.nan) if yaw is None else yaw
     if len(time) == 1:
         time, states = np.append(time, time + 1.0), np.repeat(states, 2, axis=1)
         states[1:] = 0.0
-        yaw = None if yaw is None else np.repeat(yaw, 2, axis=1) * [[1.0], [0.0]][: len(yaw)]
-
-    def between(x: Floats) -> Floats:
-        h = np.diff(time)
-        if len(x) == 1:
-            slope = np.diff(x[0], axis=0) / h[:, None]
-            return np.stack([x[0][:-1], slope], axis=-1)
-        return splines.hermite(h, x[:, :-1], x[:, 1:])
-
-    angle = np.full((len(time) - 1, 1, 1), np.nan) if yaw is None else between(yaw[..., None])
-    return Curve(time, with_yaw(between(states), angle))
+        angle = np.repeat(angle, 2, axis=1) * [[1.0], [0.0]][: len(angle)]
+    position, turned = (Piecewise.hermite(time, x) for x in (states, angle[..., None]))
+    return position.beside(turned)
 
 
-def with_yaw(position: Floats, yaw: Floats) -> Floats:
-    """Pieces (n, 4, P) of positions (n, 3, Q) and yaws (n, 1, R)."""
-    powers = max(position.shape[2], yaw.shape[2])
-    parts = [np.pad(x, ((0, 0), (0, 0), (0, powers - x.shape[2]))) for x in (position, yaw)]
-    return np.concatenate(parts, axis=1)
-
-
-def with_headings(curve: Curve, times: Floats, yaws: Floats) -> Curve:
+def with_headings(curve: Piecewise, times: Floats, yaws: Floats) -> Piecewise:
     """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]."""
-    time = np.unique(
-        np.concatenate([curve.time, times[(times > curve.time[0]) & (times < curve.time[-1])]])
-    )
-    k = np.clip(np.searchsorted(curve.time, time[:-1], side="right") - 1, 0, len(curve.pieces) - 1)
-    moved = series.of_polynomials(
-        curve.pieces[k], time[:-1] - curve.time[k], curve.pieces.shape[-1]
-    )
-    pieces = np.moveaxis(moved, 0, -1)
-    at = np.interp(time, times, yaws)
-    pieces[:, 3] = 0.0
-    pieces[:, 3, 0], pieces[:, 3, 1] = at[:-1], np.diff(at) / np.diff(time)
-    return Curve(time, pieces)
+    moved = curve.cut(times)
+    yaw = np.interp(moved.time, times, yaws)[None, :, None]
+    return Piecewise(moved.time, moved.pieces[:, :3]).beside(Piecewise.hermite(moved.time, yaw))
+
+
+def rows_to_curve(rows: ArrayLike) -> Piecewise:
+    """The curve of rows of one length: a duration [s], and the coefficients of x, y, z and yaw."""
+    table = np.array(rows, dtype=np.float64)
+    time = np.concatenate([[0.0], np.cumsum(table[:, 0])])
+    return Piecewise(time, table[:, 1:].reshape(len(table), CHANNELS, -1))
+
+
+def curve_to_rows(curve: Piecewise) -> list[list[float]]:
+    """Rows as `rows_to_curve` takes them."""
+    flat = curve.pieces.reshape(len(curve.pieces), -1)
+    return np.column_stack([np.diff(curve.time), flat]).tolist()
+
+
+def greatest_jumps(curve: Piecewise) -> tuple[Floats, Floats]:
+    """Greatest jumps (3,) of position, velocity and acceleration at inner knots [m, m/s, m/s^2], and when (3,) [s]."""
+    far = np.linalg.norm(curve.jumps(3)[..., :3], axis=-1)
+    if not far.size:
+        return np.zeros(3), np.zeros(3)
+    return far.max(axis=1), curve.time[1 + far.argmax(axis=1)]
+
+
+def least_jerk(curve: Piecewise) -> Piecewise:
+    """The natural quintic spline through the knots of a curve: of all curves through them the one with the least jerk.
+
+    Its fourth derivative is continuous. Full turns of yaw between two knots do not count.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    time, x = curve.time, curve.at(curve.time)
+    x[:, 3] = np.unwrap(x[:, 3])
+    zero = np.zeros(1)
+    natural = [(3, zero), (4, zero)]
+    pieces = np.full((len(time) - 1, CHANNELS, 6), np.nan)
+    for q in range(CHANNELS if np.isfinite(x[:, 3]).all() else 3):
+        spline = make_interp_spline(time, x[:, q : q + 1], k=5, bc_type=(natural, natural))
+        at = [spline(time[:-1], nu=k)[:, 0] / math.factorial(k) for k in range(6)]
+        pieces[:, q] = np.stack(at, axis=-1)
+    return Piecewise(time, pieces)

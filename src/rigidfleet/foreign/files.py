@@ -17,8 +17,8 @@ import numpy as np
 from rigidfleet._common.files import why_not
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.math.piecewise import Piecewise
 
 __all__ = ["Interpolation", "Trajectories", "read_trajectories"]
 
@@ -41,7 +41,7 @@ class Trajectories(NamedTuple):
     """
 
     names: tuple[str, ...]
-    curves: tuple[Curve, ...]
+    curves: tuple[Piecewise, ...]
     assumed: str
     notes: tuple[str, ...] = ()
 
@@ -139,7 +139,7 @@ def _of_sequence(group: list[Path], interpolation: Interpolation) -> Trajectorie
             raise TrajectoryError(f"{path}: is of another kind than {group[0]}.")
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
-        curve = Curve(time, np.concatenate([curve.pieces, after.pieces]))
+        curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
     return Trajectories((group[0].parent.name,), (curve,), first.assumed)
 
 
@@ -170,7 +170,7 @@ def _of_file(path: Path, interpolation: Interpolation) -> Trajectories:
     return read
 
 
-def _check_size(name: str, who: str, curve: Curve) -> None:
+def _check_size(name: str, who: str, curve: Piecewise) -> None:
     """Refuse numbers with which no distance can be computed.
 
     Raises
@@ -197,7 +197,7 @@ def _check_size(name: str, who: str, curve: Curve) -> None:
 
 
 def _spans(
-    names: Sequence[str], curves: Sequence[Curve], listed: list[list[Path]], *, exact: bool
+    names: Sequence[str], curves: Sequence[Piecewise], listed: list[list[Path]], *, exact: bool
 ) -> list[str]:
     """A note if vehicles begin or end at different times.
 
@@ -227,7 +227,9 @@ def _spans(
     return []
 
 
-def _common_part(curves: list[Curve]) -> list[Curve]:
+def _common_part(curves: list[Piecewise]) -> list[Piecewise]:
     """The part of all curves in which every vehicle has samples."""
     start, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
-    return [c if c.time[0] == start and c.time[-1] == end else c.cut(start, end) for c in curves]
+    return [
+        c if c.time[0] == start and c.time[-1] == end else c.between(start, end) for c in curves
+    ]

@@ -13,8 +13,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.samples import sampled
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
 _POSE = "geometry_msgs/msg/PoseStamped"
@@ -23,7 +23,7 @@ _BILLION = 1_000_000_000
 
 def read_poses(
     data: bytes, name: str, interpolation: str
-) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
     """Names of the topics with poses, and a curve for each; times count from the first pose of the recording.
 
     Raises

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.foreign.curves import through
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
 #: What is assumed between samples, in words.
@@ -24,7 +25,7 @@ def sampled(
     kind: str,
     name: str,
     place: Callable[[int], str],
-) -> Curve:
+) -> Piecewise:
     """The curve through positions (K, 3) [m] and yaws (K,) [rad] at times (K,) [s].
 
     ``cubic`` is the spline with continuous acceleration (not-a-knot at its ends); yaw is on lines without full turns.
@@ -49,7 +50,5 @@ def sampled(
     from scipy.interpolate import CubicSpline
 
     spline = CubicSpline(time, position)
-    pieces = np.zeros((len(time) - 1, 4, 4))
-    pieces[:, :3] = np.moveaxis(np.asarray(spline.c)[::-1], (0, 1, 2), (2, 0, 1))
-    pieces[:, 3] = np.pad(lines.pieces[:, 3], ((0, 0), (0, 2)))
-    return Curve(time, pieces)
+    pieces = np.moveaxis(np.asarray(spline.c)[::-1], 0, -1)
+    return Piecewise(time, pieces).beside(Piecewise(time, lines.pieces[:, 3:]))

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import Curve, with_headings
-from rigidfleet.math.bernstein import of_bernstein
+from rigidfleet.foreign.curves import with_headings
+from rigidfleet.math.piecewise import Piecewise
 
 #: What is between the points of a show.
 BEZIER = "the Bezier curves of the show"
@@ -25,7 +25,7 @@ BEZIER = "the Bezier curves of the show"
 _BYTES, _INNER = 512 << 20, 6
 
 
-def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
     """Names and curves of the drones of a show, in the show's time and axes.
 
     Raises
@@ -51,13 +51,13 @@ def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...
         ) from None
 
 
-def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Curve, ...]]:
+def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
     show = _json(archive, "show.json", name)
     drones = _get(show, "swarm.drones", list, f"{name}: show.json")
     if not drones:
         raise TrajectoryError(f"{name}: show.json: has no drones.")
     names: list[str] = []
-    curves: list[Curve] = []
+    curves: list[Piecewise] = []
     for k, drone in enumerate(drones, 1):
         where = f"{name}: show.json: drone {k}"
         settings = _get(drone, "settings", dict, where)
@@ -116,7 +116,7 @@ def _resolved(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> di
     return found
 
 
-def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Curve:
+def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Piecewise:
     points = _get(trajectory, "points", list, where)
     if not points:
         raise TrajectoryError(f"{where}: its trajectory has no points.")
@@ -148,9 +148,9 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
     for k, ((begin, end), between) in enumerate(zip(pairwise(ends), inner, strict=True)):
         middle = _floats(between or np.zeros((0, 3)), (None, 3), lambda k=k: told(k + 1))
         control = np.vstack([begin, middle, end])
-        for axis in range(3):
-            pieces[k, axis, : len(control)] = of_bernstein(control[:, axis], time[k + 1] - time[k])
-    curve = Curve(time + start, pieces)
+        piece = Piecewise.of_bernstein(time[k : k + 2], control.T[None])
+        pieces[k, :3, : len(control)] = piece.pieces[0]
+    curve = Piecewise(time + start, pieces)
     if yaw is None:
         pieces[:, 3] = np.nan
         return curve

@@ -8,9 +8,9 @@ import numpy as np
 
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.columns import numbers, read_columns, read_lines
-from rigidfleet.foreign.curves import NAMES, Curve, through
-from rigidfleet.foreign.pieces import rows_to_curve
+from rigidfleet.foreign.curves import NAMES, rows_to_curve, through
 from rigidfleet.foreign.samples import ASSUMED, sampled
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
 
@@ -22,7 +22,7 @@ _SHARE, _LEAST = 0.05, 0.05
 
 def read_text(
     data: bytes, path: Path, interpolation: str
-) -> tuple[tuple[str, ...], tuple[Curve, ...], str, tuple[str, ...]]:
+) -> tuple[tuple[str, ...], tuple[Piecewise, ...], str, tuple[str, ...]]:
     """Names, curves, what is assumed between samples, and notes, of a table of setpoints or of polynomials.
 
     Raises
@@ -37,7 +37,7 @@ def read_text(
     return names, curves, ASSUMED[interpolation], notes
 
 
-def read_pieces(data: bytes, name: str) -> Curve:
+def read_pieces(data: bytes, name: str) -> Piecewise:
     """The curve in Crazyswarm2's table: duration [s], 8 coefficients of x, y, z [m] and yaw [rad] a piece, any order.
 
     Raises
@@ -65,7 +65,7 @@ def read_pieces(data: bytes, name: str) -> Curve:
 
 def read_setpoints(
     data: bytes, path: Path, interpolation: str
-) -> tuple[tuple[str, ...], tuple[Curve, ...], tuple[str, ...]]:
+) -> tuple[tuple[str, ...], tuple[Piecewise, ...], tuple[str, ...]]:
     """Names, curves and notes of a table with time, x, y, z, and, if given, agent, yaw and velocity.
 
     Raises
@@ -114,12 +114,12 @@ def _contradiction(off: float, fastest: float) -> tuple[str, ...]:
     )
 
 
-def read_polynomial(data: bytes) -> list[Curve]:
+def read_polynomial(data: bytes) -> list[Piecewise]:
     """The curve in a table of `crazyflie.write_polynomial`, from time zero on."""
     return [read_pieces(data, "polynomial")]
 
 
-def read_table(data: bytes) -> list[Curve]:
+def read_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
     due = ("time", *axes, "yaw", "yaw_rate")

@@ -270,15 +270,13 @@ def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list
     """How far the ways in a file are from those of the vehicles from ``first`` on."""
     read = chosen.read(data)
     if isinstance(read, np.ndarray):  # a path without times
-        source = motion.knots(first).curve()
+        source = motion.curve(first)
         between = (source.time[:-1] + source.time[1:]) / 2
         points = source.at(np.sort(np.concatenate([source.time, between])))[:, :3]
         return [Deviation(float(mavlink.to_segments(points, read).max()), math.nan, 0.0)]
     start = motion.start if chosen.own_time else 0.0
     return [
-        deviation(
-            motion.knots(first + i).curve(), curve.later(start), motion.result.motors_off[first + i]
-        )
+        deviation(motion.curve(first + i), curve.later(start), motion.result.motors_off[first + i])
         for i, curve in enumerate(read)
     ]
 

@@ -13,10 +13,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import NAMES, Curve
-from rigidfleet.foreign.pieces import curve_to_rows, rows_to_curve
-from rigidfleet.interchange.curves import Knots, Motion
-from rigidfleet.math.bernstein import bernstein, of_bernstein
+from rigidfleet.foreign.curves import NAMES, curve_to_rows, rows_to_curve
+from rigidfleet.interchange.curves import Motion, fit
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
 
@@ -40,7 +39,7 @@ _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 20
 def write_polynomial(motion: Motion, tolerance: float) -> Iterator[bytes]:
     """One table a vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
     for agent in range(motion.n_agents):
-        rows = curve_to_rows(motion.knots(agent).fitted(tolerance))
+        rows = curve_to_rows(fit(motion.curve(agent), tolerance))
         lines = [",".join(f"{x:.9g}" for x in row) for row in rows]
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
@@ -54,20 +53,20 @@ def write_poly4d(motion: Motion, tolerance: float) -> Iterator[bytes]:
         A flight needs more than `PIECES` pieces.
     """
     for agent in range(motion.n_agents):
-        knots = motion.knots(agent)
-        curve = knots.fitted(tolerance)
+        way = motion.curve(agent)
+        curve = fit(way, tolerance)
         if len(curve.pieces) > PIECES:
             raise _too_long(
                 agent,
                 f"{len(curve.pieces)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}",
                 curve.time[PIECES] - curve.time[0],
                 tolerance,
-                lambda x, knots=knots: len(knots.fitted(x).pieces) <= PIECES,
+                lambda x, way=way: len(fit(way, x).pieces) <= PIECES,
             )
         yield np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
 
 
-def read_poly4d(data: bytes) -> list[Curve]:
+def read_poly4d(data: bytes) -> list[Piecewise]:
     """The way in an image of `write_poly4d`, from time zero on."""
     rows = np.frombuffer(data, "<f4").reshape(-1, 4 * POWERS + 1)
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
@@ -88,8 +87,9 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
             f"Use --tolerance {2 * COMPRESSED_ROUNDING:g} or more."
         )
     for agent in range(motion.n_agents):
-        knots = motion.knots(agent).moved(_MS)
-        data, ends = _compressed(knots, tolerance, agent)
+        way = motion.curve(agent)
+        way = way.on(np.round(way.time / _MS) * _MS)
+        data, ends = _compressed(way, tolerance, agent)
         if len(data) > MEMORY:
             raise _too_long(
                 agent,
@@ -99,19 +99,18 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
                     1,
                 ],
                 tolerance,
-                lambda x, knots=knots, agent=agent: len(_compressed(knots, x, agent)[0]) <= MEMORY,
+                lambda x, way=way, agent=agent: len(_compressed(way, x, agent)[0]) <= MEMORY,
             )
         yield data
 
 
-def _compressed(knots: Knots, tolerance: float, agent: int) -> tuple[bytes, Floats]:
+def _compressed(way: Piecewise, tolerance: float, agent: int) -> tuple[bytes, Floats]:
     """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
-    curve = knots.fitted(tolerance - COMPRESSED_ROUNDING, longest=_LONGEST * _MS)
+    curve = fit(way, tolerance - COMPRESSED_ROUNDING, longest=_LONGEST * _MS)
     duration = np.diff(curve.time)
-    position = bernstein(curve.pieces[:, :3], duration) / _MM
-    yaw = (
-        bernstein(curve.pieces[:, 3:, :4], duration) / _TENTH
-    )  # of degree 3, like the reference between samples
+    position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
+    # Yaw is of degree 3, like the reference between samples.
+    yaw = Piecewise(curve.time, curve.pieces[:, 3:, :4]).bernstein() / _TENTH
     if abs(position).max() > _MOST:
         k = int(np.argmax(abs(position).max(axis=(1, 2))))
         far = float(abs(position).max()) * _MM
@@ -141,7 +140,7 @@ def _compressed(knots: Knots, tolerance: float, agent: int) -> tuple[bytes, Floa
     return data + _END, np.array(ends)
 
 
-def read_compressed(data: bytes) -> list[Curve]:
+def read_compressed(data: bytes) -> list[Piecewise]:
     """The way in an image of `write_compressed`, from time zero on."""
     units = [_MM, _MM, _MM, _TENTH]
     at = [x * unit for x, unit in zip(struct.unpack_from("<4h", data), units, strict=True)]
@@ -154,9 +153,10 @@ def read_compressed(data: bytes) -> list[Curve]:
             count = _STORED[kinds >> 2 * axis & 3]
             due = struct.unpack_from(f"<{count}h", data, place)
             place += 2 * count
-            points = np.array([at[axis], *(x * unit for x in due)])
-            piece[axis, : count + 1] = of_bernstein(points, milliseconds * _MS)
-            at[axis] = points[-1]
+            points = np.array([[at[axis], *(x * unit for x in due)]])
+            way = Piecewise.of_bernstein(np.array([0.0, milliseconds * _MS]), points)
+            piece[axis, : count + 1] = way.pieces[0]
+            at[axis] = points[0, -1]
         rows.append([milliseconds * _MS, *piece.ravel()])
     return [rows_to_curve(rows)]
 

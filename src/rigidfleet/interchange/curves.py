@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import Curve, values, with_yaw
-from rigidfleet.math import series, splines
+from rigidfleet.math import series
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result
-from rigidfleet.setpoints import Setpoints, at_rate
+from rigidfleet.setpoints import Setpoints, at_rate, curve
 from rigidfleet.typing import Floats
 
 #: Tolerance of yaw wherever pieces are fitted [rad]. Position does not depend on it.
@@ -55,117 +55,65 @@ class Motion:
         """Setpoints at a rate [Hz]; without one, the samples."""
         return at_rate(self.samples, rate)
 
-    def knots(self, agent: int) -> Knots:
-        """States of one vehicle at the ends of intervals; a change of phase is one knot with two states."""
-        given = self.samples
-        time = given.time
-        first = np.flatnonzero(np.nextafter(time[:-1], np.inf) < time[1:])
-        x = given.state[:, :, agent].swapaxes(0, 1)
-        angle = np.stack([given.yaw[:, agent], given.yaw_rate[:, agent]])[..., None]
-        ends = np.append(time[first], time[first[-1] + 1])
-        return Knots(
-            ends, x[:, first], x[:, first + 1], angle[:, first], angle[:, first + 1]
-        )  # fmt: skip
+    def curve(self, agent: int) -> Piecewise:
+        """The way of one vehicle: degree 7 (yaw: 3) between samples."""
+        return curve(self.samples, agent)
 
 
-class Knots(NamedTuple):
-    """States of one vehicle: derivatives 0 to 3 of position, and yaw and its rate, at both ends of n intervals.
+def fit(source: Piecewise, tolerance: float, orders: int = 4, longest: float = np.inf) -> Piecewise:
+    """The fewest pieces that go from knot to knot of a way within a tolerance [m], and `YAW_TOLERANCE`.
 
-    Attributes
-    ----------
-    time : (n + 1,) [s]
-    begin, end : (4, n, 3) position [m] to jerk [m/s^3]
-    yaw_begin, yaw_end : (2, n, 1) yaw [rad], yaw rate [rad/s]
+    Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3; yaw: always) at the knots they join. Each is as
+    long as the tolerance allows, and not longer than ``longest`` [s].
+
+    Raises
+    ------
+    ResultError
+        Not even a piece between two samples is within the tolerance.
     """
+    time, n = source.time, len(source.pieces)
+    begin, end = source.ends(4)
+    t = time[:-1, None] + np.diff(time)[:, None] * _CHECKED
+    wanted = source.within(_CHECKED)
 
-    time: Floats
-    begin: Floats
-    end: Floats
-    yaw_begin: Floats
-    yaw_end: Floats
-
-    def curve(self) -> Curve:
-        """The way between all samples: of degree 7 (yaw: 3)."""
-        position = splines.hermite(np.diff(self.time), self.begin, self.end)
-        return Curve(self.time, with_yaw(position, self._yaw(slice(None), slice(None))))
-
-    def _yaw(self, first: slice, last: slice) -> Floats:
-        h = self.time[1:][last] - self.time[:-1][first]
-        return splines.hermite(h, self.yaw_begin[:, first], self.yaw_end[:, last])
-
-    def moved(self, step: float) -> Knots:
-        """The same way with all times rounded to multiples of ``step`` [s], states moved along their derivatives."""
-        time = np.round(self.time / step) * step
-        by = time - self.time
-
-        def along(x: Floats, by: Floats) -> Floats:
-            pieces = np.moveaxis(series.from_derivatives(x), 0, -1)
-            return series.derivatives(series.of_polynomials(pieces, by, len(x)))
-
-        parts = (
-            (self.begin, by[:-1]),
-            (self.end, by[1:]),
-            (self.yaw_begin, by[:-1]),
-            (self.yaw_end, by[1:]),
+    def tried(i: int, j: int) -> tuple[Floats, float]:
+        """The piece over intervals i to j - 1, and its error as a share of what is allowed."""
+        ends = time[[i, j]]
+        position, yaw = (
+            Piecewise.of_ends(ends, begin[:m, i : i + 1, axes], end[:m, j - 1 : j, axes])
+            for m, axes in ((orders, slice(3)), (2, slice(3, 4)))
         )
-        return Knots(time, *(along(x, by) for x, by in parts))
+        piece = position.beside(yaw)
+        off = piece.at(t[i:j].ravel()) - wanted[i:j].reshape(-1, 4)
+        far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
+        far = max(far, (ends[1] - ends[0]) / longest)
+        return piece.pieces, float(max(far, abs(off[:, 3]).max() / YAW_TOLERANCE))
 
-    def fitted(self, tolerance: float, orders: int = 4, longest: float = np.inf) -> Curve:
-        """The fewest pieces that go from knot to knot within a tolerance [m], and `YAW_TOLERANCE`.
-
-        Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3) at the knots they join. Each is as long as
-        the tolerance allows, and not longer than ``longest`` [s].
-
-        Raises
-        ------
-        ResultError
-            Not even a piece between two samples is within the tolerance.
-        """
-        n = len(self.time) - 1
-        source = self.curve()
-        t = self.time[:-1, None] + np.diff(self.time)[:, None] * _CHECKED
-        wanted = values(
-            np.repeat(source.pieces, len(_CHECKED), axis=0), (t - self.time[:-1, None]).ravel()
-        )
-        wanted = wanted.reshape(n, len(_CHECKED), 4)
-
-        def tried(i: int, j: int) -> tuple[Floats, float]:
-            """The piece over intervals i to j - 1, and its error as a share of what is allowed."""
-            first, last = slice(i, i + 1), slice(j - 1, j)
-            h = self.time[j : j + 1] - self.time[i : i + 1]
-            piece = splines.hermite(h, self.begin[:orders, first], self.end[:orders, last])
-            piece = with_yaw(piece, self._yaw(first, last))
-            after = (t[i:j] - self.time[i]).ravel()
-            off = values(piece, after) - wanted[i:j].reshape(-1, 4)
-            far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
-            far = max(far, h[0] / longest)
-            return piece, float(max(far, abs(off[:, 3]).max() / YAW_TOLERANCE))
-
-        ends, pieces, length = [0], [], 1
-        while ends[-1] < n:
-            i = ends[-1]
-            good, bad = i, n + 1  # the longest piece known to fit, the shortest known not to
-            j = min(i + length, n)
-            while good < n and bad - good > 1:
-                piece, error = tried(i, j)
-                if error <= 1.0:
-                    good, best = j, piece
-                elif j > i + 1:
-                    bad = j
-                else:
-                    raise ResultError(
-                        f"the tolerance of {1e3 * tolerance:g} mm cannot be met: a curve of degree {2 * orders - 1} "
-                        f"between the samples at {self.time[i]:g} and {self.time[j]:g} s is {error:.2g} times as far "
-                        f"off. Use --tolerance {1.2 * error * tolerance:.2g}, or fly with a shorter output_step."
-                    )
-                j = min(2 * good - i, n) if bad > n else (good + bad) // 2
-            ends.append(good)
-            pieces.append(best)
-            length = good - i
-        return Curve(self.time[ends], np.concatenate(pieces))
+    ends, pieces, length = [0], [], 1
+    while ends[-1] < n:
+        i = ends[-1]
+        good, bad = i, n + 1  # the longest piece known to fit, the shortest known not to
+        j = min(i + length, n)
+        while good < n and bad - good > 1:
+            piece, error = tried(i, j)
+            if error <= 1.0:
+                good, best = j, piece
+            elif j > i + 1:
+                bad = j
+            else:
+                raise ResultError(
+                    f"the tolerance of {1e3 * tolerance:g} mm cannot be met: a curve of degree {2 * orders - 1} "
+                    f"between the samples at {time[i]:g} and {time[j]:g} s is {error:.2g} times as far "
+                    f"off. Use --tolerance {1.2 * error * tolerance:.2g}, or fly with a shorter output_step."
+                )
+            j = min(2 * good - i, n) if bad > n else (good + bad) // 2
+        ends.append(good)
+        pieces.append(best)
+        length = good - i
+    return Piecewise(time[ends], np.concatenate(pieces))
 
 
-def headings(curve: Curve) -> tuple[Floats, Floats]:
+def headings(curve: Piecewise) -> tuple[Floats, Floats]:
     """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
 
     Times increase: where yaw jumps, it turns within a millisecond.
@@ -178,7 +126,7 @@ def headings(curve: Curve) -> tuple[Floats, Floats]:
     shares = [np.linspace(0.0, 1.0, count + 1) for count in counts]
     k = np.repeat(np.arange(len(step)), counts + 1)
     after = np.concatenate(shares) * step[k]
-    times, yaws = curve.time[k] + after, values(curve.pieces[k], after)[:, 3]
+    times, yaws = curve.time[k] + after, series.of_polynomials(yaw[k], after, 1)[0]
     again = np.append(False, np.diff(times) < 1e-9)
     times[again] += 1e-3
     needed = ~again | np.append(False, abs(np.diff(yaws)) > 1e-9)
@@ -201,15 +149,14 @@ class Deviation(NamedTuple):
     missing: float
 
 
-def deviation(source: Curve, written: Curve, until: float = np.inf) -> Deviation:
+def deviation(source: Piecewise, written: Piecewise, until: float = np.inf) -> Deviation:
     """Greatest distance and difference of yaw between two ways, at five times in each interval of the source.
 
     After a time ``until`` [s] nothing is missing: the vehicle stands on the ground.
     """
     h = np.diff(source.time)[:, None]
-    after = (h * _COMPARED).ravel()
     t = (source.time[:-1, None] + h * _COMPARED).ravel()
-    wanted = values(np.repeat(source.pieces, len(_COMPARED), axis=0), after)
+    wanted = source.within(_COMPARED).reshape(len(t), -1)
     there = t <= written.time[-1]
     off = written.at(t[there]) - wanted[there]
     turned = (off[:, 3] + np.pi) % (2.0 * np.pi) - np.pi

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.foreign.curves import Curve, with_headings
-from rigidfleet.interchange.curves import Motion, headings
-from rigidfleet.math import series, splines
+from rigidfleet.foreign.curves import with_headings
+from rigidfleet.interchange.curves import Motion, fit, headings
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints
 
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -65,7 +65,7 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
     }
     nodes, samplers, channels = [], [], []
     for agent, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
-        curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
+        curve = fit(motion.curve(agent), tolerance, orders=2).later(-motion.start)
         times, yaws = headings(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
@@ -95,7 +95,7 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
     )
 
 
-def read_gltf(data: bytes) -> list[Curve]:
+def read_gltf(data: bytes) -> list[Piecewise]:
     """The ways in a file of `write_gltf`, from time zero on. Rotation is on lines of the angle, as slerp turns."""
     length = struct.unpack_from("<I", data, 12)[0]
     scene = json.loads(data[20 : 20 + length])
@@ -117,19 +117,17 @@ def read_gltf(data: bytes) -> list[Curve]:
         )
         before, at, after = (_y_down(x) for x in values.reshape(-1, 3, 3).swapaxes(0, 1))
         begin, end = np.stack([at[:-1], after[:-1]]), np.stack([at[1:], before[1:]])
-        pieces = np.pad(splines.hermite(np.diff(time[:, 0]), begin, end), ((0, 0), (0, 1), (0, 0)))
         yaw = np.unwrap(2.0 * np.arctan2(quaternions[:, 1], quaternions[:, 3]))
-        curves.append(with_headings(Curve(time[:, 0], pieces), times[:, 0], yaw))
+        way = Piecewise.of_ends(time[:, 0], begin, end)
+        curves.append(with_headings(way, times[:, 0], yaw))
     return curves
 
 
-def _spline(curve: Curve) -> Floats:
+def _spline(curve: Piecewise) -> Floats:
     """Rows (3 K, 3) of a cubic spline: for each key the velocity before, the position and the velocity after."""
-    h = np.diff(curve.time)
-    position = series.of_polynomials(curve.pieces[:, :3], h, 2)  # at the ends of pieces
+    begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.ends(2))
     rows = np.zeros((len(curve.time), 3, 3))
-    rows[1:, 0], rows[1:, 1] = position[1], position[0]
-    rows[:-1, 1:] = np.moveaxis(curve.pieces[:, :3, :2], 2, 1)
+    rows[1:, :2], rows[:-1, 1:] = end[:, ::-1], begin
     return _y_up(rows.reshape(-1, 3))
 
 

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.foreign.curves import through
 from rigidfleet.interchange.curves import Motion
 from rigidfleet.math import geodesy
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.setpoints import Setpoints, at_times
 from rigidfleet.typing import Floats
 
@@ -79,7 +80,7 @@ def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
         yield _origin_record(motion, system) + records.tobytes() + disarmed
 
 
-def read_tlog(data: bytes) -> list[Curve]:
+def read_tlog(data: bytes) -> list[Piecewise]:
     """The way in a log: cubics through its positions and velocities."""
     first = 8 + 8 + data[9]
     if data[13] == _ORIGIN:
@@ -155,7 +156,7 @@ def write_plan(motion: Motion, tolerance: float) -> Iterator[bytes]:
         [np.radians(given.latitude_deg), np.radians(given.longitude_deg), given.altitude]
     )
     for agent in range(motion.n_agents):
-        curve = motion.knots(agent).curve()
+        curve = motion.curve(agent)
         t = (curve.time[:-1, None] + np.diff(curve.time)[:, None] * [0.0, 0.5]).ravel()
         points = curve.at(np.append(t, curve.time[-1]))[:, :3]
         places = geodesy.geodetic(points[_corners(points, tolerance)], origin)

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidfleet.foreign.curves import Curve, through
+from rigidfleet.foreign.curves import through
 from rigidfleet.interchange.curves import Motion
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
 _HEADER = """
@@ -94,7 +95,7 @@ def write_mcap(motion: Motion, rate: float | None) -> Iterator[bytes]:
     yield buffer.getvalue()
 
 
-def read_mcap(data: bytes) -> list[Curve]:
+def read_mcap(data: bytes) -> list[Piecewise]:
     """The ways in a file of `write_mcap`: cubics through its poses and twists."""
     from mcap.reader import make_reader
 
@@ -135,7 +136,7 @@ def write_rrd(motion: Motion, rate: float | None) -> Iterator[bytes]:
     yield data or b""
 
 
-def read_rrd(data: bytes) -> list[Curve]:
+def read_rrd(data: bytes) -> list[Piecewise]:
     """The ways in a recording of `write_rrd`: straight lines through its positions."""
     from rerun.chunk import RrdReader
 

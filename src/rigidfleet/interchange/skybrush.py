@@ -17,11 +17,10 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.errors import ResultError
-from rigidfleet.foreign.curves import Curve
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import Motion, headings
+from rigidfleet.interchange.curves import Motion, fit, headings
 from rigidfleet.interchange.lights import FRAME, fades, program
-from rigidfleet.math.bernstein import bernstein
+from rigidfleet.math.piecewise import Piecewise
 
 #: Greatest number of vehicles of a show.
 MOST = 5000
@@ -46,7 +45,7 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     last = round((motion.end - motion.start) / FRAME)
     drones, files = [], {}
     for agent in range(motion.n_agents):
-        curve = motion.knots(agent).fitted(tolerance, orders=2).later(-motion.start)
+        curve = fit(motion.curve(agent), tolerance, orders=2).later(-motion.start)
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _segments(curve)
@@ -96,14 +95,14 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     yield buffer.getvalue()
 
 
-def read_skyc(data: bytes) -> list[Curve]:
+def read_skyc(data: bytes) -> list[Piecewise]:
     """The ways in a show, from its time zero on. Yaw is on lines between its setpoints."""
     return list(read_show(data, "skyc")[1])
 
 
-def _segments(curve: Curve) -> list[list[Any]]:
+def _segments(curve: Piecewise) -> list[list[Any]]:
     """Time, end point and inner control points of each cubic piece, and of the start; numbers to a micrometre."""
-    points = np.round(bernstein(curve.pieces[:, :3], np.diff(curve.time)), 6)
+    points = np.round(Piecewise(curve.time, curve.pieces[:, :3]).bernstein(), 6)
     times = np.round(curve.time, 6)
     segments: list[list[Any]] = [[times[0], points[0, :, 0].tolist(), []]]
     for t, piece in zip(times[1:].tolist(), points, strict=True):

@@ -1,4 +1,4 @@
-"""Polynomials by their Bernstein coefficients (control points), and their greatest values in continuous time."""
+"""The greatest values of polynomials in continuous time, by their control points."""
 
 from __future__ import annotations
 
@@ -19,27 +19,6 @@ SIZES: dict[str, Callable[[Floats], Floats]] = {
 }
 #: Relative accuracy of a greatest value, and the most halvings of a piece.
 _CLOSE, _HALVINGS = 1e-10, 50
-
-
-def bernstein(pieces: Floats, duration: Floats) -> Floats:
-    """Bernstein coefficients (n, ..., P), or control points, of pieces (n, ..., P) of durations (n,) [s]."""
-    powers = pieces.shape[-1]
-    scaled = pieces * duration.reshape(-1, *(1,) * (pieces.ndim - 1)) ** np.arange(powers)
-    return scaled @ _to_bernstein(powers).T
-
-
-def of_bernstein(points: Floats, duration: float) -> Floats:
-    """Coefficients (P,) in ascending powers of time of a piece with control points (P,) and a duration [s]."""
-    powers = len(points)
-    return np.linalg.solve(_to_bernstein(powers), points) / duration ** np.arange(powers)
-
-
-@cache
-def _to_bernstein(powers: int) -> Floats:
-    """The matrix of Bernstein coefficients b_i = sum_k C(i, k) / C(P - 1, k) a_k on [0, 1]."""
-    return np.array(
-        [[comb(i, k) / comb(powers - 1, k) for k in range(powers)] for i in range(powers)]
-    )
 
 
 @cache

@@ -9,85 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rigidfleet.math import series
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
 #: Number of coefficients of a piece.
 POWERS = 8
-#: From the derivatives that lack at the end of a piece of unit length to its highest coefficients, by the number of
-#: derivatives: the inverse of the rows k! / (k - m)! of u^k at u = 1.
-_ENDS = {
-    2: np.array([[3.0, -1.0], [-2.0, 1.0]]),
-    3: np.array([[10.0, -4.0, 0.5], [-15.0, 7.0, -1.0], [6.0, -3.0, 0.5]]),
-    4: np.array(
-        [
-            [35.0, -15.0, 2.5, -1 / 6],
-            [-84.0, 39.0, -7.0, 0.5],
-            [70.0, -34.0, 6.5, -0.5],
-            [-20.0, 10.0, -2.0, 1 / 6],
-        ]
-    ),
-}
-
-
-def septic_pieces(times: Floats, x: Floats) -> Floats:
-    """Pieces of degree 7 (n, ..., 8) between times (n + 1,) [s] that meet derivatives 0 to 3, x (4, n + 1, ...).
-
-    x(t) = sum_p pieces[i, ..., p] (t - times[i])^p for times[i] <= t <= times[i + 1], with three continuous
-    derivatives.
-    """
-    return hermite(np.diff(times), x[:, :-1], x[:, 1:])
-
-
-def hermite(h: Floats, begin: Floats, end: Floats) -> Floats:
-    """Polynomials (n, ..., 2 m) of widths h (n,) with m derivatives ``begin`` and ``end`` (m, n, ...); m is 2 to 4."""
-    m = len(begin)
-    h = h.reshape(-1, *(1,) * (begin.ndim - 2))
-    scale = np.stack([h**k for k in range(2 * m)])
-    start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
-    reached = [
-        sum(start[k] * np.prod(np.arange(k, k - j, -1.0)) for k in range(j, m)) for j in range(m)
-    ]
-    rest = np.tensordot(_ENDS[m], end * scale[:m] - np.stack(reached), 1)
-    return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
-
-
-#: Weights (4, 4) of four control points, and powers of the share x of a span, of a uniform cubic B-spline.
-CUBIC = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
-
-
-def b_spline_pieces(control: Floats, duration: float) -> tuple[Floats, Floats]:
-    """Knots (M + 1,) [s] and cubics (M, ..., 4) of a uniform cubic B-spline with control points (M + 3, ...)."""
-    spans = len(control) - 3
-    windows = np.stack([control[k : k + spans] for k in range(4)], axis=-1)
-    return np.linspace(0.0, duration, spans + 1), windows @ CUBIC * (spans / duration) ** np.arange(
-        4.0
-    )
-
-
-def begun_from(knots: Floats, pieces: Floats, start: Floats, fade: float) -> tuple[Floats, Floats]:
-    """Knots from 0 and pieces (K, ..., P) of a way, so that it begins in another state.
-
-    What the derivatives 0 to 3, ``start`` (4, ...), differ from those of the way fades within a time [s] along a
-    polynomial of degree 7, so that three derivatives stay as continuous as they are.
-    """
-    orders = pieces.shape[-1]
-    first = np.zeros((4, *pieces.shape[1:-1]))
-    first[: min(4, orders)] = series.derivatives(np.moveaxis(pieces[0], -1, 0)[:4])
-    off = start - first
-    if not off.any():
-        return knots, pieces
-    extra = hermite(np.array([fade]), off[:, None], np.zeros_like(off[:, None]))
-    at = np.union1d(knots, [fade])
-    low = np.clip(np.searchsorted(knots, at[:-1], side="right") - 1, 0, len(pieces) - 1)
-    found = np.zeros((len(low), *pieces.shape[1:-1], POWERS))
-    found[..., :orders] = np.moveaxis(
-        series.of_polynomials(pieces[low], at[:-1] - knots[low], orders), 0, -1
-    )
-    early = at[:-1] < fade
-    shifted = series.of_polynomials(np.repeat(extra, early.sum(), axis=0), at[:-1][early], POWERS)
-    found[early] += np.moveaxis(shifted, 0, -1)
-    return at, found
 
 
 def stopping_piece(T: float, begin: Floats) -> Floats:
@@ -96,10 +22,11 @@ def stopping_piece(T: float, begin: Floats) -> Floats:
     Velocity, acceleration and jerk vanish at its end, and where it ends is free. Of all such ways it has the least
     integral of snap^2: the transversality condition x^(7)(T) = 0 leaves a velocity of degree 5.
     """
-    velocity = hermite(np.array([T]), begin[1:, None], np.zeros((3, 1, *begin.shape[1:])))
-    place = velocity / np.arange(1.0, 7.0)
-    ends = np.zeros((1, *begin.shape[1:], 1))
-    return np.concatenate([ends + begin[0][None, ..., None], place, ends], axis=-1)
+    ends = np.stack([begin[1:], np.zeros_like(begin[1:])], axis=1)
+    velocity = Piecewise.hermite(np.array([0.0, T]), ends)
+    place = velocity.pieces / np.arange(1.0, 7.0)
+    zero = np.zeros((1, *begin.shape[1:], 1))
+    return np.concatenate([zero + begin[0][None, ..., None], place, zero], axis=-1)
 
 
 def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Floats) -> Floats:
@@ -140,20 +67,12 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Float
                 A[k, 2, 0, k] = 1.0
         found = np.linalg.solve(A.reshape(3 * inner, 3 * inner), b.reshape(3 * inner, -1))
         full[1:, 1:-1] = found.reshape(3, inner, *shape)
-    pieces = septic_pieces(t, full)
-    return pieces / unit ** np.arange(POWERS)
+    return Piecewise.hermite(t, full).pieces / unit ** np.arange(POWERS)
 
 
 def _jumps(times: Floats, x: Floats) -> Floats:
-    """Jumps (n - 1, 3, ...) of derivatives 4, 5 and 6 at the inner times, of `septic_pieces`."""
-    pieces = septic_pieces(times, x)
-    ends = series.of_polynomials(pieces[:-1], np.diff(times)[:-1], 7)[4:]
-    starts = np.moveaxis(pieces[1:, ..., 4:7], -1, 0)
-    return np.moveaxis(series.derivatives(_padded(starts) - _padded(ends))[4:], 0, 1)
-
-
-def _padded(x: Floats) -> Floats:
-    return np.concatenate([np.zeros((4, *x.shape[1:])), x])
+    """Jumps (n - 1, 3, ...) of derivatives 4, 5 and 6 at the inner times, of degree 7 through x (4, n + 1, ...)."""
+    return np.moveaxis(Piecewise.hermite(times, x).jumps(7)[4:], 0, 1)
 
 
 def snap_cost(pieces: Floats, times: Floats) -> float:

@@ -22,9 +22,8 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
-from rigidfleet.foreign.curves import Curve
+from rigidfleet.foreign.curves import curve_to_rows, least_jerk
 from rigidfleet.foreign.files import files_of, read_trajectories
-from rigidfleet.foreign.pieces import curve_to_rows, smoothed
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.formation.point_files import parse_points, read_bytes
 from rigidfleet.mission import bounds
@@ -201,12 +200,12 @@ def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
         found = read_trajectories(name)
     except TrajectoryError as error:
         raise _unread(name, "", error) from None
-    curves = [Curve(curve.time - curve.time[0], curve.pieces) for curve in found.curves]
+    curves = [curve.later(-curve.time[0]) for curve in found.curves]
     if found.assumed in ASSUMED.values():
-        curves = [smoothed(curve) for curve in curves]
+        curves = [least_jerk(curve) for curve in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         raise unread(name, "has no yaw", "remove yaw = 'file', or give a file with a yaw")
-    return Content([curve_to_rows(Curve(c.time, np.nan_to_num(c.pieces))) for c in curves])
+    return Content([curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves])
 
 
 #: A height that no terrain has [m], and one by which files mark cells without data besides such heights.

@@ -9,7 +9,8 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field, model_validator
 
-from rigidfleet.foreign.pieces import joined, rows_to_curve
+from rigidfleet.foreign.curves import rows_to_curve
+from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.mission.values import (
     AUTO,
     AgentNumber,
@@ -29,10 +30,11 @@ from rigidfleet.mission.values import (
     Velocity,
     VelocityOrFree,
 )
-from rigidfleet.typing import Floats
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
+#: Greatest number of coefficients of all trajectories that a phase follows.
+_COEFFICIENTS = 10_000_000
 #: Keys of an attitude: 3-2-1 Euler angles.
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 
@@ -120,7 +122,8 @@ class AnyPhase(Part):
     @property
     def free(self) -> bool:
         """Whether a place is to be reached at any velocity."""
-        return "position" in self.meets and "velocity" not in self.meets
+        meets = self.meets
+        return "position" in meets and "velocity" not in meets
 
     @property
     def turns_away(self) -> bool:
@@ -523,15 +526,15 @@ class Follow(Cruising):
         return data
 
     @cached_property
-    def pieces(self) -> tuple[Floats, Floats]:
-        """Knots (K + 1,) from 0 [s], and pieces (K, N, 4, P) [m, rad] of all trajectories.
+    def curve(self) -> Piecewise:
+        """All trajectories as one from 0 [s]: pieces (K, N, 4, P) [m, rad].
 
         Raises
         ------
         ValueError
             They have too many knots in all.
         """
-        return joined([rows_to_curve(rows) for rows in self.trajectories or ()])
+        return join([rows_to_curve(rows) for rows in self.trajectories or ()], _COEFFICIENTS)
 
     @property
     def turns_away(self) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
-from copy import copy
 from functools import cache, cached_property, wraps
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
@@ -64,14 +63,18 @@ A = TypeVar("A", bound="Floats | Ints | None")
 
 
 def _once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
-    """Compute an array of each formation, by its name, once, and return a copy."""
+    """Compute an array of each formation, by its name, once, and return a copy; edges are the same array always.
+
+    By that, phases see at once that they have the edges of the phase before.
+    """
 
     @wraps(method)
     def wrapper(self: Mission, name: Any) -> A:
         key = wrapper.__name__, name
         if key not in self._made:
             self._made[key] = method(self, name)
-        return copy(self._made[key])
+        made = self._made[key]
+        return made if made is None or made.dtype.kind == "i" else made.copy()
 
     return wrapper
 

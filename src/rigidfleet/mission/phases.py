@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import toml_key
-from rigidfleet.foreign.pieces import CHANNELS, jump, rows_to_curve
+from rigidfleet.foreign.curves import CHANNELS, greatest_jumps, rows_to_curve
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
@@ -412,7 +412,7 @@ def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float |
                 (*where, i), problem, "make all rows of one length: 1 + 4 P numbers", None
             )
             return
-        by, when = jump(rows_to_curve(rows))
+        by, when = greatest_jumps(rows_to_curve(rows))
         for far, t, (most, unit) in zip(by.tolist(), when.tolist(), _JUMPS, strict=False):
             if far > most:
                 problem = f"jumps by {far:.3g} {unit} at {t:.6g} s"
@@ -420,7 +420,7 @@ def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float |
                 collector.add((*where, i), problem, remedy, None)
                 return
     try:
-        _ = p.pieces
+        _ = p.curve
     except ValueError as error:
         collector.add(where, str(error), "give all vehicles the same times, or fewer", None)
 

@@ -13,6 +13,7 @@ from rigidfleet._common.kept import kept
 from rigidfleet.kernel.problem import Motion, septic_polynomial
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission.kinds import Orbit, Through, seconds
 from rigidfleet.mission.schema import Lqr, Tracking
 from rigidfleet.planning.reference import Pose, changed
@@ -137,10 +138,7 @@ class SmoothTrajectory:
         zero, times = np.zeros(3), self.times()
         cm = splines.minimum_snap(times, *self._to_meet)
         phi = np.stack([rotation_of(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
-        turn = splines.septic_pieces(times[[0, -1]], phi)
-        each = np.repeat(turn, len(times) - 1, axis=0)
-        shifted = series.of_polynomials(each, times[:-1], splines.POWERS)
-        turn = np.moveaxis(shifted, 0, -1)
+        turn = Piecewise.hermite(times[[0, -1]], phi).on(times).pieces
         return as_motion(self.t0 + times, np.concatenate([cm, turn], axis=1), goal.T)
 
     def times(self) -> Floats:
@@ -226,7 +224,7 @@ class OrbitTrajectory:
         x = self.at(times)
         smooth = len(self.carried) > 1
         pieces = (
-            splines.septic_pieces(times, np.stack(x))
+            Piecewise.hermite(times, np.stack(x)).pieces
             if smooth
             else lqr.quintic_pieces(times, *x[:3])
         )

@@ -9,7 +9,8 @@ import numpy as np
 
 from rigidfleet.formation.assignment import FEW, closest_approach
 from rigidfleet.kernel.problem import Reference, septic_polynomial
-from rigidfleet.math import proximity, series
+from rigidfleet.math import proximity
+from rigidfleet.math.piecewise import about
 from rigidfleet.mission import Phase
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -50,12 +51,15 @@ def certified(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
-    left = np.arange(len(radius)) if lost is None else np.flatnonzero(~lost)
-    if len(left) < 2:
+    left = None if lost is None else np.flatnonzero(~lost)
+    if left is not None:
+        reference, radius = of_agents(reference, left), radius[left]
+    if len(radius) < 2:
         return None
-    some, r = of_agents(reference, left), radius[left]
-    found = of_ways(some.knots, some.ways, r) if len(some.knots) else straight(some, r)
-    assert found is not None  # of two agents
+    some = reference
+    found = of_ways(some.knots, some.ways, radius) if len(some.knots) else straight(some, radius)
+    if found is None or left is None:
+        return found
     i, j = (int(left[k]) for k in found.agents)
     return found._replace(agents=(i, j))
 
@@ -111,7 +115,7 @@ def of_ways(knots: Floats, ways: Floats, radius: Floats | None = None) -> Certif
         half = np.repeat(np.diff(knots) / 2, n - 1 - i)
         middle = np.repeat((knots[:-1] + knots[1:]) / 2, n - 1 - i)
         other = np.tile(np.arange(i + 1, n), len(knots) - 1)
-        c = _about(c, half)
+        c = about(c, half)
         while len(c):
             distance = np.linalg.norm(c[..., 0], axis=1)
             direction = c[..., 0] / np.where(distance > 0.0, distance, 1.0)[:, None]
@@ -123,12 +127,7 @@ def of_ways(knots: Floats, ways: Floats, radius: Floats | None = None) -> Certif
                 best = float(separation[k]), float(middle[k]), (i, int(other[k]))
             open_ = separation - fall < best[0] - CLOSE
             c, half, middle, other = c[open_], half[open_] / 2, middle[open_], other[open_]
-            c = np.concatenate([_about(c, -half), _about(c, half)])
+            c = np.concatenate([about(c, -half), about(c, half)])
             middle = np.concatenate([middle - half, middle + half])
             half, other = np.tile(half, 2), np.tile(other, 2)
     return Certificate(best[0] - CLOSE, best[1], best[2], "conservative advancement")
-
-
-def _about(c: Floats, x: Floats) -> Floats:
-    """Coefficients (L, 3, P) of polynomials about other points x (L,)."""
-    return np.moveaxis(series.of_polynomials(c, x, c.shape[-1]), 0, -1)

@@ -14,6 +14,7 @@ import numpy as np
 
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import proximity, series
+from rigidfleet.math.piecewise import piece_at
 from rigidfleet.mission import Obstacle
 from rigidfleet.planning.certificate import of_agents
 from rigidfleet.planning.derivatives import slot_derivatives
@@ -56,8 +57,8 @@ def greatest_speeds(reference: Reference, motion: Motion, begin: Floats, end: Fl
 
 def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Floats, Floats]:
     """Upper bounds (L, n) of size and rate of polynomials (K, n, 3, P) over spans, from ``begin`` to ``end`` (L,)."""
-    first = np.clip(np.searchsorted(knots, begin, side="right") - 1, 0, len(ways) - 1)
-    last = np.clip(np.searchsorted(knots, end, side="left") - 1, first, len(ways) - 1)
+    first = piece_at(knots, begin)
+    last = np.maximum(piece_at(knots, end, "left"), first)
     size = rate = np.zeros((len(begin), ways.shape[1]))
     for k in range(int((last - first).max(initial=0)) + 1):
         piece = np.minimum(first + k, last)
@@ -179,7 +180,7 @@ def _while_there(
     within = (time > ends[0]) & (time < ends[1])
     first, last = slot_derivatives(leg.reference, leg.motion, ends, 1)[:, :1]
     at = np.concatenate([ends[:1], time[within], ends[1:]])
-    span = np.clip(np.searchsorted(time, at[:-1], side="right") - 1, 0, len(speed) - 1)
+    span = piece_at(time, at[:-1])
     return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 

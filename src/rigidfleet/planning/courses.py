@@ -16,7 +16,7 @@ from rigidfleet._common.kept import kept
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS
 from rigidfleet.math import attitude as att
-from rigidfleet.math import series, splines
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import (
     Brake,
@@ -156,10 +156,10 @@ def _followed(
     assert now.pose is not None
     assert now.slots is not None
     pose, slots = now.pose, now.slots
-    knots, pieces = phase.pieces
+    way = phase.curve
     length = t_end - now.t if phase.travel is None else phase.travel
-    scale = length / knots[-1]
-    knots, pieces = knots * scale, pieces * scale ** -np.arange(float(pieces.shape[-1]))
+    scale = length / way.time[-1]
+    knots, pieces = way.time * scale, way.pieces * scale ** -np.arange(float(way.pieces.shape[-1]))
     T1 = np.eye(3) if phase.turns_away else pose.T
     begin = np.concatenate(
         [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_of(pose, T1)], 1
@@ -177,11 +177,11 @@ def _followed(
         ways = np.einsum("ab,kibp->kiap", pose.T, pieces[:, :, :3] - body[:, None, :3])
         start = np.zeros((4, *slots.shape))
         start[0] = slots
-        at, ways = splines.begun_from(knots, ways, start, fade)
-        end = series.of_polynomials(ways[-1:], np.diff(at)[-1:], 1)[0, 0]
-        lift = Lift(end - slots, length, now.t + at, np.ascontiguousarray(ways))
-    at, body = splines.begun_from(knots, body, begin, fade)
-    return GivenTrajectory(as_motion(now.t + at, body, T1)), lift
+        own = Piecewise(knots, ways).start_from(start, fade)
+        end = own.at(own.time[-1:])[0]
+        lift = Lift(end - slots, length, now.t + own.time, np.ascontiguousarray(own.pieces))
+    cm = Piecewise(knots, body).start_from(begin, fade)
+    return GivenTrajectory(as_motion(now.t + cm.time, cm.pieces, T1)), lift
 
 
 def _whole_turns(yaw: float, near: float) -> float:
@@ -198,12 +198,11 @@ def misled(mission: Mission, phase: Phase, now: PhaseState) -> str:
     if not isinstance(phase, Follow) or now.pose is None or now.slots is None:
         return ""
     pose = now.pose
-    _, pieces = phase.pieces
+    knots, pieces = phase.curve
     first = pieces[0, :, :3, :2]
     alone = pieces.shape[1] == 1
     place = pose.r[None] if alone else pose.r + now.slots @ pose.T
     speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, now.slots) @ pose.T)
-    knots = phase.pieces[0]
     length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
     off = (
         np.linalg.norm(first[..., 0] - place, axis=1),
@@ -238,7 +237,7 @@ def lifted(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Lif
         return _followed(mission, phase, now, t_end)[1]
     if isinstance(phase, Reshape) and phase.control_points is not None:
         control = np.array(phase.control_points)
-        knots, ways = splines.b_spline_pieces(control, seconds(phase.blend))
+        knots, ways = Piecewise.b_spline(control, seconds(phase.blend))
         return Lift(control[-1] - control[0], seconds(phase.blend), now.t + knots, ways, keeps=True)
     vertical = phase.vertical
     if vertical is None or not vertical.each:

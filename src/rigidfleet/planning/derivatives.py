@@ -15,6 +15,7 @@ from numpy.polynomial import Polynomial
 
 from rigidfleet.kernel.problem import Motion, Reference, septic_polynomial
 from rigidfleet.math import series
+from rigidfleet.math.piecewise import Piecewise, piece_at
 from rigidfleet.typing import Floats
 
 #: Number of coefficients of a series: position, velocity, acceleration, jerk, snap.
@@ -70,10 +71,9 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
 
 def way_series(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
-    knots, ways = reference.knots, reference.ways
-    inside = np.clip(time, knots[0], knots[-1])
-    low = np.clip(np.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
-    found = np.moveaxis(series.of_polynomials(ways[low], inside - knots[low], ORDERS), 1, -1)
+    ways = Piecewise(reference.knots, reference.ways)
+    inside = np.clip(time, ways.time[0], ways.time[-1])
+    found = np.moveaxis(ways.series(inside, ORDERS), 1, -1)
     found[1:, ..., inside != time] = 0.0
     return found
 
@@ -96,7 +96,7 @@ def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
     """
     knots = motion.knots
     inside = np.minimum(time, knots[-1])
-    low = np.clip(np.searchsorted(knots, inside, side="right") - 1, 0, len(knots) - 2)
+    low = piece_at(knots, inside)
     rows = motion.coefficients.transpose(2, 1, 0)[..., low]  # (P, 6, K)
     x = series.of_polynomials(
         rows.reshape(len(rows), -1).T, np.tile(inside - knots[low], 6), ORDERS
@@ -248,7 +248,7 @@ def _turning(yaw: Floats, terms: Floats) -> Floats:
 
 def _hermite(knots: Floats, y: Floats, rates: Floats, time: Floats) -> Floats:
     """Cubics through values and rates (n, N) at knots (n,), at times (K,) between them."""
-    k = np.clip(np.searchsorted(knots, time, side="right") - 1, 0, len(knots) - 2)
+    k = piece_at(knots, time)
     h = np.diff(knots)[k][:, None]
     s = (time - knots[k])[:, None] / np.where(h > 0.0, h, 1.0)
     rise = y[k + 1] - y[k]

@@ -156,13 +156,17 @@ class PhasePlan:
         goal, since, phase = self.goal, t - self.arrival, self.phase
         if goal is None or phase.control == "open":
             return None
-        later, stays = since > _LATER, "position" not in phase.meets
+        meets, later = phase.meets, since > _LATER
+        stays, free = "position" not in meets, "velocity" not in meets
         kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
         found: dict[str, Any] = {"time": t}
-        if stays or (later and not phase.free):
+        if stays or (later and not free):
             found |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
-        if later if "attitude" in phase.meets else kept:
-            T = att.dcm_from_rotation_vector(goal.omega * since) @ goal.T
+        if later if "attitude" in meets else kept:
+            # Most stay without a turn, and whether they do is asked at the end of every phase.
+            T = goal.T
+            if goal.omega.any():
+                T = att.dcm_from_rotation_vector(goal.omega * since) @ T
             found |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
         return found if len(found) > 1 else None
 
@@ -354,7 +358,7 @@ def _bounded(external: External, motion: Motion, reference: Reference) -> Extern
 
     Only after a rest or a uniform motion, where steps grow without bound: they could miss what comes between two.
     """
-    longest = 2.0 * external.max_step
+    most = longest = 2.0 * external.max_step
     for knots, pieces in ((motion.knots, motion.coefficients), (reference.knots, reference.ways)):
         if len(knots) < 3:
             continue  # a single piece follows nothing
@@ -363,7 +367,7 @@ def _bounded(external: External, motion: Motion, reference: Reference) -> Extern
         for *c, k in np.argwhere(steady[..., :-1] & ~steady[..., 1:]):
             again = np.append(steady[(*c, slice(k + 1, None))], True).argmax()
             longest = min(longest, float(knots[k + 1 + again] - knots[k + 1]))
-    return external._replace(max_step=0.5 * longest)
+    return external if longest == most else external._replace(max_step=0.5 * longest)
 
 
 def _end(phase: Phase, start: float) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.formation.assignment import closest_approach
-from rigidfleet.math import splines
+from rigidfleet.math.piecewise import CUBIC, Piecewise
 from rigidfleet.planning.certificate import Certificate, of_ways
 from rigidfleet.typing import Floats
 
@@ -53,9 +53,9 @@ class Transfer(NamedTuple):
     duration: float
     certificate: Certificate
 
-    def pieces(self) -> tuple[Floats, Floats]:
-        """Knots (M + 1,) [s], and the ways between them as cubics (M, N, 3, 4), powers of the time since a knot."""
-        return splines.b_spline_pieces(self.control, self.duration)
+    def pieces(self) -> Piecewise:
+        """The ways as cubics (M, N, 3, 4) between knots (M + 1,) [s]."""
+        return Piecewise.b_spline(self.control, self.duration)
 
     def at(self, time: ArrayLike) -> Floats:
         """Positions (K, N, 3) [m] at times (K,) [s] from the start; at rest before and after."""
@@ -130,7 +130,7 @@ def transfer(
                 control = _searched(control, duration, limits, rng)
             if not _kept(control, duration, limits):
                 continue
-            knots, pieces = splines.b_spline_pieces(control, duration)
+            knots, pieces = Piecewise.b_spline(control, duration)
             certificate = of_ways(knots, pieces * metric[:, None])
             if certificate.separation >= distance:
                 return Transfer(control, duration, certificate)
@@ -153,9 +153,7 @@ def _basis(u: Floats, spans: int) -> Floats:
     k = np.minimum(u.astype(np.int64), spans - 1)
     x = u - k
     B = np.zeros((len(u), spans + 3))
-    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = (
-        x[:, None] ** np.arange(4) @ splines.CUBIC.T
-    )
+    B[np.arange(len(u))[:, None], k[:, None] + np.arange(4)] = x[:, None] ** np.arange(4) @ CUBIC.T
     return B
 
 

@@ -71,7 +71,15 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             guess = (
                 "" if exact else "; straight paths are assumed, as only distances guide the agents"
             )
-            yield Remark("fails" if exact else "note", "collision", text + guess)
+            yield _collision(mission, text + guess, limit, exact=exact)
+
+
+def _collision(mission: Mission, text: str, limit: float, *, exact: bool) -> Remark:
+    """Remark on planned paths that come too close, which is a note where the guard of [avoidance] keeps the limit."""
+    a = mission.avoidance
+    if exact and a is not None and a.guard and (a.separation is None or a.separation >= limit):
+        text, exact = f"{text}. So it is planned; [avoidance] has to keep them apart", False
+    return Remark("fails" if exact else "note", "collision", text)
 
 
 def _near(
@@ -110,7 +118,7 @@ def _crossing(
     guess = (
         "" if planned.exact else ". Straight paths are assumed, as only distances guide the agents"
     )
-    return Remark("fails" if planned.exact else "note", "collision", text + guess)
+    return _collision(mission, text + guess, limit, exact=planned.exact)
 
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:

@@ -265,7 +265,7 @@ class Extremes:
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         flags, steps = self.monitor.monitor.flags, int(state.count[4])
-        new = range(int(flags[3]), steps)
+        new: Ints = np.arange(int(flags[3]), steps)
         listed = int(flags[records.LISTED])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
         self._take_solids(problem, state, new)
@@ -313,14 +313,14 @@ class Extremes:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in the trail, not the forces."""
         steps, flags = int(state.count[4]), self.monitor.monitor.flags
-        self._take_solids(problem, state, range(steps))
+        self._take_solids(problem, state, np.arange(steps))
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
             return
         flags[:3] = 0, steps, 0
         self.monitor(problem, work, state)
-        self._find_contacts(problem, work, state, _rows(state, range(steps)))
+        self._find_contacts(problem, work, state, _rows(state, np.arange(steps)))
 
     def _find_contacts(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, rows: Ints
@@ -354,14 +354,14 @@ class Extremes:
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0, len(steps[0]), 0, 0, records.ANY_STEP, records.ANY_STEP
-        self._take_solids(problem, state, range(len(steps[0])))
+        self._take_solids(problem, state, np.arange(len(steps[0])))
         self.monitor(problem, work, state)
         found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
         return found
 
-    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: range) -> None:
+    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: Ints) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is None:
             return

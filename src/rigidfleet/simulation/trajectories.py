@@ -17,15 +17,16 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.samples import ASSUMED
-from rigidfleet.interchange.curves import Curve
 from rigidfleet.kernel import records
 from rigidfleet.kernel.problem import workspace
-from rigidfleet.math import proximity, series, splines
-from rigidfleet.math.bernstein import SIZES, bernstein, greatest
+from rigidfleet.math import proximity, series
+from rigidfleet.math.bernstein import SIZES, greatest
+from rigidfleet.math.piecewise import Piecewise, common_knots, join
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.result import Extremum, PhaseRecord, Result
+from rigidfleet.setpoints import intervals
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.typing import Floats
 
@@ -37,8 +38,6 @@ _JUMP = 1e-3
 _MOST, _TOGETHER = 5e8, 4_000_000
 #: Time between samples [s], unless the trajectory itself has more; about so many in all.
 _STEP, _SAMPLES = 0.05, 2_000_000
-#: Times that are nearer to each other than this are one [s].
-_SAME = 1e-9
 #: Where a start is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
@@ -51,41 +50,6 @@ NAMES = {
 UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
 #: Name of the only phase.
 PHASE = "flight"
-
-
-class Pieces:
-    """Trajectories of N vehicles with common ends of their pieces.
-
-    Attributes
-    ----------
-    time : (K,) ends of the pieces [s]
-    position : (K - 1, N, 3, P) coefficients [m] in ascending powers of the time since the beginning of a piece
-    yaw : (K, N) [rad], NaN where it is not known
-    """
-
-    def __init__(self, time: Floats, position: Floats, yaw: Floats | None = None) -> None:
-        self.time, self.position = time, position
-        n = position.shape[1]
-        self.yaw = np.full((len(time), n), np.nan) if yaw is None else yaw
-
-    def cut(self, times: Floats) -> Pieces:
-        """The same trajectories, with ends of pieces also at these times."""
-        inside = times[(times > self.time[0]) & (times < self.time[-1])]
-        near = np.searchsorted(self.time, inside)
-        far = np.minimum(inside - self.time[near - 1], self.time[near] - inside)
-        time = np.union1d(self.time, inside[far > 1e-6])
-        k = np.searchsorted(self.time, time[:-1], side="right") - 1
-        moved = series.of_polynomials(
-            self.position[k], time[:-1] - self.time[k], self.position.shape[-1]
-        )
-        yaw = np.stack([np.interp(time, self.time, x) for x in self.yaw.T], axis=1)
-        return Pieces(time, np.moveaxis(moved, 0, -1), yaw)
-
-    def states(self) -> tuple[Floats, Floats]:
-        """Derivatives 0 to 3 (4, K - 1, N, 3) at the beginning and at the end of each piece."""
-        ends = np.stack([np.zeros(len(self.time) - 1), np.diff(self.time)])
-        first, last = (series.derivatives(series.of_polynomials(self.position, t, 4)) for t in ends)
-        return first, last
 
 
 def trajectories(
@@ -166,23 +130,27 @@ def trajectories(
         raise ResultError(
             f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
         )
+    first, knots = intervals(t)
+    if not len(first):
+        raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
     yaws = None if yaw is None else _checked("yaw", yaw, 2)
     if yaws is not None and yaws.shape != shape[:2]:
         raise ResultError(f"yaw has shape {yaws.shape}, expected {shape[:2]}: samples, vehicles.")
+    # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
     if cubic and len(states) == 1:
         from scipy.interpolate import CubicSpline
 
-        pieces = np.moveaxis(CubicSpline(t, states[0]).c[::-1], 0, -1)
+        spline = CubicSpline(knots, np.append(states[0][first], states[0][-1:], axis=0))
+        position = Piecewise(knots, np.moveaxis(spline.c[::-1], 0, -1))
         how = ASSUMED["cubic"]
-    elif len(states) == 1:
-        slope = np.diff(states[0], axis=0) / np.diff(t)[:, None, None]
-        pieces, how = np.stack([states[0][:-1], slope], axis=-1), NAMES[1]
     else:
         x = np.stack(states)
-        pieces = splines.hermite(np.diff(t), x[:, :-1], x[:, 1:])
+        position = Piecewise.of_ends(knots, x[:, first], x[:, first + 1])
         how = NAMES[2 * len(states) - 1]
-    return of_pieces(
-        Pieces(t, pieces, yaws), how,
+    angle = (np.full(shape[:2], np.nan) if yaws is None else yaws)[None, ..., None]
+    turned = Piecewise.of_ends(knots, angle[:, first], angle[:, first + 1])
+    return of_curve(
+        position.beside(turned), how,
         mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
     )  # fmt: skip
 
@@ -280,10 +248,10 @@ def _told_apart(start: Floats) -> Floats:
     return found
 
 
-def of_pieces(
-    pieces: Pieces, interpolation: str, *, names: Sequence[str] = (), **judged: Any
+def of_curve(
+    curve: Piecewise, interpolation: str, *, names: Sequence[str] = (), **judged: Any
 ) -> Result:
-    """A result of piecewise polynomials; see `trajectories`.
+    """A result of a curve (K, N, 4, P) of x, y, z [m] and yaw [rad]; see `trajectories`. Yaw is NaN if it is not known.
 
     Parameters
     ----------
@@ -298,59 +266,40 @@ def of_pieces(
     MissionError
         A limit is invalid.
     """
-    if abs(pieces.time[0]) > _CLOCK or pieces.time[0] < 0.0:
-        pieces = Pieces(pieces.time - pieces.time[0], pieces.position, pieces.yaw)
-    _continuous(pieces)
-    n, span = pieces.position.shape[1], float(pieces.time[-1] - pieces.time[0])
+    if abs(curve.time[0]) > _CLOCK or curve.time[0] < 0.0:
+        curve = curve.later(-curve.time[0])
+    _continuous(curve)
+    n, span = curve.pieces.shape[1], float(curve.time[-1] - curve.time[0])
     step = max(_STEP, span * n / _SAMPLES)
-    grid = pieces.time[0] + step * np.arange(1, math.ceil(span / step))
-    _bounded(n, len(pieces.time) + len(grid))
-    pieces = pieces.cut(grid)
-    first, last = pieces.states()
-    mission = judged_as(first[0, 0], span, **judged)
-    time, state, yaw = _samples(pieces, first, last)
+    grid = curve.time[0] + step * np.arange(1, math.ceil(span / step))
+    _bounded(n, len(curve.time) + len(grid))
+    curve = curve.cut(grid, 1e-6)
+    time, state, yaw = _samples(curve)
+    mission = judged_as(state[0, 0], span, **judged)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    _put_extremes(record, mission, pieces)
-    if pieces.position.shape[-1] < 3:  # lines turn at once at samples
+    _put_extremes(record, mission, Piecewise(curve.time, curve.pieces[:, :, :3]))
+    if curve.pieces.shape[-1] < 3:  # lines turn at once at samples
         state[2:] = np.nan
     return _result(mission, record, time, state, yaw, interpolation, names)
 
 
 def of_curves(
-    curves: Sequence[Curve], interpolation: str, *, names: Sequence[str] = (), **judged: Any
+    curves: Sequence[Piecewise], interpolation: str, *, names: Sequence[str] = (), **judged: Any
 ) -> Result:
     """A result of curves with times of their own; before and after its own, a vehicle stays where it is.
 
     Parameters
     ----------
-    interpolation, judged : see `of_pieces`
+    interpolation, judged : see `of_curve`
     names : of the vehicles, where they come from
 
     Raises
     ------
     ResultError, MissionError
-        As for `of_pieces`.
+        As for `of_curve`.
     """
-    begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
-    time = np.unique(np.concatenate([c.time for c in curves]))
-    time = time[np.append(True, np.diff(time) > _SAME)]
-    time[-1] = max(float(time[-1]), float(end))
-    n, powers = len(curves), max(c.pieces.shape[-1] for c in curves)
-    _bounded(n, len(time))
-    position, yaw = np.zeros((len(time) - 1, n, 3, powers)), np.full((len(time), n), np.nan)
-    for i, curve in enumerate(curves):
-        middle = 0.5 * (time[:-1] + time[1:])
-        k = np.clip(np.searchsorted(curve.time, middle, side="right") - 1, 0, len(curve.pieces) - 1)
-        moved = series.of_polynomials(
-            curve.pieces[k, :3], time[:-1] - curve.time[k], curve.pieces.shape[-1]
-        )
-        position[:, i, :, : len(moved)] = np.moveaxis(moved, 0, -1)
-        for outside, at in ((middle < curve.time[0], begin), (middle > curve.time[-1], end)):
-            position[outside, i] = 0.0
-            stay = curve.at(np.array([np.clip(at, curve.time[0], curve.time[-1])]))[0, :3]
-            position[outside, i, :, 0] = stay
-        yaw[:, i] = curve.at(np.clip(time, curve.time[0], curve.time[-1]))[:, 3]
-    return of_pieces(Pieces(time, position, yaw), interpolation, names=names, **judged)
+    _bounded(len(curves), len(common_knots(curves)))
+    return of_curve(join(curves), interpolation, names=names, **judged)
 
 
 def _bounded(n: int, times: int) -> None:
@@ -369,7 +318,7 @@ def _bounded(n: int, times: int) -> None:
         )
 
 
-def _continuous(pieces: Pieces) -> None:
+def _continuous(curve: Piecewise) -> None:
     """Refuse trajectories that jump.
 
     Raises
@@ -377,49 +326,47 @@ def _continuous(pieces: Pieces) -> None:
     ResultError
         One does.
     """
-    h = np.diff(pieces.time)[:-1]
-    end = series.of_polynomials(pieces.position[:-1], h, 1)[0]
-    off = np.linalg.norm(pieces.position[1:, ..., 0] - end, axis=2)
+    off = np.linalg.norm(curve.jumps(1)[0, ..., :3], axis=2)
     if off.size and off.max() > _JUMP:
         k, i = np.unravel_index(int(off.argmax()), off.shape)
         raise ResultError(
-            f"agent {i + 1} jumps by {off[k, i]:.3g} m at {pieces.time[k + 1]:g} s: its pieces do not join."
+            f"agent {i + 1} jumps by {off[k, i]:.3g} m at {curve.time[k + 1]:g} s: its pieces do not join."
         )
 
 
-def _samples(pieces: Pieces, first: Floats, last: Floats) -> tuple[Floats, Floats, Floats]:
+def _samples(curve: Piecewise) -> tuple[Floats, Floats, Floats]:
     """Times (K',), states (4, K', N, 3) and yaws (K', N): one sample at each end of a piece, two where states jump."""
+    begin, end = curve.ends(4)
+    first, last = begin[..., :3], end[..., :3]
     before, after = last[:, :-1], first[:, 1:]
     scale = 1.0 + np.abs(after).max(axis=(1, 2, 3), initial=0.0)
     jump = (np.abs(after - before) > 1e-9 * scale[:, None, None, None]).any(axis=(0, 2, 3))
     again = np.flatnonzero(jump) + 1
-    k = np.sort(np.concatenate([np.arange(len(pieces.time)), again]))
+    k = np.sort(np.concatenate([np.arange(len(curve.time)), again]))
     later = np.append(False, k[1:] == k[:-1])  # the second sample of a jump
-    time = pieces.time[k]
+    time = curve.time[k]
     time[later] = np.nextafter(time[later], np.inf)
     state = np.concatenate([first, last[:, -1:]], axis=1)[:, k]
     state[:, np.flatnonzero(later) - 1] = before[:, again - 1]
-    return time, state, pieces.yaw[k]
+    return time, state, np.concatenate([begin[0], end[0, -1:]])[k, :, 3]
 
 
-def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces) -> None:
+def _put_extremes(record: PhaseRecord, mission: Mission, curve: Piecewise) -> None:
     """Give the phase the extremes of the curves, in continuous time."""
     n = mission.n_agents
     extremes = Extremes(mission)
-    r, v = (
-        series.derivatives(pieces.position[:1, ..., :2].transpose(3, 0, 1, 2))[k][0] for k in (0, 1)
-    )
+    r, v = curve.states(curve.time[:1], 2)[:, 0]
     problem = plan_phase(mission, mission.phases[0], PhaseState(0.0, r, v)).problem
     work = workspace(n, 0)
     y = np.zeros(6 * n)
     state = extremes.begin(y, record.t_start, 0, rtol=1e-9, atol=np.ones_like(y))
     trail = state.trail
-    powers = pieces.position.shape[-1]
+    powers = curve.pieces.shape[-1]
     together = max(1, _TOGETHER // (n * 3 * powers))
     row, best = 0, {}
-    for begin in range(0, len(pieces.position), together):
-        c = pieces.position[begin : begin + together]
-        t, h = pieces.time[begin : begin + len(c)], np.diff(pieces.time[begin : begin + len(c) + 1])
+    for begin in range(0, len(curve.pieces), together):
+        c = curve.pieces[begin : begin + together]
+        t, h = curve.time[begin : begin + len(c)], np.diff(curve.time[begin : begin + len(c) + 1])
         for k, parts in enumerate(_parts(c, h)):
             for part in range(parts):
                 width = h[k] / parts
@@ -433,7 +380,8 @@ def _put_extremes(record: PhaseRecord, mission: Mission, pieces: Pieces) -> None
                 if row == len(trail.clock):
                     _take(extremes, problem, work, state, row)
                     row = 0
-        _accelerations(best, c, t, h, directed=extremes.directed)
+        part = Piecewise(curve.time[begin : begin + len(c) + 1], c)
+        _accelerations(best, part, directed=extremes.directed)
     _take(extremes, problem, work, state, row)
     record.extremes.update(extremes.phase())
     extremes.flight([record])
@@ -461,22 +409,21 @@ def _parts(c: Floats, h: Floats) -> list[int]:
         parts[wide] *= 2
 
 
-def _accelerations(
-    best: dict[str, Extremum], c: Floats, t: Floats, h: Floats, *, directed: bool
-) -> None:
+def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
-    if c.shape[-1] < 3:
+    n, powers = curve.pieces.shape[1], curve.pieces.shape[-1]
+    if powers < 3:
         return
-    n = c.shape[1]
-    power = np.arange(2, c.shape[-1])
-    a = (c[..., 2:] * (power * (power - 1))).reshape(len(c) * n, 3, -1)
-    points = bernstein(a, np.repeat(h, n))
+    power = np.arange(2, powers)
+    a = Piecewise(curve.time, curve.pieces[..., 2:] * (power * (power - 1)))
+    points = a.bernstein().reshape(-1, 3, powers - 2)
     for way in SIZES if directed else ("",):
         name = f"{way}_acceleration".lstrip("_")
         found, known = greatest(points, SIZES[way]), best.get(name)
         if known is None or found.value > known.value:
             k, i = divmod(found.curve, n)
-            best[name] = Extremum(found.value, float(t[k] + found.place * h[k]), i, -1)
+            t, end = curve.time[k : k + 2]
+            best[name] = Extremum(found.value, float(t + found.place * (end - t)), i, -1)
 
 
 def _result(

@@ -16,6 +16,7 @@ import numpy as np
 
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import write_file
+from rigidfleet.math.piecewise import piece_at
 from rigidfleet.result import Result, as_result
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
@@ -129,7 +130,7 @@ def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
     """
     if len(result.time) == 1:
         return values
-    k = np.clip(np.searchsorted(result.time, time, side="right") - 1, 0, len(result.time) - 2)
+    k = piece_at(result.time, time)
     share = (time - result.time[k]) / (result.time[k + 1] - result.time[k])
     share = share.reshape(-1, *(1,) * (values.ndim - 1))
     low, high = values[k], values[k + 1]
