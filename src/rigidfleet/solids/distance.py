@@ -342,9 +342,9 @@ def column(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
     """
     o, T, size = s.origin[b], s.turn[b], s.size[b]
     x, y = choose(np.isfinite(x), x, _FAR) - o[0], choose(np.isfinite(y), y, _FAR) - o[1]
-    if s.kind[b] == HEIGHTS:
-        u, v, top = below(x, y, b, s)
-        over = (u == x) & (v == y)
+    if s.turned[b] == 0 or s.kind[b] == HEIGHTS:
+        over = (x >= size[0]) & (x <= size[3]) & (y >= size[1]) & (y <= size[4])
+        top = below(x, y, b, s)[2] if s.kind[b] == HEIGHTS else size[5]
         return choose(over, size[2], math.inf), choose(over, top, -math.inf)
     low, top = x * 0.0 - math.inf, x * 0.0 + math.inf
     for k in range(3):
