@@ -15,8 +15,6 @@ from rigidfleet.errors import ResultError
 from rigidfleet.interchange import FORMATS, brief, export
 
 FLIGHTS = ("passage-quadrotors", "cube-passage-quadrotors", "show-1000")
-#: Any place: plans need one.
-ORIGIN = {"latitude_deg": 47.3977, "longitude_deg": 8.5456, "altitude": 488.0}
 
 
 def row(result: rf.Result, name: str, folder: Path, flown: bool) -> str:
@@ -27,9 +25,8 @@ def row(result: rf.Result, name: str, folder: Path, flown: bool) -> str:
     except ResultError as error:
         found = re.search(r"is ([\d.]+ m) from|needs (\d+ \w+) of|needs (\d+ bytes)", str(error))
         return f"refused: {next(x for x in found.groups() if x) if found else error}"
-    degrees = math.degrees(made.yaw_deviation)
-    turned = "" if math.isnan(degrees) else f"{brief(degrees)} deg, "
-    return f"{brief(1e3 * made.deviation)} mm, {turned}{made.size / 1e3:,.0f} kB"
+    turned = brief(math.degrees(made.yaw_deviation))
+    return f"{brief(1e3 * made.deviation)} mm, {turned} deg, {made.size / 1e3:,.0f} kB"
 
 
 def main() -> None:
@@ -42,8 +39,7 @@ def main() -> None:
     flights = asked.only or FLIGHTS
     columns = []
     for flight in flights:
-        tables = rf.load_mission(flight).to_dict() | {"geodetic_origin": ORIGIN}
-        result = rf.simulate(rf.Mission.from_dict(tables))
+        result = rf.simulate(flight)
         with tempfile.TemporaryDirectory() as folder:
             columns.append([row(result, name, Path(folder), asked.flown) for name in FORMATS])
     head = f"| format | {' | '.join(f'`{flight}`' for flight in flights)} |\n|{' --- |' * (len(flights) + 1)}"

@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import LABELS, PhaseRecord, Result
+from rigidfleet.simulation.flight import simulate
 
 G = 9.81
 
@@ -110,3 +111,48 @@ def quadrotors(n: int, seconds: float) -> Result:
         points, mission_text=mission.text, vehicle_attitude=q, vehicle_rates=np.zeros((len(t), n, 3)),
         rotor_force=force, saturated=saturated,
     )  # fmt: skip
+
+
+#: A word of 65 vehicles: a row of cells for each height, from above.
+WORD = (
+    "#####.#.....#...#...#...#.####.",
+    "#.....#.....#...#...#...#.#...#",
+    "#.....#......#.#....#...#.#...#",
+    "####..#.......#.....#...#.####.",
+    "#.....#.......#.....#...#.#....",
+    "#.....#.......#.....#...#.#....",
+    "#.....#####...#......###..#....",
+)
+
+
+def word(*, lit: bool = True) -> Result:
+    """Vehicles that stand upright as `WORD`, read from the south; their lights fade from white to amber in a second."""
+    cells = [(x, -z) for z, row in enumerate(WORD) for x, cell in enumerate(row) if cell == "#"]
+    slots = 2.0 * np.array([[x, 0.0, z] for x, z in cells])
+    slots -= slots.mean(axis=0)
+    colour = 'colour = "#ffb000"\n' if lit else ""
+    text = (
+        'schema_version = 1\nname = "word"\nsmoothness = "jerk"\n'
+        f"[agents]\nmass = 0.3\nradius = 0.15\nposition = {(slots + [0, 0, 20.0]).tolist()}\n"
+        f"[formations.word]\nslots = {slots.tolist()}\nedges = []\n{colour}"
+        '[[obstacles]]\nkind = "ground"\n'
+        '[[phases]]\nkind = "establish"\nformation = "word"\nblend = 1.0\nduration = 3.0\n'
+    )
+    return simulate(Mission.from_toml(text))
+
+
+def bitmap(bright: np.ndarray) -> tuple[str, ...]:
+    """A picture (height, width) of `WORD`, reduced to its cells: those bright near their middle."""
+    rows, columns = np.nonzero(bright)
+    high, wide = len(WORD) - 1, len(WORD[0]) - 1
+    # So many steps between the middles of cells, and half a dot at each side.
+    step = (np.ptp(columns) - np.ptp(rows)) / (wide - high)
+    edge, about = (np.ptp(columns) - wide * step) / 2, round(0.25 * step)
+
+    def cell(x: int, y: int) -> str:
+        place = [rows.min() + edge + y * step, columns.min() + edge + x * step]
+        i, j = np.round(place).astype(int)
+        near = bright[max(i - about, 0) : i + about + 1, max(j - about, 0) : j + about + 1]
+        return "#" if near.any() else "."
+
+    return tuple("".join(cell(x, y) for x in range(wide + 1)) for y in range(high + 1))

@@ -14,6 +14,7 @@ import struct
 import zipfile
 from dataclasses import replace
 from importlib.metadata import packages_distributions
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -23,10 +24,7 @@ from sample_flights import swarm
 import rigidfleet as rf
 from rigidfleet import interchange
 from rigidfleet.cli.app import main
-from rigidfleet.cli.export import Name
 from rigidfleet.interchange import FORMATS, FormatName, export
-from rigidfleet.interchange.mavlink import read_plan
-from rigidfleet.math import geodesy
 from rigidfleet.result import VARIABLES
 
 N, END, W = 4, 20.0, 0.5
@@ -281,7 +279,12 @@ def check_skyc(path):
 
 
 def test_skyc(flight, tmp_path):
-    """The show follows the schema, and its Bezier curves and yaw setpoints are the flight."""
+    """The show follows the schema, and its Bezier curves and yaw setpoints are the flight.
+
+    Between setpoints, yaw is on lines (`show-format/src/yaw-control.ts` in skybrush-io/skybrush.js), clockwise
+    (`drone-flock.ts` in skybrush-io/viewer: the angle is inverted before it turns a vehicle about z), from the x axis
+    (the same file: the mark of yaw zero is along x; so does `AC_DroneShowManager.cpp` in skybrush-io/ardupilot).
+    """
     made, (path,) = written(flight, "skyc", tmp_path / "show.skyc")
     show, drones = check_skyc(path)
     assert show["environment"]["location"] == {
@@ -296,14 +299,96 @@ def test_skyc(flight, tmp_path):
         def state(k, t, points=points, yaw=yaw):
             (t0, begin, _), (t1, end, control) = points[k : k + 2]
             place = de_casteljau([begin, *control, end], t / (t1 - t0))
-            return [*place, math.radians(np.interp(t0 + t, *yaw.T))]
+            return [*place, -math.radians(np.interp(t0 + t, *yaw.T))]
 
         found.append(off(in_pieces(np.diff([point[0] for point in points]), state), agent))
     agrees(made, found)
     assert made.deviation <= 1.01e-2
+    assert math.degrees(made.yaw_deviation) <= 0.51
+    assert all(0 <= drone["yawControl"]["setpoints"][0][1] < 360 for drone in drones)
     again = tmp_path / "again.skyc"
     export(flight, again, "skyc")
     assert again.read_bytes() == path.read_bytes()
+
+
+def show_of(path, *drones):
+    """A show of drones with these settings, written as the format's types have it."""
+    swarm = [{"type": "generic", "settings": {"name": f"d{k}", **x}} for k, x in enumerate(drones)]
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("show.json", json.dumps({"version": 1, "swarm": {"drones": swarm}}))
+    return path
+
+
+def read_show(path):
+    return FORMATS["skyc"].read(path.read_bytes())
+
+
+def studio_rotation(t):
+    """Rotation about z [deg], counter-clockwise, of the object that Skybrush Studio's numbers are of."""
+    return 30.0 + 52.0 * np.clip(t - 2.0, 0.0, 5.0) - 40.0 * np.clip(t - 7.0, 0.0, 2.0)
+
+
+def test_a_show_of_studio_turns_as_it_did_there(tmp_path):
+    """Yaw that Skybrush Studio's own code wrote is read as the rotation that it was given, counter-clockwise."""
+    own = json.loads((Path(__file__).parent / "data" / "skybrush_studio.json").read_text())
+    (curve,) = read_show(show_of(tmp_path / "studio.skyc", own))
+    t = np.linspace(0.0, 10.0, 401)
+    yaw = curve.at(t)[:, 3]
+    assert abs(np.angle(np.exp(1j * (yaw - np.radians(studio_rotation(t)))))).max() < 1e-4
+    assert yaw[280] - yaw[80] == pytest.approx(np.radians(260.0))
+
+
+def test_a_show_of_studio_turns_so_in_mavlink(tmp_path):
+    """Read by `assess` and exported, Studio's show asks MAVLink for headings clockwise from north, and their rates."""
+    own = json.loads((Path(__file__).parent / "data" / "skybrush_studio.json").read_text())
+    bent = {"points": [[0, [0, 0, 5], []], [10, [4, 0, 5], [[0, 1, 5], [4, 1, 5]]]], "version": 1}
+    show = show_of(tmp_path / "studio.skyc", own | {"trajectory": bent})
+    assert (
+        main(["assess", str(show), "--limits", "speed=1", "--out", str(tmp_path / "judged")]) == 0
+    )
+    (result,) = (tmp_path / "judged").glob("*.nc")
+    assert main(["export", str(result), "--format", "tlog", "--out", str(tmp_path / "tlog")]) == 0
+    (log,) = (tmp_path / "tlog").iterdir()
+    # Message 84 in MAVLink's common.xml: time [ms], 9 floats of state, yaw and its rate; 18 bytes ahead, 2 after.
+    data, found = log.read_bytes(), []
+    while data:
+        length = data[9]
+        if data[13] == 84:
+            found.append(struct.unpack_from("<I9f2f", data, 14))
+        data = data[8 + 6 + length + 2 :]
+    t, yaw, rate = np.array(found)[:, [0, 10, 11]].T
+    wanted = np.radians(90.0 - studio_rotation(t / 1e3))
+    assert abs(np.angle(np.exp(1j * (yaw - wanted)))).max() < math.radians(0.01)
+    turning = (t > 2100) & (t < 6900)
+    assert np.degrees(rate[turning]) == pytest.approx(-52.0, abs=0.01)
+    again = tmp_path / "again.skyc"
+    assert main(["export", str(result), "--format", "skyc", "--out", str(again)]) == 0
+    _, (drone,) = check_skyc(again)
+    way = np.array(drone["yawControl"]["setpoints"])
+    t = np.linspace(0.0, 10.0, 401)
+    assert np.interp(t, *way.T) == pytest.approx(360.0 - studio_rotation(t), abs=0.5)
+
+
+STILL = {"points": [[0, [0, 0, 1], []], [10, [0, 0, 1], []]], "version": 1}
+
+
+def test_yaw_counts_from_the_start_of_the_show(tmp_path):
+    """A later take-off moves a trajectory, not yaw; yaw is constant outside of its setpoints, and may jump."""
+    yaw = {"version": 1, "setpoints": [[4, 90], [6, -90], [6, 0], [8, 0], [8, 45]]}
+    late = {"trajectory": STILL | {"takeoffTime": 3}, "yawControl": yaw}
+    (curve,) = read_show(show_of(tmp_path / "late.skyc", late))
+    assert curve.time[[0, -1]].tolist() == [3.0, 13.0]
+    found = np.degrees(
+        curve.at(np.array([3.0, 4.0, 5.0, 5.999, 6.001, 7.0, 7.999, 8.001, 13.0]))[:, 3]
+    )
+    assert found == pytest.approx([-90, -90, 0, 90, 0, 0, 0, -45, -45], abs=0.1)
+
+
+def test_automatic_yaw_is_unknown(tmp_path):
+    """Where a vehicle turns by itself, setpoints of yaw are not its yaw; a flight by the file's yaw says so."""
+    yaw = {"version": 1, "autoYaw": True, "autoYawOffset": 90, "setpoints": [[0, 10]]}
+    (curve,) = read_show(show_of(tmp_path / "auto.skyc", {"trajectory": STILL, "yawControl": yaw}))
+    assert np.isnan(curve.pieces[:, 3]).all()
 
 
 def lights(settings):
@@ -353,59 +438,6 @@ def test_lights_of_a_show(tmp_path):
             (0.0, (255, 255, 255), False), (2.0, colour, True), (6.0, colour, False), (8.0, (0, 0, 0), True),
             (9.0, (0, 0, 0), False),
         ]  # fmt: skip
-
-
-# -- MAVLink ----------------------------------------------------------------------------------------
-
-
-def test_topocentric_example():
-    """The example of EPSG Guidance Note 7-2, topocentric conversion (9837), comes out to the millimetre, and back."""
-    dms = np.array([53 + 48 / 60 + 33.82 / 3600, 2 + 7 / 60 + 46.38 / 3600])
-    place = np.array([[*np.radians(dms), 73.0]])
-    origin = np.array([*np.radians([55.0, 5.0]), 200.0])
-    enu = geodesy.local(place, origin)
-    assert enu[0] == pytest.approx([-189013.869, -128642.040, -4220.171], abs=5e-3)
-    assert geodesy.geodetic(enu, origin)[0] == pytest.approx(place[0], abs=1e-9)
-
-
-def test_plan(flight, tmp_path):
-    """A plan has QGroundControl's keys, and its points are on the path, at its heights above the origin."""
-    made, files = written(flight, "plan", tmp_path / "plan", tolerance=0.05)
-    assert math.isnan(made.yaw_deviation)
-    assert "deg" not in str(made)
-    for agent, file in enumerate(files):
-        plan = json.loads(file.read_text())
-        assert (plan["fileType"], plan["version"], plan["mission"]["version"]) == ("Plan", 1, 2)
-        assert plan["mission"]["plannedHomePosition"] == [*ORIGIN.values()]
-        items = plan["mission"]["items"]
-        assert [item["doJumpId"] for item in items] == list(range(1, len(items) + 1))
-        assert [item["command"] for item in items] == [22] + [16] * (len(items) - 1)
-        assert all(item["frame"] == 3 and len(item["params"]) == 7 for item in items)
-        # Within 3 m of the origin, a degree is this long (WGS 84, series by Snyder, 1987).
-        phi = math.radians(ORIGIN["latitude_deg"])
-        north = 111132.954 - 559.822 * math.cos(2 * phi) + 1.175 * math.cos(4 * phi)
-        east = 111412.84 * math.cos(phi) - 93.5 * math.cos(3 * phi)
-        params = np.array([item["params"][4:] for item in items])
-        points = np.stack(
-            [(params[:, 1] - 8.5456) * east, (params[:, 0] - 47.3977) * north, params[:, 2]], axis=1
-        )
-        assert points == pytest.approx(read_plan(file.read_bytes()), abs=2e-3)
-        r, _ = motion(np.linspace(0.0, END, 1000))
-        legs = [
-            points[:-1] + share * np.diff(points, axis=0) for share in np.linspace(0.0, 1.0, 50)
-        ]
-        near = np.linalg.norm(np.concatenate(legs)[:, None] - r[0, None, :, agent], axis=2)
-        assert near.min(axis=0).max() < 0.07
-        assert near.min(axis=1).max() < 0.07
-    assert 0.01 < made.deviation <= 0.05
-
-
-def test_a_plan_needs_a_place(flight, tmp_path):
-    """Without a place on the Earth, a plan is refused with the keys that are missing."""
-    data = {key: x for key, x in flight.mission.to_dict().items() if key != "geodetic_origin"}
-    nowhere = replace(flight, mission_text=rf.Mission.from_dict(data).text)
-    with pytest.raises(rf.ResultError, match=r"\[geodetic_origin\] latitude_deg"):
-        export(nowhere, tmp_path / "plan", "plan")
 
 
 def test_places_are_on_the_earth():
@@ -506,14 +538,46 @@ def test_gltf(flight, tmp_path):
         found.append(off(state, agent))
     agrees(made, found)
     assert made.deviation <= 1.01e-2
+    assert math.degrees(made.yaw_deviation) <= 0.51
+
+
+@pytest.mark.parametrize("name", ["skyc", "gltf", "compressed"])
+@pytest.mark.parametrize("omega", [0.5, 0.9, 3.0])
+def test_yaw_keeps_half_a_degree(flight, tmp_path, name, omega):
+    """Tolerances of fitted yaw, of lines through it and of rounding stay within half a degree in sum."""
+    angle = omega * flight.time[:, None] + 0.5 * np.arange(N)
+    swings = replace(flight, yaw=1.5 * np.sin(angle), yaw_rate=1.5 * omega * np.cos(angle))
+    made = export(swings, tmp_path / f"{name}.x", name, tolerance=0.5)
+    assert 0.1 < math.degrees(made.yaw_deviation) <= 0.5
+
+
+def test_fast_turns_are_kept(flight, tmp_path):
+    """Vehicles that turn by 1.5 turns a second still do so in a show and an animation: none takes the short way."""
+    rate = 3.0 * np.pi
+    spun = replace(
+        flight, yaw=np.repeat(rate * flight.time[:, None], N, axis=1), yaw_rate=np.full((len(flight.time), N), rate)
+    )  # fmt: skip
+    for name, most in (("skyc", 0.01), ("gltf", 0.02)):
+        made = export(spun, tmp_path / f"spun.{name}", name)
+        assert math.degrees(made.yaw_deviation) <= most
+    for curve in read_show(tmp_path / "spun.skyc"):
+        assert curve.at(np.array([19.9]))[0, 3] == pytest.approx(19.9 * rate, abs=1e-3)
 
 
 # -- all formats ------------------------------------------------------------------------------------
 
 
 def test_names():
-    """The command, the type and the table of formats have the same names, and the page of exports describes each."""
-    assert get_args(Name) == get_args(FormatName) == tuple(FORMATS)
+    """The type and the table of formats have the same names."""
+    assert get_args(FormatName) == tuple(FORMATS)
+
+
+def test_a_plan_is_refused(flight, tmp_path, capsys):
+    """Plans, which had no times, are no format any more; the error names what to use instead."""
+    with pytest.raises(ValueError, match="no format 'plan'; plans have no times: use tlog to fly"):
+        export(flight, tmp_path / "plan", "plan")  # ty: ignore
+    assert main(["export", "nothing.nc", "--format", "plan"]) == 2
+    assert "use tlog to fly" in capsys.readouterr().err
 
 
 def test_flown_is_not_the_reference(flight, tmp_path):

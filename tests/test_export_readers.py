@@ -1,11 +1,9 @@
-"""Exports read by others' programs: rosbags and mcap-ros2 (MCAP), pymavlink (.tlog), MAVSDK (.plan), Rerun, pygltflib.
+"""Exports read by others' programs: rosbags and mcap-ros2 (MCAP), pymavlink (.tlog), Rerun, pygltflib.
 
 `make .venv/.interchange` installs them; a test whose reader is missing is skipped.
 """
 
-import json
 import math
-import time
 
 import numpy as np
 import pytest
@@ -139,45 +137,6 @@ def test_pymavlink_reads_tlog(flight, wanted, tmp_path):
         assert found[:, 1:10] == pytest.approx(due, rel=2e-7, abs=2e-6)
         same_angles(math.pi / 2 - found[:, 10], wanted.yaw[:, i], 1e-6)
         assert found[:, 11] == pytest.approx(wanted.yaw_rate[:, i], abs=1e-6)
-
-
-@pytest.fixture
-def autopilot():
-    """MAVSDK's access to the missions of an autopilot, which is a heartbeat on MAVSDK's raw link."""
-    mavsdk, missions = reader("mavsdk"), reader("mavsdk.plugins.mission_raw")
-    dialect = reader("pymavlink.dialects.v20.common")
-    beat = dialect.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3)  # a quadrotor with PX4
-    link = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
-    sdk = mavsdk.Mavsdk(
-        mavsdk.Configuration.create_with_component_type(mavsdk.ComponentType.GROUND_STATION)
-    )
-    sdk.add_any_connection("raw://")
-    for _ in range(600):
-        sdk.pass_received_raw_bytes(beat.pack(link))
-        if sdk.system_count():
-            break
-        time.sleep(0.1)
-    yield missions.MissionRaw(sdk.get_systems()[0])
-    sdk.destroy()
-
-
-def test_mavsdk_reads_plan(flight, autopilot, tmp_path):
-    """MAVSDK imports the plan as it would upload it: a take-off, then waypoints at the places of the file."""
-    export(flight, tmp_path / "plan", "plan")
-    for path in sorted((tmp_path / "plan").iterdir()):
-        items = autopilot.import_qgroundcontrol_mission(str(path)).mission_items
-        written = json.loads(path.read_text())["mission"]["items"]
-        assert [item.seq for item in items] == list(range(len(written)))
-        assert [item.command for item in items] == [22] + [16] * (len(items) - 1)
-        assert {item.frame for item in items} == {3}  # heights above home
-        for item, given in zip(items, written, strict=True):
-            latitude, longitude, height = given["params"][4:]
-            assert [item.x, item.y] == [round(1e7 * latitude), round(1e7 * longitude)]
-            assert item.z == pytest.approx(height, rel=1e-6)
-        broken = tmp_path / "broken.plan"
-        broken.write_text(path.read_text()[:200])
-        with pytest.raises(Exception, match="FAILED_TO_PARSE_QGC_PLAN"):
-            autopilot.import_qgroundcontrol_mission(str(broken))
 
 
 def test_rerun_reads_rrd(flight, wanted, tmp_path):

@@ -199,3 +199,15 @@ def test_greatest_of_curves():
     assert found.value == pytest.approx(dense.max(), rel=1e-6)
     assert found.value >= dense.max() * (1 - 1e-9)
     assert found.curve == dense.max(axis=0).argmax()
+
+
+def test_yaw_has_its_rate():
+    """A vehicle that turns evenly has that rate of yaw, also where its yaw is given from -pi to pi."""
+    time = np.linspace(0.0, 8.0, 81)
+    turned = (1.3 * time + np.pi) % (2 * np.pi) - np.pi
+    place = np.stack([np.cos(time), np.sin(time), 0 * time], axis=1)[:, None]
+    made = rf.trajectories(time, place, cubic=True, yaw=turned[:, None])
+    assert made.yaw is not None
+    assert made.yaw_rate is not None
+    np.testing.assert_allclose(made.yaw_rate, 1.3, atol=1e-9)
+    np.testing.assert_allclose(np.cos(made.yaw[:, 0] - 1.3 * made.time), 1.0)

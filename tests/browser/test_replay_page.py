@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import started
-from sample_flights import quadrotors, swarm
+from sample_flights import WORD, bitmap, quadrotors, swarm, word
 from test_policy import HOSTILE, flight
 
 from rigidfleet.math import attitude as att
@@ -829,3 +829,28 @@ def test_in_a_cell_of_a_notebook(browser, eight, tmp_path):
         assert not [words for words in browser.heard() if "SEVERE" in words]
     finally:
         browser.driver.switch_to.default_content()
+
+
+def test_a_word_is_read_at_night(show):
+    """The picture, reduced to a cell a vehicle, is the word that is flown: upright, not mirrored, on a dark sky."""
+    page = show(word(), "t=2.5")
+    page.wait("return replay.scene.renderer.scale === 1 && !replay.stale")
+    wide, high, pixels = page.run(
+        """
+        const { renderer } = replay.scene, { gl, canvas } = renderer;
+        replay.scene.camera.shown = null;
+        replay.scene.draw(2.5, 10);
+        const data = new Uint8Array(4 * canvas.width * canvas.height);
+        gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, data);
+        const amber = [];
+        for (let k = 0; k < data.length; k += 4) if (data[k] > 150 && data[k] - data[k + 2] > 80) amber.push(k / 4);
+        return [canvas.width, canvas.height, amber];
+        """
+    )
+    bright = np.zeros((high, wide), dtype=bool)
+    bright.reshape(-1)[pixels] = True
+    assert bitmap(bright[::-1]) == WORD
+    sky = page.run(PIXEL, 2.5, [0.0, 0.0, 60.0])
+    assert max(sky[:3]) < 40
+    assert page.run("return document.documentElement.classList.contains('night')")
+    assert page.heard() == []

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
-
-from cyclopts import Parameter
 
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import PASSED
 from rigidfleet.cli.outputs import keep_existing
 from rigidfleet.errors import ResultError, RigidfleetError
 
-#: Names of `rigidfleet.interchange.FORMATS`, whose module loads slowly.
-Name = Literal[
-    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "plan", "rrd", "gltf"
-]
-
 
 def export(
     result: Path,
     /,
     *,
-    format: Annotated[Name, Parameter(show_choices=False)],
+    format: str,
     out: Path | None = None,
     rate: float | None = None,
     tolerance: float | None = None,
@@ -39,25 +31,29 @@ def export(
         Result of a flight, NAME.nc.
     format : str
         setpoints (CSV), polynomial (Crazyswarm2), poly4d or compressed (memory of a Crazyflie), skyc (Skybrush), mcap
-        (ROS 2), tlog (MAVLink), plan (QGroundControl), rrd (Rerun) or gltf (Blender).
+        (ROS 2), tlog (MAVLink), rrd (Rerun) or gltf (Blender).
     out : Path
-        File to write, or for polynomial, poly4d, compressed, tlog and plan, folder with one file a vehicle; setpoints
-        takes either. Default: beside the result.
+        File to write, or for polynomial, poly4d, compressed and tlog, folder with one file a vehicle; setpoints takes
+        either. Default: beside the result.
     rate : float
         Samples per second [Hz] of setpoints, mcap, tlog and rrd. Default: those of the result.
     tolerance : float
         Greatest deviation [m] of the curves of all other formats. Default: 0.001 for polynomial and poly4d, 0.005 for
-        compressed, 0.01 for skyc and gltf, 0.1 for plan.
+        compressed, 0.01 for skyc and gltf.
     flown : bool
         Write the motion flown instead of the reference.
     force : bool
         Overwrite existing files, and write a flight that failed, too.
     """
     from rigidfleet.assessment import assess
-    from rigidfleet.interchange import FORMATS
     from rigidfleet.interchange import export as write
+    from rigidfleet.interchange import format_of
     from rigidfleet.result import as_result
 
+    try:
+        chosen = format_of(format)
+    except ValueError as error:
+        raise RigidfleetError(f"{error}.") from None
     flight = as_result(result)
     verdict = assess(flight)
     if not verdict.passed:
@@ -65,12 +61,11 @@ def export(
         if not force:
             raise ResultError(f"{why}\nUse --force to export it all the same; it overwrites, too.")
         console.warn(why)
-    chosen = FORMATS[format]
     name = f"{result.stem}-{format}" if chosen.each else f"{result.stem}.{chosen.suffix}"
     path = out or result.parent / name  # a path such as "." has no name to change
     keep_existing(path, force=force)
     try:
-        made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)
+        made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)  # ty: ignore[invalid-argument-type]
     except ValueError as error:
         raise RigidfleetError(f"{error}.") from None
     console.out().print(f"{made}\nExport   {path}", soft_wrap=True)

@@ -33,10 +33,15 @@ def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewis
 
 
 def with_headings(curve: Piecewise, times: Floats, yaws: Floats) -> Piecewise:
-    """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]."""
+    """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]; it jumps where two have one time."""
     moved = curve.cut(times)
-    yaw = np.interp(moved.time, times, yaws)[None, :, None]
-    return Piecewise(moved.time, moved.pieces[:, :3]).beside(Piecewise.hermite(moved.time, yaw))
+    quarter = np.diff(moved.time) / 4  # inside of a piece, where a jump at its end is not seen
+    begin, end = (
+        np.interp(t, times, yaws) for t in (moved.time[:-1] + quarter, moved.time[1:] - quarter)
+    )
+    slope = (end - begin) / (2 * quarter)
+    yaw = Piecewise(moved.time, np.stack([begin - slope * quarter, slope], axis=-1)[:, None])
+    return Piecewise(moved.time, moved.pieces[:, :3]).beside(yaw)
 
 
 def rows_to_curve(rows: ArrayLike) -> Piecewise:

@@ -1,6 +1,9 @@
 """Skybrush's shows, read: curves of all drones, from an archive that is not trusted.
 
-Sources: the types of Skybrush's show format; times of a trajectory count from its ``takeoffTime``.
+Sources: the types of Skybrush's show format, and its player (`show-format` in skybrush-io/skybrush.js,
+`src/trajectory.ts` and `src/yaw-control.ts`): times of a trajectory count from its ``takeoffTime``, those of yaw from
+the start of the show; yaw is constant before its first and after its last setpoint. It is in degrees clockwise from the
+show's x axis (`sbstudio/model/yaw.py` in skybrush-io/studio-blender, `drone-flock.ts` in skybrush-io/viewer).
 """
 
 from __future__ import annotations
@@ -151,7 +154,8 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
         piece = Piecewise.of_bernstein(time[k : k + 2], control.T[None])
         pieces[k, :3, : len(control)] = piece.pieces[0]
     curve = Piecewise(time + start, pieces)
-    if yaw is None:
+    # With automatic yaw, the vehicle turns by itself; no player of Skybrush says how.
+    if yaw is None or yaw.get("autoYaw"):
         pieces[:, 3] = np.nan
         return curve
     setpoints = _floats(
@@ -162,7 +166,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
     if not len(setpoints):
         pieces[:, 3] = np.nan
         return curve
-    return with_headings(curve, setpoints[:, 0] + start, np.radians(setpoints[:, 1]))
+    return with_headings(curve, setpoints[:, 0], -np.radians(setpoints[:, 1]))
 
 
 def _floats(given: Any, shape: tuple[int | None, ...], where: Callable[[], str]) -> Any:

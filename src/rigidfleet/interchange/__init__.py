@@ -23,12 +23,14 @@ from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
 from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result, as_result
+from rigidfleet.result.lights import has_lights
 
 __all__ = ["FORMATS", "Export", "Format", "FormatName", "export"]
 
 FormatName = Literal[
-    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "plan", "rrd", "gltf"
+    "setpoints", "polynomial", "poly4d", "compressed", "skyc", "mcap", "tlog", "rrd", "gltf"
 ]
 #: How much further off than its tolerance an export may be, by rounding and between the times that a fit checks.
 _SLACK = 1.05
@@ -40,17 +42,18 @@ class Format(NamedTuple):
     Attributes
     ----------
     write : from what is exported and the rate [Hz] or the tolerance [m] to the bytes of each file
-    read : from the bytes of a file to the ways of its vehicles (of a plan: its points)
+    read : from the bytes of a file to the ways of its vehicles
     suffix : of the files' names
     each : whether each vehicle has a file of its own
     tolerance : default tolerance of fitted curves [m]; None: it has samples at a rate instead
     kept, lost : what such a file has of each vehicle, and what it lacks
     own_time : whether its time begins at 0, not at the mission time of the first state
     package, distribution : module that has to be installed, and the name under which pip installs it
+    lights : whether it has the vehicles' lights
     """
 
     write: Callable[[Motion, Any], Iterator[bytes]]
-    read: Callable[[bytes], Any]
+    read: Callable[[bytes], list[Piecewise]]
     suffix: str
     each: bool
     tolerance: float | None
@@ -59,6 +62,7 @@ class Format(NamedTuple):
     own_time: bool = True
     package: str = ""
     distribution: str = ""
+    lights: bool = False
 
 
 FORMATS: dict[str, Format] = {
@@ -80,7 +84,7 @@ FORMATS: dict[str, Format] = {
     ),
     "skyc": Format(
         skybrush.write_skyc, skybrush.read_skyc, "skyc", False, 1e-2,
-        "position (cubic pieces) and yaw", "continuous acceleration, tilt and rotors",
+        "position (cubic pieces) and yaw", "continuous acceleration, tilt and rotors", lights=True,
     ),
     "mcap": Format(
         recordings.write_mcap, recordings.read_mcap, "mcap", False, None,
@@ -90,17 +94,13 @@ FORMATS: dict[str, Format] = {
         mavlink.write_tlog, mavlink.read_tlog, "tlog", True, None,
         "position, velocity, acceleration, yaw and yaw rate", "jerk, tilt and rotors",
     ),
-    "plan": Format(
-        mavlink.write_plan, mavlink.read_plan, "plan", True, 0.1,
-        "path (straight legs)", "all times and speeds, and yaw: it is a preview",
-    ),
     "rrd": Format(
         recordings.write_rrd, recordings.read_rrd, "rrd", False, None,
         "position and yaw", "velocity, acceleration, jerk, tilt and rotors", False, "rerun", "rerun-sdk",
     ),
     "gltf": Format(
         gltf.write_gltf, gltf.read_gltf, "glb", False, 1e-2,
-        "position (cubic splines) and yaw", "continuous acceleration, tilt and rotors",
+        "position (cubic splines) and yaw", "continuous acceleration, tilt and rotors", lights=True,
     ),
 }  # fmt: skip
 assert tuple(FORMATS) == get_args(FormatName)
@@ -115,10 +115,11 @@ class Export:
     format, path : what was written, and where: a file, or a folder with one file a vehicle
     files, size : number of files and of all their bytes
     flown : whether it is the motion flown, not the reference
-    deviation : greatest distance of the files' ways from what was exported [m]; of a plan, of the paths
-    yaw_deviation : greatest difference of yaw [rad]; NaN if the format has no yaw
+    deviation : greatest distance of the files' ways from what was exported [m]
+    yaw_deviation : greatest difference of yaw [rad]
     span : first and last mission time of the ways [s]
     part : words about the part of the flight that the files have; "" for all of it
+    lights : whether the flight has lights, which the format keeps or loses
     """
 
     format: str
@@ -130,22 +131,22 @@ class Export:
     yaw_deviation: float
     span: tuple[float, float]
     part: str
+    lights: bool = False
 
     def __str__(self) -> str:
         what = FORMATS[self.format]
         files = "1 file" if self.files == 1 else f"{self.files} files"
         source = "flown" if self.flown else "reference"
         turned = math.degrees(self.yaw_deviation)
-        within = f"{brief(1e3 * self.deviation)} mm" + (
-            "" if math.isnan(turned) else f" and {brief(turned)} deg"
-        )
+        within = f"{brief(1e3 * self.deviation)} mm and {brief(turned)} deg"
         size = max(1, round(self.size / 1e3))
         # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
-        heading = self.flown and not math.isnan(turned)
-        extra = "; yaw is the reference's, and east where it has none" if heading else ""
+        extra = "; yaw is the reference's, and east where it has none" if self.flown else ""
+        kept = ", and lights" if self.lights and what.lights else ""
+        lost = f"lights, {what.lost}" if self.lights and not what.lights else what.lost
         return (
-            f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}; lost "
-            f"{what.lost}{extra}."
+            f"{self.format}: {files}, {size:,} kB; kept the {source} {what.kept}{self.part} within {within}{kept}; "
+            f"lost {lost}{extra}."
         )
 
 
@@ -203,14 +204,27 @@ def export(
             " (slots are not tracked before or after)" if cut else ""
         )
     return Export(
-        format, path, count, size, flown, off.position, off.yaw, (motion.start, end), part
-    )
+        format, path, count, size, flown, off.position, off.yaw, (motion.start, end), part,
+        has_lights(result),
+    )  # fmt: skip
+
+
+def format_of(name: str) -> Format:
+    """The format of a name.
+
+    Raises
+    ------
+    ValueError
+        There is none of this name.
+    """
+    if name not in FORMATS:
+        why = "; plans have no times: use tlog to fly, gltf to look" if name == "plan" else ""
+        raise ValueError(f"there is no format {name!r}{why}; use one of {', '.join(FORMATS)}")
+    return FORMATS[name]
 
 
 def _chosen(format: str, path: Path) -> Format:
-    if format not in FORMATS:
-        raise ValueError(f"there is no format {format!r}; use one of {', '.join(FORMATS)}")
-    chosen = FORMATS[format]
+    chosen = format_of(format)
     if format == "setpoints" and path.suffix != ".csv":
         return chosen._replace(write=tables.write_tables, each=True)
     return chosen
@@ -268,16 +282,10 @@ def _written(
 
 def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list[Deviation]:
     """How far the ways in a file are from those of the vehicles from ``first`` on."""
-    read = chosen.read(data)
-    if isinstance(read, np.ndarray):  # a path without times
-        source = motion.curve(first)
-        between = (source.time[:-1] + source.time[1:]) / 2
-        points = source.at(np.sort(np.concatenate([source.time, between])))[:, :3]
-        return [Deviation(float(mavlink.to_segments(points, read).max()), math.nan, 0.0)]
     start = motion.start if chosen.own_time else 0.0
     return [
         deviation(motion.curve(first + i), curve.later(start), motion.result.motors_off[first + i])
-        for i, curve in enumerate(read)
+        for i, curve in enumerate(chosen.read(data))
     ]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import NAMES, curve_to_rows, rows_to_curve
-from rigidfleet.interchange.curves import Motion, fit
+from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, fit
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
@@ -106,7 +106,8 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
 
 def _compressed(way: Piecewise, tolerance: float, agent: int) -> tuple[bytes, Floats]:
     """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
-    curve = fit(way, tolerance - COMPRESSED_ROUNDING, longest=_LONGEST * _MS)
+    near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
+    curve = fit(way, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     duration = np.diff(curve.time)
     position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
     # Yaw is of degree 3, like the reference between samples.

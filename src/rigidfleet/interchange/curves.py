@@ -14,7 +14,7 @@ from rigidfleet.result import Result
 from rigidfleet.setpoints import Setpoints, at_rate, curve
 from rigidfleet.typing import Floats
 
-#: Tolerance of yaw wherever pieces are fitted [rad]. Position does not depend on it.
+#: Tolerance of yaw [rad] of exported curves. Position does not depend on it.
 YAW_TOLERANCE = np.radians(0.5)
 #: Where in each interval a fit is checked, and an export is compared: shares of the interval.
 _CHECKED = np.array([0.25, 0.5, 0.75, 1.0])
@@ -60,8 +60,11 @@ class Motion:
         return curve(self.samples, agent)
 
 
-def fit(source: Piecewise, tolerance: float, orders: int = 4, longest: float = np.inf) -> Piecewise:
-    """The fewest pieces that go from knot to knot of a way within a tolerance [m], and `YAW_TOLERANCE`.
+def fit(
+    source: Piecewise, tolerance: float, orders: int = 4, yaw_tolerance: float = YAW_TOLERANCE,
+    longest: float = np.inf,
+) -> Piecewise:  # fmt: skip
+    """The fewest pieces that go from knot to knot of a way within a tolerance [m], and one of yaw [rad].
 
     Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3; yaw: always) at the knots they join. Each is as
     long as the tolerance allows, and not longer than ``longest`` [s].
@@ -87,7 +90,7 @@ def fit(source: Piecewise, tolerance: float, orders: int = 4, longest: float = n
         off = piece.at(t[i:j].ravel()) - wanted[i:j].reshape(-1, 4)
         far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
         far = max(far, (ends[1] - ends[0]) / longest)
-        return piece.pieces, float(max(far, abs(off[:, 3]).max() / YAW_TOLERANCE))
+        return piece.pieces, float(max(far, abs(off[:, 3]).max() / yaw_tolerance))
 
     ends, pieces, length = [0], [], 1
     while ends[-1] < n:
@@ -116,13 +119,15 @@ def fit(source: Piecewise, tolerance: float, orders: int = 4, longest: float = n
 def headings(curve: Piecewise) -> tuple[Floats, Floats]:
     """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
 
-    Times increase: where yaw jumps, it turns within a millisecond.
+    Times increase: where yaw jumps, it turns within a millisecond. A line turns by 90 deg at most: from half a turn on,
+    the shorter way to its end would be another one.
     """
     step, yaw = np.diff(curve.time), curve.pieces[:, 3]
-    bend = (
-        2.0 * abs(yaw[:, 2]) + 6.0 * abs(yaw[:, 3]) * step
-    )  # at least the greatest second derivative
-    counts = np.maximum(1, np.ceil(step * np.sqrt(bend / (4.0 * YAW_TOLERANCE)))).astype(int)
+    # At least the greatest rate and second derivative.
+    _, a, b, c = abs(yaw[:, :4]).T
+    rate, bend = a + 2.0 * b * step + 3.0 * c * step**2, 2.0 * b + 6.0 * c * step
+    lines = step * np.maximum(np.sqrt(bend / (4.0 * YAW_TOLERANCE)), rate / (np.pi / 2))
+    counts = np.maximum(1, np.ceil(lines)).astype(int)
     shares = [np.linspace(0.0, 1.0, count + 1) for count in counts]
     k = np.repeat(np.arange(len(step)), counts + 1)
     after = np.concatenate(shares) * step[k]
@@ -139,7 +144,7 @@ def headings(curve: Piecewise) -> tuple[Floats, Floats]:
 
 
 class Deviation(NamedTuple):
-    """How far an export is from what was exported: position [m], yaw [rad] (NaN: the format has none), and what lacks.
+    """How far an export is from what was exported: position [m], yaw [rad], and what lacks.
 
     ``missing`` is the time at the end that the export does not have [s].
     """

@@ -1,8 +1,9 @@
 """glTF 2.0 in one binary file (.glb): an animation for Blender and other programs that draw.
 
-Source: the glTF 2.0 specification of Khronos: cubic splines (appendix C), the binary container (section 4). Axes are
-right-handed with y up: (x, y, z) of a mission is (x, z, -y) there. No package is used: those on offer either write no
-animations (trimesh) or only wrap the JSON (pygltflib, which the tests read with).
+Source: the glTF 2.0 specification of Khronos: cubic splines (appendix C), the binary container (section 4); for lights,
+its ratified extension KHR_animation_pointer. Axes are right-handed with y up: (x, y, z) of a mission is (x, z, -y)
+there. No package is used: those on offer either write no animations (trimesh) or only wrap the JSON (pygltflib, which
+the tests read with).
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import with_headings
-from rigidfleet.interchange.curves import Motion, fit, headings
+from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, fit, headings
 from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.result.lights import fades, has_lights, lights, view
 from rigidfleet.typing import Floats, Ints
 
 _FLOAT, _UNSIGNED = 5126, 5125
 _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
+#: Extension by which lights change, and the camera's vertical angle of view [rad].
+_POINTER, _FOV = "KHR_animation_pointer", 0.6
 #: An octahedron of radius 1: corners and triangles.
 _CORNERS = np.array(
     [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
@@ -57,7 +61,10 @@ class _File:
 
 
 def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
-    """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between."""
+    """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between.
+
+    If the flight has lights, each vehicle shines in its own, seen by a camera in front.
+    """
     file = _File()
     mesh = {
         "attributes": {"POSITION": file.add(_CORNERS, bounds=True)},
@@ -65,7 +72,7 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
     }
     nodes, samplers, channels = [], [], []
     for agent, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
-        curve = fit(motion.curve(agent), tolerance, orders=2).later(-motion.start)
+        curve = fit(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
         times, yaws = headings(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
@@ -76,23 +83,64 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
             samplers.append(keys | {"interpolation": way})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
         nodes.append({"name": f"agent {agent + 1}", "mesh": 0, "scale": [max(radius, 0.05)] * 3})
-    scene = {
+    scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "rigidfleet"},
         "scene": 0,
         "scenes": [{"name": motion.result.mission.name, "nodes": list(range(len(nodes)))}],
         "nodes": nodes,
         "meshes": [{"primitives": [mesh]}],
         "animations": [{"name": "flight", "samplers": samplers, "channels": channels}],
-        "buffers": [{"byteLength": len(file.data)}],
         "bufferViews": file.views,
         "accessors": file.accessors,
     }
+    if has_lights(motion.result):
+        _light(scene, file, motion)
+    scene["buffers"] = [{"byteLength": len(file.data)}]
     words = json.dumps(scene).encode()
     parts = [(_JSON, words + b" " * (-len(words) % 4)), (_BINARY, bytes(file.data))]
     size = 12 + sum(8 + len(part) for _, part in parts)
     yield struct.pack("<III", _MAGIC, 2, size) + b"".join(
         struct.pack("<II", len(part), kind) + part for kind, part in parts
     )
+
+
+def _light(scene: dict[str, Any], file: _File, motion: Motion) -> None:
+    """Add lights and a camera to a scene: a material for each vehicle, whose emission changes.
+
+    Programs without the extension show the last colour of each that is not black.
+    """
+    result, animation, n = motion.result, scene["animations"][0], motion.n_agents
+    # A change at once takes a millisecond. Samplers are linear where they do not say.
+    ends = [t for fade in fades(result) for t in (fade.begin, fade.end + 1e-3)]
+    times = np.unique(np.clip(ends, motion.start, motion.end).round(4))
+    shown = lights(result, times)
+    shown = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)  # linear
+    last = len(times) - 1 - shown[::-1].any(axis=2).argmax(axis=0)
+    scene["extensionsUsed"] = [_POINTER]
+    black = {"pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1], "metallicFactor": 0}}
+    colours = shown[last, np.arange(n)].tolist()
+    scene["materials"] = [black | {"emissiveFactor": colour} for colour in colours]
+    (shape,) = scene["meshes"][0]["primitives"]
+    scene["meshes"] = [{"primitives": [shape | {"material": i}]} for i in range(n)]
+    keys = file.add(times - motion.start, bounds=True)
+    for i, node in enumerate(scene["nodes"]):
+        node["mesh"] = i
+        animation["samplers"].append({"input": keys, "output": file.add(shown[:, i])})
+        pointer = {_POINTER: {"pointer": f"/materials/{i}/emissiveFactor"}}
+        target = {"path": "pointer", "extensions": pointer}
+        animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
+    azimuth, elevation = view(result)
+    low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
+    far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    ahead = np.array([right[1], -right[0], 0.0])
+    back = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    axes = np.stack([right, np.cross(back, right), back, (low + high) / 2 + far * back])
+    matrix = np.column_stack([_y_up(axes), [0.0, 0.0, 0.0, 1.0]]).ravel().tolist()
+    seen = {"yfov": _FOV, "znear": 0.01 * far, "zfar": 10 * far}
+    scene["cameras"] = [{"type": "perspective", "perspective": seen}]
+    scene["nodes"].append({"name": "front", "camera": 0, "matrix": matrix})
+    scene["scenes"][0]["nodes"].append(n)
 
 
 def read_gltf(data: bytes) -> list[Piecewise]:
@@ -109,8 +157,9 @@ def read_gltf(data: bytes) -> list[Piecewise]:
         return found.astype(float).reshape(-1, each)
 
     animation = scene["animations"][0]
+    channels = [x for x in animation["channels"] if "node" in x["target"]]
     curves = []
-    for moved, turned in zip(animation["channels"][::2], animation["channels"][1::2], strict=True):
+    for moved, turned in zip(channels[::2], channels[1::2], strict=True):
         (time, values), (times, quaternions) = (
             [array(animation["samplers"][channel["sampler"]][key]) for key in ("input", "output")]
             for channel in (moved, turned)

@@ -1,24 +1,19 @@
-"""MAVLink: a log of offboard setpoints (.tlog) for PX4 and ArduPilot, and QGroundControl plans.
+"""MAVLink: a log of offboard setpoints (.tlog) for PX4 and ArduPilot.
 
-Sources: MAVLink's `common.xml` (messages 48, 76 and 84, command 400), its packet format of version 1 with the checksum
-CRC-16/MCRF4XX, and QGroundControl's plan file format, version 1. Local axes are north, east, down: (N, E, D) =
-(y, x, -z), and yaw is clockwise from north.
+Sources: MAVLink's `common.xml` (messages 48, 76 and 84, command 400), and its packet format of version 1 with the
+checksum CRC-16/MCRF4XX. Local axes are north, east, down: (N, E, D) = (y, x, -z), and yaw is clockwise from north.
 """
 
 from __future__ import annotations
 
-import json
 import struct
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import through
 from rigidfleet.interchange.curves import Motion
-from rigidfleet.math import geodesy
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.setpoints import Setpoints, at_times
 from rigidfleet.typing import Floats
@@ -44,8 +39,6 @@ _ORIGIN, _ORIGIN_EXTRA = 48, 41
 _ORIGIN_FIELDS = struct.Struct("<iiiB")
 _MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
 _LOCAL_NED, _AUTOPILOT = 1, 1
-#: Commands and frame of a plan: waypoint, take-off; altitude above the home position.
-_WAYPOINT, _TAKEOFF, _RELATIVE = 16, 22, 3
 
 
 def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
@@ -137,98 +130,3 @@ def _checksum(data: np.ndarray, extra: int) -> np.ndarray:
         low ^= (low << 4) & 0xFF
         crc = (crc >> 8) ^ (low << 8) ^ (low << 3) ^ (low >> 4)
     return crc
-
-
-def write_plan(motion: Motion, tolerance: float) -> Iterator[bytes]:
-    """One plan a vehicle: a take-off to the start of its way and waypoints along it, without times.
-
-    Raises
-    ------
-    ResultError
-        The mission has no geodetic origin.
-    """
-    if (given := motion.result.mission.geodetic_origin) is None:
-        raise ResultError(
-            "a plan needs the place of the mission on the Earth. Add to the mission, and fly it again: "
-            "[geodetic_origin] latitude_deg, longitude_deg and altitude."
-        )
-    origin = np.array(
-        [np.radians(given.latitude_deg), np.radians(given.longitude_deg), given.altitude]
-    )
-    for agent in range(motion.n_agents):
-        curve = motion.curve(agent)
-        t = (curve.time[:-1, None] + np.diff(curve.time)[:, None] * [0.0, 0.5]).ravel()
-        points = curve.at(np.append(t, curve.time[-1]))[:, :3]
-        places = geodesy.geodetic(points[_corners(points, tolerance)], origin)
-        items = [
-            _item(k, _TAKEOFF if k == 1 else _WAYPOINT, np.degrees(place[:2]), place[2] - origin[2])
-            for k, place in enumerate(places, start=1)
-        ]
-        home = [given.latitude_deg, given.longitude_deg, given.altitude]
-        yield (json.dumps(_plan(items, home), indent=1) + "\n").encode()
-
-
-def read_plan(data: bytes) -> Floats:
-    """The points (K, 3) [m] of a plan in axes east, north, up at its home position."""
-    mission = json.loads(data)["mission"]
-    latitude, longitude, altitude = mission["plannedHomePosition"]
-    places = np.array([item["params"][4:7] for item in mission["items"]], dtype=float)
-    places[:, :2] = np.radians(places[:, :2])
-    places[:, 2] += altitude
-    return geodesy.local(places, np.array([np.radians(latitude), np.radians(longitude), altitude]))
-
-
-def _plan(items: list[dict[str, Any]], home: list[float]) -> dict[str, Any]:
-    return {
-        "fileType": "Plan",
-        "version": 1,
-        "groundStation": "QGroundControl",
-        "geoFence": {"version": 2, "circles": [], "polygons": []},
-        "rallyPoints": {"version": 2, "points": []},
-        "mission": {
-            "version": 2,
-            "firmwareType": 12,
-            "vehicleType": 2,
-            "cruiseSpeed": 15,
-            "hoverSpeed": 5,
-            "plannedHomePosition": home,
-            "items": items,
-        },
-    }
-
-
-def _item(number: int, command: int, place: Floats, altitude: float) -> dict[str, Any]:
-    latitude, longitude = (round(float(x), 9) for x in place)
-    return {
-        "type": "SimpleItem",
-        "autoContinue": True,
-        "command": command,
-        "doJumpId": number,
-        "frame": _RELATIVE,
-        "params": [0, 0, 0, None, latitude, longitude, round(float(altitude), 4)],
-    }
-
-
-def _corners(points: Floats, tolerance: float) -> list[int]:
-    """Indices of the points (K, 3) whose polyline has all others within a tolerance [m] (Douglas and Peucker, 1973)."""
-    kept, open_ = {0, len(points) - 1}, [(0, len(points) - 1)]
-    while open_:
-        i, j = open_.pop()
-        if j - i < 2:
-            continue
-        off = to_segments(points[i + 1 : j], points[[i, j]])
-        if off.max() > tolerance:
-            k = i + 1 + int(off.argmax())
-            kept.add(k)
-            open_ += [(i, k), (k, j)]
-    return sorted(kept)
-
-
-def to_segments(points: Floats, corners: Floats) -> Floats:
-    """Distances (K,) of points (K, 3) to a polyline (n + 1, 3)."""
-    least = np.full(len(points), np.inf)
-    for a, b in pairwise(corners):
-        along = b - a
-        share = np.clip((points - a) @ along / max(along @ along, 1e-30), 0.0, 1.0)
-        least = np.minimum(least, np.linalg.norm(points - a - share[:, None] * along, axis=1))
-    return least

@@ -2,7 +2,8 @@
 
 Source: the types of Skybrush's show format (`ShowSpecification`, `Trajectory`, `YawControl`), and, for the location,
 `ShowLocation` of Skybrush Studio: [latitude, longitude] in 1e-7 deg, altitude in mm, and the direction of the show's
-x axis from north to east [deg], here east.
+x axis from north to east [deg], here east. Yaw is in degrees clockwise from the show's x axis, and begins within a turn
+from zero (`sbstudio/model/yaw.py` of Skybrush Studio).
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import Motion, fit, headings
-from rigidfleet.interchange.lights import FRAME, fades, program
+from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, fit, headings
+from rigidfleet.interchange.lights import program
 from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.result.lights import fades
 
 #: Greatest number of vehicles of a show.
 MOST = 5000
@@ -41,11 +43,10 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     if motion.n_agents > MOST:
         raise ResultError(f"a show has at most {MOST} drones, and this flight {motion.n_agents}.")
     mission = motion.result.mission
-    changes = fades(motion.result, motion.start, motion.end)
-    last = round((motion.end - motion.start) / FRAME)
+    changes = fades(motion.result)
     drones, files = [], {}
     for agent in range(motion.n_agents):
-        curve = fit(motion.curve(agent), tolerance, orders=2).later(-motion.start)
+        curve = fit(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _segments(curve)
@@ -56,9 +57,11 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
             "version": 1, "points": points, "takeoffTime": 0, "landingTime": landing
         }  # fmt: skip
         times, yaws = headings(curve)
-        setpoints = np.column_stack([times.round(6), np.degrees(yaws).round(4)]).tolist()
+        clockwise = -np.degrees(yaws)
+        clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
+        setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
-        light = base64.b64encode(bytes(program(changes, agent, last))).decode()
+        light = base64.b64encode(bytes(program(changes, agent, motion.start, motion.end))).decode()
         files[f"{folder}/lights.json"] = {"version": 1, "data": light}
         settings = {
             "name": name,

@@ -489,7 +489,7 @@ class Formation(Part):
         None,
         description="light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
         "default: that of the file of slots if it has colours, else the light before. Vehicles that rest are dark. "
-        "`export --format skyc` writes it",
+        "Replay, figures and the exports skyc and gltf show it",
     )
 
     def greatest_error(self, shortest: float) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import sketches, space
 from rigidfleet.plotting import style as st
+from rigidfleet.result.lights import seen_from
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,11 +65,15 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
     flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * extent
     sideways = flat and rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
     R = np.eye(3) if flat and not sideways else space.camera(-70.0, 30.0 if flat else 16.0)
+    lit = mission.formation_colours(name)
+    R = R if lit is None else space.camera(*np.degrees(seen_from(p)))
     redundant = set() if rigidity is None else set(rigidity.redundant.tolist())
     colours = [st.FLOWN if k in redundant else st.GREY for k in range(len(edges))]
     dashed = [k in redundant for k in range(len(edges))]
     few = len(edges) <= 12
-    sketches.draw_graph(ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed)
+    sketches.draw_graph(
+        ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed, lights=lit
+    )
     told = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
     if rigidity is not None:
         told = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {told}"

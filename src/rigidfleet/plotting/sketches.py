@@ -14,6 +14,7 @@ from rigidfleet.plotting import style as st
 from rigidfleet.plotting.space import camera, dot
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
+from rigidfleet.result.lights import seen_from
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -113,14 +114,17 @@ def _sketch(fig: Figure, rect: Rect, result: Result, name: str) -> None:
     ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
     turned = p - origin
     axes = np.eye(3)
-    if not flat:
-        R = camera(-70.0, 16.0)
+    lit = mission.formation_colours(name)
+    if not flat or lit:
+        R = camera(*np.degrees(seen_from(p))) if lit else camera(-70.0, 16.0)
         turned, axes = turned @ R.T, axes @ R.T
     colours = {k: g.colour for g in curves.edge_groups(result) for k in g.edges}
     index = {edge: k for k, edge in enumerate(map(tuple, result.edges.tolist()))}
     of_edge = [colours[index[edge]] for edge in map(tuple, edges.tolist())]
-    draw_graph(ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None)
-    if placed and len(p) > 1:
+    draw_graph(
+        ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None, lights=lit
+    )
+    if placed and len(p) > 1 and not lit:
         reach = float(np.linalg.norm(turned, axis=1).max())
         taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
         length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(p, 1e-3)] * reach
@@ -135,14 +139,24 @@ def draw_graph(
     lengths: Floats | None,
     *,
     dashed: Sequence[bool] = (),
+    lights: Sequence[str] | None = None,
 ) -> None:
-    """Draw agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m]."""
+    """Draw agents at p (N, 3), seen along the last axis, as numbered discs, with edges and their lengths [m].
+
+    With the colour of each agent's light, it is night.
+    """
     n = len(p)
     room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
     ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
     ax.axis("off")
+    if lights:
+        from matplotlib.patches import Rectangle
+
+        night: Any = {"facecolor": st.NIGHT, "linewidth": 0, "zorder": 0}
+        ax.add_patch(Rectangle((-room, -room), 2 * room, 2 * room, **night, gid="night"))
+    shown = lights or st.agent_colours(n)
     if n > st.MANY:
-        _draw_mesh(ax, p, edges, colours)
+        _draw_mesh(ax, p, edges, colours, shown)
         return
     for e in np.argsort(p[edges, 2].mean(axis=1)) if len(edges) else []:
         i, j = edges[e]
@@ -166,9 +180,9 @@ def draw_graph(
                 x, y, f"{lengths[e]:.3g} m", fontsize=7.5, ha="center", va="center", zorder=3,
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )  # fmt: skip
-    size = 14.0 if n <= 12 else 60.0 / math.sqrt(n)
+    size = (14.0 if n <= 12 else 60.0 / math.sqrt(n)) * (0.6 if lights else 1.0)
     for i in np.argsort(p[:, 2]):
-        colour = st.agent_colours(n)[i]
+        colour = shown[i]
         x, y = p[i, :2]
         ax.plot(x, y, **dot(colour, size), zorder=5, gid=f"agent-{i + 1}")
         if size > 7:
@@ -178,8 +192,8 @@ def draw_graph(
             )  # fmt: skip
 
 
-def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
-    """Draw a graph of many agents, with the far parts first and fainter."""
+def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Sequence[str]) -> None:
+    """Draw a graph of many agents in the colours shown, with the far parts first and fainter."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import to_rgba_array
 
@@ -196,7 +210,7 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str]) -> None:
         lines.set_gid("edges")
         ax.add_collection(lines)
     order = np.argsort(p[:, 2])
-    dots = to_rgba_array(st.agent_colours(len(p)))
+    dots = to_rgba_array(list(shown))
     dots[:, 3] = depth
     ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 

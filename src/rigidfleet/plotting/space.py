@@ -12,6 +12,8 @@ from rigidfleet.plotting import solids
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
+from rigidfleet.result.lights import has_lights, lights
+from rigidfleet.result.lights import view as seen
 from rigidfleet.solids.records import corners
 from rigidfleet.typing import Floats
 
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 _BOX = solids.COLOUR
 _GROUND = "#E9E6DF"
 _ELEVATION = 24.0  # of the camera [deg]
+#: Least and greatest elevation of the camera in front of lights, and how far it stands aside, to show the axes [deg].
+_LOW, _HIGH, _ASIDE = 12.0, 60.0, 15.0
 _TRAIL = 1500  # points of an agent's path
 _LINES = 2000  # edges that are drawn among paths
 
@@ -120,6 +124,8 @@ def _shots(result: Result, rows: Any) -> list[int]:
     """
     if not len(rows):
         return []
+    if has_lights(result):  # of two at one place, the later light
+        rows = rows[::-1]
     r = result.position
     about = r[rows] - r[rows].mean(axis=1, keepdims=True)
     size = 2 * float(np.median(np.linalg.norm(about, axis=2).max(axis=1))) or 1e-9
@@ -159,6 +165,15 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Draw paths, agents at the drawn samples, start, end and waypoints, in 2 or 3 axes."""
     for _, place in view.waypoints:
         ax.plot(*place[:axes, None], **_CROSS, zorder=7)
+    if has_lights(result):
+        for i in st.some(result.n_agents, st.MANY):
+            path: dict[str, Any] = {"color": st.GREY, "linewidth": 0.4, "alpha": 0.3, "zorder": 3}
+            ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
+        r = result.position[view.shots, :, :axes].reshape(-1, axes)
+        shown = lights(result, result.time[view.shots]).reshape(-1, 3)
+        look: dict[str, Any] = {"depthshade": False} if axes == 3 else {}
+        ax.scatter(*r.T, s=5, c=shown, linewidths=0, zorder=5, gid="lights", **look)
+        return
     if result.n_agents > st.MANY:
         _draw_many(ax, result, view, axes)
         return
@@ -214,7 +229,13 @@ def draw_space(
     low, high = view.low, view.high
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     _plain_axes(ax)
-    if view.ground:
+    night = has_lights(result)
+    if night:
+        ax.grid(visible=False)
+        walls: tuple[Any, ...] = (ax.xaxis, ax.yaxis, ax.zaxis)
+        for wall in walls:
+            wall.set_pane_color(st.NIGHT)
+    if view.ground and not night:
         flat = corners(low, high)[[0, 2, 6, 4]]
         flat[:, 2] = view.floor
         ax.add_collection3d(Poly3DCollection([flat], facecolor=_GROUND, alpha=0.8, zorder=0))
@@ -239,7 +260,11 @@ def draw_space(
             x, y, z, f"  {name}", fontsize=7.5, zorder=8, va="bottom", parse_math=False,
             path_effects=st.halo(),
         )  # fmt: skip
-    ax.view_init(_ELEVATION, _azimuth(view))
+    if night:
+        azimuth, elevation = np.degrees(seen(result))
+        ax.view_init(min(max(elevation, _LOW), _HIGH), azimuth + _ASIDE)
+    else:
+        ax.view_init(_ELEVATION, _azimuth(view))
     _fit(fig, ax, view, rect)
     _name_axes(fig, ax, view)
     return ax
@@ -284,10 +309,16 @@ def _on_screen(ax: Axes3D, points: Floats) -> Floats:
 def _name_axes(fig: Figure, ax: Axes3D, view: Scene) -> None:
     """Name the axes at a fixed distance from them; the distance of matplotlib's own names changes with the zoom."""
     (x0, y0, z0), (x1, y1, z1) = view.low, view.high
+    # Corners of the floor from the left one, as seen; matplotlib draws the ticks of z right or left of these edges.
+    turns = round((ax.azim + 45) / 90)
+    ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+    a, b, c = (ring[(turns + k) % 4] for k in range(3))
+    across, deep = ("y [m]", "x [m]") if turns % 2 else ("x [m]", "y [m]")
+    high = a if turns % 2 else c
     edges = {
-        "x [m]": [(x0, y0, z0), (x1, y0, z0)],
-        "y [m]": [(x1, y0, z0), (x1, y1, z0)],
-        "z [m]": [(x1, y1, z0), (x1, y1, z1)],
+        across: [(*a, z0), (*b, z0)],
+        deep: [(*b, z0), (*c, z0)],
+        "z [m]": [(*high, z1), (*high, z0)] if turns % 2 else [(*high, z0), (*high, z1)],
     }
     for name, edge in edges.items():
         a, b = _on_screen(ax, np.array(edge))
@@ -334,6 +365,9 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
     ax.set(xlabel="x [m]", ylabel="y [m]")
     ax.set_aspect("equal", adjustable="box")
     ax.apply_aspect()
+    if has_lights(result):
+        ax.set_facecolor(st.NIGHT)
+        ax.grid(visible=False)
     for name, low, high in view.boxes:
         _outline(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
     for shape in view.shapes:
@@ -369,13 +403,14 @@ def handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
     from matplotlib.lines import Line2D
 
-    marks = [
+    waypoints = [Line2D([], [], **_CROSS, label="waypoint")] if view.waypoints else []
+    if has_lights(result):
+        return waypoints
+    ends = [
         Line2D([], [], **dot(st.GREY, 5, hollow=True), label="start"),
         Line2D([], [], **dot(st.GREY, 5, marker="s"), label="end"),
     ]
-    if view.waypoints:
-        marks.append(Line2D([], [], **_CROSS, label="waypoint"))
-    return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *marks]
+    return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
 @styled

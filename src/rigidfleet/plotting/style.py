@@ -42,6 +42,8 @@ TONES = ("#1F2A36", "#66798D", "#A9B8C6")
 BAND = "#F1F3F5"
 DASHES = (0, (4, 2.5))
 ALERT = "#B00020"
+#: Background of lights.
+NIGHT = "#0B0E16"
 
 WIDTH = 9.0  # width of a figure over time [in]
 _COLUMN = 5.5  # a figure that is narrower has one column of axes [in]

@@ -87,7 +87,7 @@ def trajectories(
     time : (K,) [s], increasing
     position : (K, N, 3) [m], world axes (z up)
     velocity, acceleration, jerk : (K, N, 3); each needs those before
-    yaw : (K, N) [rad]
+    yaw : (K, N) [rad], on lines; full turns between two samples do not count
     cubic : without velocities, cubic splines with continuous acceleration (`scipy.interpolate.CubicSpline`) instead of
         lines
     mission : a mission, its name or path: the radii and masses of its vehicles, its limits and obstacles count, instead
@@ -133,7 +133,7 @@ def trajectories(
     first, knots = intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
-    yaws = None if yaw is None else _checked("yaw", yaw, 2)
+    yaws = None if yaw is None else np.unwrap(_checked("yaw", yaw, 2), axis=0)
     if yaws is not None and yaws.shape != shape[:2]:
         raise ResultError(f"yaw has shape {yaws.shape}, expected {shape[:2]}: samples, vehicles.")
     # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
@@ -335,7 +335,10 @@ def _continuous(curve: Piecewise) -> None:
 
 
 def _samples(curve: Piecewise) -> tuple[Floats, Floats, Floats]:
-    """Times (K',), states (4, K', N, 3) and yaws (K', N): one sample at each end of a piece, two where states jump."""
+    """Times (K',), states (4, K', N, 3), yaws and their rates (2, K', N): one sample at each end of a piece.
+
+    Where states jump, there are two. Where the rate of yaw jumps, it is the mean.
+    """
     begin, end = curve.ends(4)
     first, last = begin[..., :3], end[..., :3]
     before, after = last[:, :-1], first[:, 1:]
@@ -348,7 +351,11 @@ def _samples(curve: Piecewise) -> tuple[Floats, Floats, Floats]:
     time[later] = np.nextafter(time[later], np.inf)
     state = np.concatenate([first, last[:, -1:]], axis=1)[:, k]
     state[:, np.flatnonzero(later) - 1] = before[:, again - 1]
-    return time, state, np.concatenate([begin[0], end[0, -1:]])[k, :, 3]
+    left, right = (
+        np.concatenate(x, axis=1)[:2, k][..., 3]
+        for x in ((begin[:, :1], end), (begin, end[:, -1:]))
+    )
+    return time, state, np.stack([right[0], (left[1] + right[1]) / 2])
 
 
 def _put_extremes(record: PhaseRecord, mission: Mission, curve: Piecewise) -> None:
@@ -463,7 +470,7 @@ def _result(
     return Result(
         time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=a,
         slot_position=r, slot_velocity=v, slot_acceleration=a, slot_jerk=j,
-        yaw=np.nan_to_num(yaw), yaw_rate=np.zeros((k, n)),
+        yaw=np.nan_to_num(yaw[0]), yaw_rate=np.nan_to_num(yaw[1]),
         input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
         cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,
         edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),

@@ -18,6 +18,7 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import write_file
 from rigidfleet.math.piecewise import piece_at
 from rigidfleet.result import Result, as_result
+from rigidfleet.result.lights import has_lights, view
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import page
@@ -106,6 +107,9 @@ def html_page(result: Result) -> str:
     info = describe(result.mission, result.edges[shown], tension) | _story(result, time)
     if result.interpolation is not None:  # nobody knows the thrust
         info["plots"] = [plot for plot in info["plots"] if plot["column"] != "thrust plot"]
+    if has_lights(result):
+        azimuth, elevation = view(result)
+        info |= {"night": True, "azimuth": azimuth, "elevation": elevation}
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
     info |= {"note": _note(result, shown, tension, most), "swarm": swarm}
     return page(info, start="replay/replay.js", data=data)

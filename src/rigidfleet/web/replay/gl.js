@@ -1,7 +1,9 @@
 // Drawing with WebGL 2: instances of lit meshes, lines of constant width, a ground grid. World axes as
 // in the flight: x east, y north, z up; lengths in metres, colours [r, g, b, a] from 0 to 1.
 
-export const BACKGROUND = [0.945, 0.957, 0.969];
+// Background, ground and lines on it, and the share of light that falls on things: by day and by night.
+const DAY = { background: [0.945, 0.957, 0.969], base: [0.885, 0.902, 0.918], grid: [0.66, 0.71, 0.76], light: 1 };
+const NIGHT = { background: [0.02, 0.027, 0.05], base: [0.035, 0.045, 0.07], grid: [0.11, 0.13, 0.18], light: 0.3 };
 
 // -- vectors and matrices ---------------------------------------------------------------------------
 
@@ -214,6 +216,8 @@ export function rotorMesh() {
 
 // -- instances ---------------------------------------------------------------------
 
+/** Reach of a light's glow beyond its vehicle, in radii. */
+const GLOW = 3;
 /** Number of items in a row of their texture; each takes 12 words (three texels). */
 const PER_ROW = 256;
 export const NO_TURN = [1, 0, 0, 0];
@@ -297,7 +301,7 @@ layout(location=2) in vec3 a_look; // tone, opacity, number of the copy
 uniform int u_first;
 uniform mat4 u_view;
 uniform vec3 u_eye, u_background;
-uniform float u_fog;
+uniform float u_fog, u_light;
 out vec4 v_colour;
 ${ITEM}
 ${FOG}
@@ -310,7 +314,7 @@ void main() {
   vec3 place = uintBitsToFloat(first.xyz) + turned(a_position * second.xyz, turn), n = turned(a_normal, turn);
   float light = 0.71 + 0.06 * n.z + 0.30 * max(dot(n, vec3(0.36, -0.30, 0.88)), 0.0);
   vec3 own = a_look.x < 0.5 ? vec3(0.17, 0.19, 0.22) : a_look.x < 1.5 ? given.rgb : vec3(0.98);
-  v_colour = vec4(fogged(own * light, place), given.a * a_look.y);
+  v_colour = vec4(fogged(own * light * u_light, place), given.a * a_look.y);
   gl_Position = u_view * vec4(place, 1.0);
 }`;
 
@@ -368,23 +372,30 @@ layout(location=1) in float a_radius;
 layout(location=2) in vec4 a_colour;
 uniform mat4 u_view;
 uniform vec3 u_eye, u_background;
-uniform float u_fog, u_pixels, u_least, u_ground, u_shade; // a shade lies on the ground
+uniform float u_fog, u_pixels, u_least, u_ground, u_shade, u_glow; // a shade lies on the ground, a glow before its vehicle
 out vec4 v_colour;
 ${FOG}
 void main() {
   vec3 place = u_shade > 0.0 ? vec3(a_position.xy, u_ground) : a_position;
+  place += u_glow * a_radius * normalize(u_eye - place);
   gl_Position = u_view * vec4(place, 1.0);
-  gl_PointSize = 2.0 * max(a_radius * u_pixels / max(gl_Position.w, 1e-6), u_least);
-  v_colour = u_shade > 0.0 ? vec4(0.13, 0.15, 0.18, u_shade) : vec4(fogged(a_colour.rgb, place), 1.0);
+  gl_PointSize = 2.0 * max((1.0 + u_glow) * a_radius * u_pixels / max(gl_Position.w, 1e-6), u_least);
+  v_colour = u_shade > 0.0 ? vec4(0.13, 0.15, 0.18, u_shade) : vec4(u_glow > 0.0 ? a_colour.rgb : fogged(a_colour.rgb, place), 1.0);
 }`;
 
 const DOT_FRAGMENT = `#version 300 es
-precision mediump float;
+precision highp float;
+uniform float u_glow;
 in vec4 v_colour;
 out vec4 colour;
 void main() {
   vec2 d = gl_PointCoord - 0.5;
   if (dot(d, d) > 0.25) discard;
+  if (u_glow > 0.0) { // a bright point in a faint halo, which add up
+    float far = 4.0 * dot(d, d);
+    colour = vec4(v_colour.rgb * (1.4 * exp(-30.0 * far) + 0.5 * exp(-9.0 * far) + 0.12 * (1.0 - far)), 1.0);
+    return;
+  }
   colour = vec4(v_colour.rgb * (1.05 - 0.4 * gl_PointCoord.y), v_colour.a);
 }`;
 
@@ -401,7 +412,7 @@ void main() {
 // Lines thinner than a pixel fade out before they can flicker.
 const GROUND_FRAGMENT = `#version 300 es
 precision highp float;
-uniform vec3 u_base;
+uniform vec3 u_base, u_grid;
 uniform vec2 u_offset;
 uniform float u_reach, u_step, u_solid;
 in vec2 v_place;
@@ -414,7 +425,7 @@ void main() {
   float fade = 1.0 - smoothstep(0.15, 1.0, length(v_place));
   vec2 p = v_place * (u_reach / u_step) + u_offset, d = max(fwidth(p), 1e-6);
   float line = max(0.5 * grid(p, d, 1.1), grid(0.1 * p, 0.1 * d, 1.5));
-  colour = vec4(mix(u_base, vec3(0.66, 0.71, 0.76), line), fade * max(u_solid, line));
+  colour = vec4(mix(u_base, u_grid, line), fade * max(u_solid, line));
 }`;
 
 /** Whether WebGL runs in software, without a graphics card. */
@@ -437,6 +448,7 @@ export class Renderer {
     this.gl = gl;
     this.effort = this.software ? 0.7 : 1; // share of the resolution, lowered where drawing is slow
     this.scale = 1;
+    this.night = false;
     this.mesh = this.program(MESH_VERTEX, PLAIN_FRAGMENT);
     this.line = this.program(LINE_VERTEX, LINE_FRAGMENT);
     this.grid = this.program(GROUND_VERTEX, GROUND_FRAGMENT);
@@ -447,6 +459,10 @@ export class Renderer {
     this.empty = gl.createVertexArray();
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
+  }
+
+  get look() {
+    return this.night ? NIGHT : DAY;
   }
 
   program(vertex, fragment) {
@@ -504,13 +520,14 @@ export class Renderer {
     this.camera = camera;
     this.view = viewMatrix(camera, width / height);
     gl.viewport(0, 0, width, height);
-    gl.clearColor(...BACKGROUND, 1);
+    gl.clearColor(...this.look.background, 1);
     gl.depthMask(true);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     for (const { program, uniforms } of [this.mesh, this.line, this.grid, this.dot].filter(Boolean)) {
       gl.useProgram(program);
       gl.uniformMatrix4fv(uniforms.u_view, false, this.view);
-      if (uniforms.u_background) gl.uniform3fv(uniforms.u_background, BACKGROUND);
+      if (uniforms.u_background) gl.uniform3fv(uniforms.u_background, this.look.background);
+      if (uniforms.u_light) gl.uniform1f(uniforms.u_light, this.look.light);
       if (uniforms.u_eye) gl.uniform3fv(uniforms.u_eye, camera.eye);
       if (uniforms.u_fog) gl.uniform1f(uniforms.u_fog, camera.fog);
     }
@@ -536,7 +553,8 @@ export class Renderer {
     gl.uniform1f(uniforms.u_reach, reach);
     gl.uniform1f(uniforms.u_step, step);
     gl.uniform1f(uniforms.u_solid, solid ? 1 : 0);
-    gl.uniform3fv(uniforms.u_base, solid ? [0.885, 0.902, 0.918] : BACKGROUND);
+    gl.uniform3fv(uniforms.u_base, solid ? this.look.base : this.look.background);
+    gl.uniform3fv(uniforms.u_grid, this.look.grid);
     gl.uniform2f(uniforms.u_offset, (centre[0] / step) % 10, (centre[1] / step) % 10);
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
   }
@@ -570,7 +588,7 @@ export class Renderer {
     }
   }
 
-  /** Vehicles that are drawn as dots: radii (n,) and colours (n x 4 bytes), which do not change. */
+  /** Vehicles that are drawn as dots: radii (n,) and colours (n x 4 bytes), which change only where they glow. */
   swarm(radius, colours) {
     const { gl } = this, array = gl.createVertexArray(), places = gl.createBuffer();
     this.dot ??= this.program(DOT_VERTEX, DOT_FRAGMENT);
@@ -582,27 +600,35 @@ export class Renderer {
       gl.vertexAttribPointer(index, width, kind, scaled, 0, 0);
     };
     column(0, places, null, 3, gl.FLOAT, false);
+    const lights = gl.createBuffer();
     column(1, gl.createBuffer(), radius, 1, gl.FLOAT, false);
-    column(2, gl.createBuffer(), colours, 4, gl.UNSIGNED_BYTE, true);
+    column(2, lights, colours, 4, gl.UNSIGNED_BYTE, true);
     gl.bindVertexArray(null);
-    return { array, places, count: radius.length };
+    return { array, places, lights, count: radius.length };
   }
 
   /**
    * Draw a swarm at its places (n x 3), or its shades on the ground at a height. `pixels` cover a metre at 1 m, and no dot
-   * has a smaller radius than `least` [px].
+   * has a smaller radius than `least` [px]. With `lights` (n x 4 bytes), dots glow in these colours.
    */
-  dots(swarm, places, pixels, least, ground = null) {
+  dots(swarm, places, pixels, least, ground = null, lights = null) {
     const { gl } = this, { program, uniforms } = this.dot, ratio = this.canvas.width / Math.max(this.canvas.clientWidth, 1);
     gl.useProgram(program);
     gl.uniform1f(uniforms.u_pixels, pixels * ratio);
     gl.uniform1f(uniforms.u_least, least * ratio);
     gl.uniform1f(uniforms.u_ground, ground ?? 0);
     gl.uniform1f(uniforms.u_shade, ground === null ? 0 : 0.14);
+    gl.uniform1f(uniforms.u_glow, lights ? GLOW : 0);
     gl.bindVertexArray(swarm.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, swarm.places);
     gl.bufferData(gl.ARRAY_BUFFER, places, gl.DYNAMIC_DRAW);
+    if (lights) {
+      gl.bindBuffer(gl.ARRAY_BUFFER, swarm.lights);
+      gl.bufferData(gl.ARRAY_BUFFER, lights, gl.DYNAMIC_DRAW);
+      gl.blendFunc(gl.SRC_ALPHA, gl.ONE);
+    }
     gl.drawArrays(gl.POINTS, 0, swarm.count);
+    gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
   }
 
   lines(lines) {

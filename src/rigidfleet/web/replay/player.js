@@ -245,7 +245,7 @@ export class Player {
     }
     for (const [name, text] of Object.entries(SHOWN)) {
       const label = element("label", part("show")), box = element("input", label, { type: "checkbox", "data-show": name });
-      box.checked = true;
+      box.checked = this.scene.show[name];
       label.append(text);
       box.addEventListener("change", () => {
         this.scene.show[name] = box.checked;
@@ -531,7 +531,7 @@ export class Player {
     const [first, last] = this.span(), share = last > first ? (time - first) / (last - first) : 0;
     for (const plot of this.plots) plot.point(share, state);
     const much = scene.enlarged > 1e6 ? "Vehicles have no size; they are drawn as if." : `Vehicles are drawn ${digits(scene.enlarged)} times their size.`;
-    const larger = scene.enlarged > 1.15 ? much : "";
+    const larger = scene.enlarged > 1.15 && !scene.night ? much : "";
     write("notes", [info.note, larger, overworked(state), avoiding(state)].filter(Boolean).join("\n"));
   }
 }

@@ -1,7 +1,7 @@
 // The picture of a flight at one time, and its camera.
 
 import {
-  BACKGROUND, Lines, Mesh, NO_TURN, OWN, Places, ROTORS, add, cross, discMesh, dot, length, mixed,
+  Lines, Mesh, NO_TURN, OWN, Places, ROTORS, add, cross, discMesh, dot, length, mixed,
   ballMesh, farVehicleMesh, noseMesh, quaternion, rotorMesh, scaled, smallVehicleMesh, sub, unit, vehicleMesh,
 } from "./gl.js";
 import { bodyAxes } from "./recording.js";
@@ -19,6 +19,7 @@ const MANY = 300; // number of vehicles from which on drawing in software begins
 const AWAY = 1e12; // a coordinate that no camera sees [m]
 const NEAR = 500; // greatest number of vehicles of a swarm that are drawn with a shape
 const DOT = 2.5, LARGE_DOT = 3.5; // least radius of a dot on the screen [px], in a swarm and in a crowd
+const LIGHT = 9, SMALL_LIGHT = 5; // least radius of a light's glow on the screen [px], and in a crowd
 const CROWD = 60; // number of vehicles beyond which each is drawn less prominently
 
 /** Colour of an edge: `share` of the largest tension, from -1 (pushes) to 1 (pulls), by its square root. */
@@ -26,6 +27,7 @@ export function tensionColour(share) {
   return mixed(IDLE, share < 0 ? PUSH : PULL, Math.sqrt(Math.min(Math.abs(share), 1)));
 }
 
+const bytes = (colours) => Uint8Array.from(colours.flatMap((c) => [...c.map((x) => 255 * x), 255]));
 const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
 
 // -- the camera ---------------------------------------------------------------------------------------
@@ -52,6 +54,7 @@ class Camera {
       for (let i = k * n; i < (k + 1) * n; i++) this.sight.push(columns.position.subarray(3 * i, 3 * i + 3));
     }
     this.fov = (36 * Math.PI) / 180;
+    this.steep = info.elevation ?? STEEP;
     this.centre = [0, 0]; // of the part of the page that nothing covers, and the part's size: shares of half the page
     this.free = [1, 1];
     this.use(info.camera, true);
@@ -62,7 +65,7 @@ class Camera {
   use(mode, now = false) {
     this.mode = mode;
     this.azimuth = mode === "top" ? -Math.PI / 2 : this.info.azimuth; // from above, north is up
-    this.elevation = mode === "top" ? Math.PI / 2 : mode === "overview" ? STEEP : 0.4;
+    this.elevation = mode === "top" ? Math.PI / 2 : mode === "overview" ? this.steep : this.info.elevation ?? 0.4;
     this.zoom = 1;
     this.pan = [0, 0, 0];
     if (now) this.shown = null;
@@ -82,7 +85,7 @@ class Camera {
 
   /** Target and distance that show the whole flight and nearby obstacles in the free part of the page. */
   overview(aspect) {
-    const { right, up, back } = viewAxes(this.info.azimuth, STEEP), { middle } = this.info;
+    const { right, up, back } = viewAxes(this.info.azimuth, this.steep), { middle } = this.info;
     const wide = Math.tan(this.fov / 2) * aspect * this.free[0], high = Math.tan(this.fov / 2) * this.free[1];
     // For each side of the picture, the distance at which the outermost point lies on its border.
     let [l, r, b, t] = [-Infinity, -Infinity, -Infinity, -Infinity];
@@ -156,13 +159,17 @@ export class Scene {
     this.colours = info.colours.map(rgb);
     this.renderer = renderer;
     this.labels = new Labels(labels);
-    this.show = { edges: true, trails: true, slots: true, axes: true, names: true };
+    this.night = Boolean(info.night); // then vehicles are their lights, and all else is shown if asked for
+    renderer.night = this.night;
+    document.documentElement.classList.toggle("night", this.night);
+    const day = !this.night;
+    this.show = { edges: day, trails: day, slots: day, axes: day, names: day };
     this.camera = new Camera(recording);
     this.crowd = this.n > CROWD;
     const plain = this.crowd && renderer.software; // many triangles are slow without a graphics card
     if (this.n > MANY && renderer.software) renderer.effort = LEAST_EFFORT;
     // Dots for vehicles: in swarms always, in crowds without a graphics card while the picture moves.
-    if (info.swarm || (this.n > MANY && renderer.software)) this.swarm = renderer.swarm(Float32Array.from(info.radius), Uint8Array.from(this.colours.flatMap((c) => [...c.map((x) => 255 * x), 255])));
+    if (info.swarm || this.night || (this.n > MANY && renderer.software)) this.swarm = renderer.swarm(Float32Array.from(info.radius), bytes(this.colours));
     const upload = (mesh) => this.renderer.upload(mesh);
     this.meshes = {
       vehicle: upload(vehicleMesh()),
@@ -192,6 +199,7 @@ export class Scene {
     const { renderer, camera, recording } = this, { canvas } = renderer;
     const state = recording.at(time);
     this.state = state;
+    if (this.night) this.colours.forEach((own, i) => own.forEach((_, c) => (own[c] = state.light[3 * i + c])));
     let moving = camera.update(recording, state, canvas.clientWidth / Math.max(canvas.clientHeight, 1), wait);
     renderer.begin(camera);
     for (const name in this.places) this.places[name].clear();
@@ -217,7 +225,7 @@ export class Scene {
     renderer.ground(under, Math.max(8 * camera.distance, 0.6 * info.extent), this.gridStep, info.solid);
     const { dotted } = this, pixels = 1 / this.pixel, least = info.swarm ? DOT : LARGE_DOT;
     renderer.meshes(meshes.shade, places.shades);
-    if (dotted) renderer.dots(this.swarm, this.far, pixels, 1.3 * least, info.ground);
+    if (dotted && !this.night) renderer.dots(this.swarm, this.far, pixels, 1.3 * least, info.ground);
     renderer.lines(lines.ground);
     renderer.depth(true);
     renderer.meshes(meshes.box, places.solid);
@@ -226,7 +234,7 @@ export class Scene {
     renderer.meshes(meshes.vehicle, places.turned);
     renderer.meshes(meshes.nose, places.noses);
     renderer.meshes(meshes.small, places.small);
-    if (dotted) renderer.dots(this.swarm, this.far, pixels, least);
+    if (dotted && !this.night) renderer.dots(this.swarm, this.far, pixels, least);
     renderer.meshes(meshes.cone, places.cones);
     renderer.meshes(meshes.pin, places.pins);
     renderer.meshes(meshes.ball, places.balls);
@@ -239,6 +247,7 @@ export class Scene {
     renderer.meshes(meshes.box, places.veils);
     renderer.meshes(meshes.ball, places.ballVeils);
     for (const solid of this.solids) renderer.meshes(solid.mesh, solid.veil);
+    if (this.night) renderer.dots(this.swarm, this.far, pixels, this.n > MANY ? SMALL_LIGHT : LIGHT, null, bytes(this.colours));
     this.labels.flush();
     return moving;
   }
@@ -300,7 +309,7 @@ export class Scene {
       if (!phase.position) return;
       const p = phase.position, now = phase === current, past = k < state.phase;
       const size = this.sized(p, now ? 7 : 5), alpha = past ? 0.35 : 1;
-      const colour = past ? mixed(RIM, BACKGROUND, 0.35) : now ? INK : RIM;
+      const colour = past ? mixed(RIM, this.renderer.look.background, 0.35) : now ? INK : RIM;
       places.pins.add(p, size, NO_TURN, colour, 1);
       lines.world.add(p, [p[0], p[1], info.ground], 1, RIM, 0.45 * alpha);
       places.shades.add([p[0], p[1], info.ground], this.sized(p, 7), NO_TURN, INK, 0.3 * alpha);
@@ -322,7 +331,7 @@ export class Scene {
   // -- things that move --
 
   placeVehicles(state) {
-    this.dotted = this.info.swarm || (this.swarm && this.renderer.scale < 1);
+    this.dotted = this.info.swarm || this.night || (this.swarm && this.renderer.scale < 1);
     if (this.dotted) this.far = state.position.slice(); // all but those that have a shape
     if (this.info.swarm) {
       this.placeNear(state);
@@ -339,7 +348,7 @@ export class Scene {
       const pixel = this.sized(p, 1), size = Math.max(radius, SMALLEST * pixel), near = size > DETAILED * pixel;
       this.enlarged = Math.max(this.enlarged, size / Math.max(radius, 1e-9));
       if (this.dotted && !near) continue;
-      if (this.dotted) this.far[3 * i] = AWAY;
+      if (this.dotted && !this.night) this.far[3 * i] = AWAY;
       const own = info.rotors?.[i]; // vehicles turn as they are, points along their thrust
       const q = own ? normal(state.turn.subarray(4 * i, 4 * i + 4)) : leaning(state.thrust.subarray(3 * i, 3 * i + 3), heading);
       (near ? (own ? places.turned : places.vehicles) : places.small).add(p, size, q, this.colours[i], 1);
@@ -368,7 +377,7 @@ export class Scene {
       const a = position[at] - x, b = position[at + 1] - y, c = position[at + 2] - z, reach = info.radius[i] / (SMALLEST * pixel);
       if (a * a + b * b + c * c > reach * reach || places.vehicles.count >= NEAR) continue;
       places.vehicles.add(position.subarray(at, at + 3), info.radius[i], NO_TURN, this.colours[i], 1);
-      this.far[at] = AWAY;
+      if (!this.night) this.far[at] = AWAY;
     }
     this.enlarged = Math.max(1, (DOT * this.sized(state.cm, 1)) / Math.max(info.radius[0], 1e-9));
   }

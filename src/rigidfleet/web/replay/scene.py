@@ -8,6 +8,7 @@ import numpy as np
 
 from rigidfleet.plotting import agent_colours
 from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits, tracking_error
+from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.solids.distance import displacement
 from rigidfleet.solids.outline import outline
 from rigidfleet.solids.records import Solids, extent
@@ -86,6 +87,7 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
         "position": PackedColumn(result.position, fine),
         **_turned(result),
         **_avoiding(result),
+        **_lit(result),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -132,6 +134,13 @@ def _avoiding(result: Result) -> dict[str, PackedColumn]:
         "aside": PackedColumn(np.linalg.norm(way, axis=1), 0.01),
         "acts": PackedColumn(acts, 1.0),
     }
+
+
+def _lit(result: Result) -> dict[str, PackedColumn]:
+    """Samples of each vehicle's light: red, green and blue; nothing by day."""
+    if not has_lights(result):
+        return {}
+    return {"light": PackedColumn(lights(result, result.time), 1 / 255)}
 
 
 def _continuous(q: Floats) -> Floats:
