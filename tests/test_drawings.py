@@ -120,6 +120,13 @@ def test_what_is_not_drawn_is_said(tmp_path, monkeypatch, capsys):
             assert said in text
 
 
+def test_a_drawing_of_text_alone_says_so(tmp_path):
+    """A drawing without outlines is refused with what it has instead."""
+    (tmp_path / "d.svg").write_text(VIEW.format("<text>Hi</text>"))
+    with pytest.raises(ValueError, match="no outline; text 'Hi' is not drawn: convert it to paths"):
+        outlines.svg_outlines(tmp_path / "d.svg")
+
+
 def test_drawings_that_never_end_are_refused(tmp_path):
     """A drawing inside itself, and one of a million elements by references, is one error, in a second."""
     inside = '<g id="a"><rect width="3" height="3"/><use href="#a"/></g>'

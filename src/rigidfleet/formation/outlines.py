@@ -47,8 +47,11 @@ def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Float
         drawing = Drawing(data)
     except Exception as error:  # its parsers raise errors of many kinds
         raise ValueError(f"is no SVG drawing: {' '.join(str(error).split())}") from None
+    said = [f"{what} ({n}x)" if n > 1 else what for what, n in drawing.notes.items()]
+    if not drawing.outlines:
+        raise ValueError("; ".join(["has no outline", *said]))
     if notes is not None:
-        notes += [f"{what} ({n}x)" if n > 1 else what for what, n in drawing.notes.items()]
+        notes += said
     return _drawn([x * (1.0, -1.0) for x in drawing.outlines])
 
 
