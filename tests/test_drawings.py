@@ -30,6 +30,8 @@ SHOWN = {
     ' height="9"/><rect id="z" width="99" height="9"/><rect x="5" y="6" width="7" height="8"/>': (5, 12, 6, 14),
     '<rect class="a" width="99" height="9"/><rect width="4" height="4"/><defs><style>.a{display:none}</style></defs>':
         (0, 4, 0, 4),
+    '<g opacity="0"><rect opacity="1" width="99" height="9"/></g><g style="display:inline;opacity:0"><rect'
+    ' style="opacity:1" width="99" height="9"/></g><rect style="opacity:0.5" width="4" height="4"/>': (0, 4, 0, 4),
     '<defs><path id="p" d="M0 0 H40 V20 H0 Z"/></defs><use xlink:href="#p" x="10" y="5"/>': (10, 50, 5, 25),
     '<defs><path id="p" d="M0 0 H40 V20 H0 Z"/></defs><use href="#p" y="5" transform="rotate(90) scale(2 1)"/>':
         (-25, -5, 0, 80),

@@ -19,6 +19,8 @@ _SPACE, _LINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}h
 _DRAWN = r"svg|g|a|switch|use|path|rect|circle|ellipse|line|polyline|polygon|text|tspan|image"
 #: Properties that change what is seen of a shape, and are not followed.
 _IGNORED = r"\b(clip-path|mask|filter|marker[-a-z]*)\s*[:=]\s*[\"']?\s*(?!none)\w"
+#: An own style without opacity.
+_UNSEEN = r"(?<![-\w])opacity\s*:\s*[0.]+%?\s*(;|!|$)"
 #: Where a view is: keys, their defaults, axes.
 _VIEW = (("x", "0", 0), ("y", "0", 1), ("width", "100%", 0), ("height", "100%", 1))
 #: Rules of a style sheet that hold for some media alone, and selectors that depend on more than the element.
@@ -77,6 +79,8 @@ class Drawing:
         if self._count > _MOST or depth > _DEEP:
             raise ValueError(f"draws more than {_MOST:,} elements, or one inside itself")
         tag, own = _tag(element), element.attrib
+        if _is_zero(own.get("opacity")) or re.search(_UNSEEN, own.get("style", "")):
+            own["style"] = f"{own.get('style', '')};display:none"  # whatever those inside say
         element.tag = _SPACE + ("g" if tag in ("svg", "use") else tag)
         if tag == "use":
             link = own.pop("href", own.pop(_LINK, ""))
