@@ -263,10 +263,10 @@ BAD_TEXTS = {
     "late": (f"{HEAD}\n0,0,0,1\n1e9,0,0,1\n", "the most is 1e+06 s"),
     "missing column": ("time_s,x_m,y_m\n0,0,0\n", "no column for z"),
     "two columns": ("time_s,x_m,y_m,z_m,x [mm]\n0,0,0,0,0\n", "two columns for x"),
-    "feet": ("time_s,x [ft],y_m,z_m\n0,0,0,1\n", "unknown unit 'ft'"),
+    "rods": ("time_s,x [rd],y_m,z_m\n0,0,0,1\n", "unknown unit 'rd'"),
     "other spans": (f"agent,{HEAD}\n1,0,0,0,1\n1,1.5,0,0,1\n2,0,1,0,1\n2,1,1,0,1\n2,9,1,0,1\n2,10,1,0,1\n",
                     "'2' ends at 10 s, and '1' at 1.5 s"),
-    "decimal comma": ("time;x;y;z\n0;0;0;1\n0,5;0;0;1\n",
+    "decimal comma": ("time;x;y;z\n0;0;0;1\n0,5;0;0;1.5\n",
                       "line 3: time is 0,5, not a finite number. Write decimals with a point"),
     "grouped digits": (f"{HEAD}\n0,0,0,1\n1,1_0,0,1\n", "line 3: x_m is 1_0"),
     "nameless": (f"agent,{HEAD}\na,0,0,0,1\n,1,0,0,1\n", "line 3: agent is empty"),
@@ -439,6 +439,9 @@ def test_assess_writes_what_a_flight_has(tmp_path, capsys):
     assert "the polynomials of the file" in text
     names = {path.name for path in out.iterdir()}
     assert {"sequence_trajectories.nc", "verdict.json", "report.html", "replay.html"} <= names
+    (read,) = json.loads((out / "verdict.json").read_text())["read"]
+    assert (read["files"], read["vehicles"]) == (7, 7)
+    assert rf.Result.load(out / "sequence_trajectories.nc").statistics["read"] == [read]
     drawn = {"clearance.png", "cm.png", "trajectory.png"}
     assert {path.name for path in (out / "figures").iterdir()} == drawn
     page = (out / "report.html").read_text()

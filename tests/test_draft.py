@@ -216,7 +216,7 @@ def test_new_writes_a_show_of_files_and_words(tmp_path, monkeypatch):
         (["--show", "--shape", "cube"], "no effect on a show"),
         (["--formations", "cube"], "add --show"),
         (["--show", "--formations", "one.csv", "--agents", "5"], "a single point has no spacing"),
-        (["--show", "--formations", "nan.csv"], "is not finite"),
+        (["--show", "--formations", "nan.csv"], "not a finite number"),
     ],
     ids=str,
 )

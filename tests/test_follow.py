@@ -193,7 +193,7 @@ BAD = {
     "truncated": (_cut(_loop(), 40) + "\n3.9,1.2", "line 41"),
     "nan": (_loop().replace("0.5000,", "0.5000,nan,", 1).replace("nan,", "nan,", 1), "line"),
     "order": (_loop().replace("0.5000,", "0.3000,", 1), "line 7"),
-    "columns": ("a,b,c\n1,2,3\n2,3,4\n", "has no column for time"),
+    "columns": ("a,b,c\n1,2,3\n2,3,4\n", "has no names of columns"),
     "two vehicles": (_table(_own()[:, :2]), "has 2 trajectories for 3 agents"),
     "jump": (
         "duration," + ",".join(f"{c}^{k}" for c in ("x", "y", "z", "yaw") for k in range(8)) + "\n"

@@ -185,12 +185,12 @@ def test_points_are_read(tmp_path, text):
     [
         (b"", "has no points"),
         (b"x,y,z\n", "has no points"),
-        (b"0,0,0\n1,two,3\n", "line 2 = '1,two,3': is not a point"),
+        (b"0,0,0\n1,two,3\n", "line 2 = '1,two,3': y is two, not a finite number"),
         (b"0,0,0\n1\n", "line 2 = '1': has 1 numbers"),
-        (b"1,5;2,5;0,0\n", "has commas and semicolons\n    .*decimal points"),
-        (b"0,0,0\nnan,0,0\n", "line 2 = 'nan,0,0': is not finite"),
-        (b"0,0,0\n1,0,0\n0,0\n", "line 3 = '0,0': repeats the point of line 1"),
-        (b"\xff\xfe\x00", "is not text"),
+        (b"1,5;2,5;0.5\n", "x is 1,5, not a finite number\n    .*decimals with a point"),
+        (b"0,0,0\nnan,0,0\n", "line 2 = 'nan,0,0': x is nan, not a finite number"),
+        (b"0,0,0\n1,0,0\n0,0.0,0\n", "line 3 = '\\[0.0, 0.0, 0.0\\]': repeats the point of line 1"),
+        (b"\xff\xfe\x00", "is neither text in UTF-8"),
     ],
 )
 def test_files_without_points_are_refused(tmp_path, text, message):

@@ -73,7 +73,17 @@ def test_hermite_meets_all_derivatives(orders):
     np.testing.assert_allclose(apart.jumps(orders), 1.0, rtol=1e-7)
 
 
+def test_a_cubic_spline_is_that_of_scipy():
+    """So are its derivative, and a part of it."""
+    x = normal(len(TIME), 2, 3)
+    curve, known = Piecewise.cubic_spline(TIME, x), CubicSpline(TIME, x)
+    np.testing.assert_allclose(curve.at(INSIDE), known(INSIDE), atol=1e-12)
+    np.testing.assert_allclose(curve.rate().at(INSIDE), known(INSIDE, 1), atol=1e-11)
+    np.testing.assert_allclose(curve.part(2, 4).at(TIME[2:5]), x[2:5], atol=1e-12)
+
+
 def test_a_uniform_b_spline_is_that_of_scipy():
+    """Its knots are equally spaced over the duration."""
     control, spans = normal(9, 2, 3), 6
     curve = Piecewise.b_spline(control, 3.0)
     known = BSpline(np.arange(-3.0, spans + 4.0) * 3.0 / spans, control, 3)
@@ -106,12 +116,12 @@ def test_cuts_parts_and_later_ones_are_the_same_curve():
 def test_curves_are_joined_at_all_knots():
     """Each agrees with SciPy's spline within its own span, and stays at its ends outside; near knots are one."""
     spans = [TIME[:6] + 1e-10, TIME[2:], TIME[[0, 3, 8]]]
-    given = [CubicSpline(t, normal(len(t), 4)) for t in spans]
-    curves = [Piecewise(s.x, np.moveaxis(s.c[::-1], 0, -1)) for s in given]
+    splines = [CubicSpline(t, normal(len(t), 4)) for t in spans]
+    curves = [Piecewise(s.x, np.moveaxis(s.c[::-1], 0, -1)) for s in splines]
     both = join(curves)
     assert len(both.time) == len(common_knots(curves)) == len(TIME)
     assert both.pieces.shape == (8, 3, 4, 4)
-    for i, (t, spline) in enumerate(zip(spans, given, strict=True)):
+    for i, (t, spline) in enumerate(zip(spans, splines, strict=True)):
         wanted = spline(np.clip(INSIDE, t[0], t[-1]))
         np.testing.assert_allclose(both.at(INSIDE)[:, i], wanted, rtol=0, atol=1e-7)
     with pytest.raises(

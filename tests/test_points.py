@@ -96,7 +96,7 @@ def npy(array: np.ndarray) -> bytes:
         ("p.ply", ply(POINTS, "ascii").replace(b"property float x\n", b""), "no vertices with x"),
         ("p.ply", ply(POINTS, "ascii").replace(b"1.5", b"nan"), "point 1 .*is not finite"),
         ("p.ply", ply(POINTS, "ascii").replace(b"1.5", b"a"), "could not convert"),
-        ("p.csv", b"0,0,0\n1,0,nan\n", "line 2 .*is not finite"),
+        ("p.csv", b"0,0,0\n1,0,nan\n", "line 2 .*not a finite number"),
     ],
 )
 def test_bad_files_are_one_error(tmp_path, name, data, words):
@@ -295,7 +295,7 @@ def test_colours_of_points(suffix, tmp_path):
         ("0,0,0,1,2,256\n1,0,0,1,2,3\n", "no whole numbers from 0 to 255"),
         ("0,0,0,1,2,3.5\n1,0,0,1,2,3\n", "no whole numbers from 0 to 255"),
         ("0,0,0,1,2,3\n1,0,0\n", "unlike the lines before"),
-        ("0,0,0,1,2\n", "has 5 numbers"),
+        ("0,0,0,1,2\n", "and 5 numbers"),
     ],
 )
 def test_wrong_colours_of_points(rows, message, tmp_path):

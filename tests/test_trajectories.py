@@ -1,5 +1,7 @@
 """Flights that others made, judged as curves in continuous time."""
 
+import subprocess
+import sys
 from itertools import combinations
 from typing import Any
 
@@ -12,6 +14,7 @@ import rigidfleet as rf
 from rigidfleet.math.bernstein import greatest
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission
+from rigidfleet.simulation.trajectories import of_curve
 
 
 def check_of(verdict, name):
@@ -199,6 +202,118 @@ def test_greatest_of_curves():
     assert found.value == pytest.approx(dense.max(), rel=1e-6)
     assert found.value >= dense.max() * (1 - 1e-9)
     assert found.curve == dense.max(axis=0).argmax()
+
+
+@pytest.mark.parametrize("cubic", [False, True])
+def test_the_positions_of_a_result_are_judged_again(cubic):
+    """Two samples at a switch of phases are one knot with two states; the least distance is that of the lines."""
+    own = rf.simulate("narrow-passage")
+    assert (np.nextafter(own.time[:-1], np.inf) >= own.time[1:]).any()
+    yaw = np.repeat(0.1 * own.time[:, None], 3, axis=1)
+    again = rf.trajectories(own.time, own.position, yaw=yaw, cubic=cubic, separation=0.3)
+    dense = np.linspace(own.time[0], own.time[-1], 200_001)
+    r = np.stack(
+        [[np.interp(dense, own.time, x) for x in y.T] for y in own.position.swapaxes(0, 1)]
+    )
+    between = least(r.transpose(2, 0, 1))
+    within = 1e-3 if cubic else 1e-9
+    assert again.phases[0].extremes["separation"].value == pytest.approx(between, abs=within)
+    assert rf.assess(again).passed == (between >= 0.3)
+    at = np.searchsorted(again.time, own.time)
+    np.testing.assert_allclose(again.position[at], own.position, atol=1e-9)
+    assert again.yaw is not None
+    np.testing.assert_allclose(again.yaw[at], yaw, atol=1e-9)
+
+
+@pytest.mark.parametrize("cubic", [False, True])
+def test_a_jump_at_a_switch_is_refused(cubic):
+    """Two samples at one time with places a metre apart are no flight, whatever is assumed between samples."""
+    t = [0.0, 1.0, np.nextafter(1.0, 2.0), 2.0, 3.0]
+    x = np.array([[0.0, 0, 1], [1, 0, 1], [2, 0, 1], [3, 0, 1], [4, 0, 1]])[:, None]
+    with pytest.raises(rf.ResultError, match=r"agent 1 jumps by 1 m at 1 s"):
+        rf.trajectories(t, x, cubic=cubic)
+    with pytest.raises(rf.ResultError, match="a trajectory lasts"):
+        rf.trajectories(t[1:3], x[1:3])
+
+
+def test_starts_stay_where_they_are(tmp_path):
+    """Vehicles that begin at one place are judged there: nothing is moved, in memory or in the file."""
+    t = np.linspace(0.0, 3.0, 4)
+    x = np.zeros((4, 3, 3)) + [0.0, 0, 5]
+    x[1:, 1, 0], x[:, 2, 2] = [1, 2, 3], 5.0 + 1e-12
+    flight = rf.trajectories(t, x, separation=0.2)
+    flight.save(tmp_path / "same.nc")
+    for result in (flight, rf.Result.load(tmp_path / "same.nc")):
+        np.testing.assert_array_equal(result.mission.fleet.position, x[0])
+        np.testing.assert_array_equal(result.position[0], x[0])
+        assert result.phases[0].extremes["separation"].value == 0.0
+        assert not rf.assess(result).passed
+
+
+def test_to_judge_plans_nothing_and_writes_no_text(monkeypatch):
+    """Without planner, integrator, and missions as text, a trajectory is judged as with them."""
+    t = np.linspace(0.0, 4.0, 9)
+    x = np.stack([np.sin(t), np.cos(t), 0 * t + 5], axis=1)[:, None] + [[0, 0, 0], [0, 0, 2]]
+    wanted = rf.assess(rf.trajectories(t, x, cubic=True, separation=0.5)).to_dict()
+
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError
+
+    for place in (
+        "rigidfleet.planning.plan.plan_phase",
+        "rigidfleet.kernel.records.restarted",
+        "rigidfleet.mission.model.to_toml",
+        "rigidfleet.mission.model.parse_toml",
+    ):
+        monkeypatch.setattr(place, refuse)
+    judging = sys.modules["rigidfleet.simulation.trajectories"]
+    assert not {"plan_phase", "workspace", "integrator"} & set(vars(judging))
+    flight = rf.trajectories(t, x, cubic=True, separation=0.5)
+    assert rf.assess(flight).to_dict() == wanted
+
+
+@pytest.mark.parametrize("powers", [2, 6, 8])
+def test_long_pieces_of_any_degree_are_watched_exactly(powers):
+    """Of pieces of ten seconds, whose highest powers bend most at their end, extremes are those of dense samples."""
+    rng = np.random.default_rng(powers)
+    time = np.array([0.0, 10.0, 20.0])
+    ends = rng.normal(0, 3, (powers // 2, 3, 2, 4))
+    curve = Piecewise.hermite(time, ends)
+    flight = of_curve(curve, "a curve", separation=0.0)
+    dense = np.linspace(0.0, 20.0, 400_001)
+    r = curve.at(dense)[..., :3]
+    extremes = flight.phases[0].extremes
+    apart = np.linalg.norm(r[:, 0] - r[:, 1], axis=1).min()
+    assert extremes["separation"].value == pytest.approx(apart, abs=3e-6)
+    assert extremes["highest"].value == pytest.approx(r[..., 2].max(), abs=3e-6)
+    assert extremes["lowest"].value == pytest.approx(r[..., 2].min(), abs=3e-6)
+    speed = np.linalg.norm(curve.states(dense[1:-1], 2)[1, ..., :3], axis=-1).max()
+    assert extremes["speed"].value == pytest.approx(speed, rel=1e-5)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the peak of a process alone")
+def test_a_thousand_vehicles_are_judged_in_little_memory():
+    """480 samples each: the process needs less than 0.5 GB, curves and packages included."""
+    code = """
+from pathlib import Path
+import numpy as np
+import rigidfleet as rf
+from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.simulation.trajectories import of_curves
+from scipy.interpolate import CubicSpline
+rng, t = np.random.default_rng(3), np.arange(480) * 0.1
+curves = []
+for i in range(1000):
+    x = [3.0 * (i % 32), 3.0 * (i // 32), 20.0, 0.0] + np.sin(0.3 * t[:, None] + rng.uniform(0, 6, 4)) / 2
+    curves.append(Piecewise(t, np.ascontiguousarray(np.moveaxis(CubicSpline(t, x).c[::-1], 0, -1))))
+assert rf.assess(of_curves(curves, "splines", separation=0.5)).passed
+print(next(x.split()[1] for x in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in x))
+"""
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert int(process.stdout) * 1024 < 0.5e9
 
 
 def test_yaw_has_its_rate():

@@ -92,20 +92,17 @@ def at_times(given: Setpoints, wanted: Floats) -> Setpoints:
     time, count, n = given.time, len(wanted), given.yaw.shape[1]
     if len(time) == 1:
         return given
-    state = np.empty((count, *given.state.shape[1:]))
-    yaw, yaw_rate = np.empty((count, n)), np.empty((count, n))
+    x = np.empty((count, 4, n, 4))
     for i in range(n):
-        x = curve(given, i).states(wanted, 4)
-        state[:, :, i] = x[..., :3].swapaxes(0, 1)
-        yaw[:, i], yaw_rate[:, i] = x[:2, :, 3]
-    return Setpoints(wanted, state, yaw, yaw_rate)
+        x[:, :, i] = curve(given, i).states(wanted, 4).swapaxes(0, 1)
+    return Setpoints(wanted, x[..., :3], x[:, 0, :, 3], x[:, 1, :, 3])
 
 
-def curve(given: Setpoints, agent: int) -> Piecewise:
+def curve(samples: Setpoints, agent: int) -> Piecewise:
     """The way of an agent, from 0: pieces (k, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
-    first, knots = intervals(given.time)
-    state = given.state[:, :, agent].swapaxes(0, 1)
-    yaw = np.stack([given.yaw[:, agent], given.yaw_rate[:, agent]])[..., None]
+    first, knots = intervals(samples.time)
+    state = samples.state[:, :, agent].swapaxes(0, 1)
+    yaw = np.stack([samples.yaw[:, agent], samples.yaw_rate[:, agent]])[..., None]
     position, turned = (
         Piecewise.of_ends(knots, x[:, first], x[:, first + 1]) for x in (state, yaw)
     )

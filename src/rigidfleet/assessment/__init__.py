@@ -81,6 +81,7 @@ def assess(result: Result | str | Path) -> Verdict:
     names = ", ".join(f"'{p.name}'" for p in result.phases if p.controller is False)
     uncalled = names and f"the controller was not called in {names}, as no slots are tracked there"
     verdict = Verdict(measured.mission.name, measured.mission.title, [], phases, [], uncalled)
+    verdict.read.extend(result.statistics.get("read", []))
     verdict.checks.extend(all_checks(measured, verdict))
     verdict.notes.extend(notes(measured, phases))
     return verdict

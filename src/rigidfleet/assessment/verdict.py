@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.plain import plain
@@ -48,6 +48,7 @@ class Verdict:
     phases : the numbers of each phase, in order of flight
     notes : what else to know of the flight
     uncalled : in which phases a user's controller was not called, so that the verdict is on another law; "" if in none
+    read : of a flight that others made, what was read: vehicles, span, columns used and ignored, units and axes
 
     >>> import rigidfleet as rf
     >>> verdict = rf.assess(rf.simulate("square"))
@@ -62,6 +63,7 @@ class Verdict:
     phases: list[PhaseVerdict]
     notes: list[str]
     uncalled: str = ""
+    read: list[dict[str, Any]] = field(default_factory=list)
 
     @property
     def passed(self) -> bool:
@@ -117,6 +119,7 @@ class Verdict:
                 },
                 "checks": [asdict(check) for check in self.checks],
                 "notes": self.notes,
+                "read": self.read,
                 "worst": {name: asdict(extreme) for name, extreme in self.worst.items()},
                 "phases": [asdict(phase) for phase in self.phases],
             }

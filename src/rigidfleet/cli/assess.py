@@ -20,6 +20,9 @@ def assess(
     radius: float | None = None,
     ground: float | None = None,
     interpolation: Literal["cubic", "linear"] | None = None,
+    units: str | None = None,
+    axes: str | None = None,
+    explain: bool = False,
     out: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -45,6 +48,14 @@ def assess(
         Height of the ground [m]. Default: there is none.
     interpolation : str
         Between samples: cubic (a spline through the positions) or linear. Default: cubic.
+    units : str
+        Units of a table's columns that do not name theirs: of time, length and angle, such as ms,mm,deg. Default:
+        s,m,rad.
+    axes : str
+        Where x, y and z of a table point: enu (east, north, up), ned, or three others of e, n, u, w, s and d. Default:
+        enu.
+    explain : bool
+        Say first what was read: vehicles, span, columns used and ignored, units and axes.
     out : Path
         Folder for a result, the verdict, a report, a replay and figures. Default: write nothing.
     force : bool
@@ -61,7 +72,7 @@ def assess(
         drawing.prepare()
     given = {
         "mission": mission, "separation": separation, "limits": limits, "radius": radius, "ground": ground,
-        "interpolation": interpolation,
+        "interpolation": interpolation, "units": units, "axes": axes,
     }  # fmt: skip
     chosen = [key for key, value in given.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
@@ -79,12 +90,12 @@ def assess(
         if mission is not None and own:
             told = f"--{own[0]}: no effect with --mission, which has its own; remove one"
             raise RigidfleetError(told)
-        read = read_trajectories(files, interpolation or "cubic")
+        read = read_trajectories(files, interpolation or "cubic", units=units, axes=axes)
         result = of_curves(
             read.curves, read.assumed, names=read.names, mission=mission, separation=separation,
             limits=_limits(limits or []), radius=radius or 0.0, ground=ground, name=_name(files[0]),
         )  # fmt: skip
-        result.statistics["notes"] = list(read.notes)
+        result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     verdict = judge(result)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
@@ -94,6 +105,11 @@ def assess(
     if json:
         console.print_json(verdict.to_dict())
     else:
+        for part in verdict.read if explain else ():
+            for key, value in part.items():
+                words = ", ".join(value) if isinstance(value, list) else f"{value}"
+                line = f"{key.replace('_', ' ')}: {words}"
+                console.out().print(line, highlight=False, markup=False, soft_wrap=True)
         console.out().print(verdict)
     if made is not None:
         from rigidfleet.cli.report import write_report

@@ -82,7 +82,7 @@ def design(
 
     keep_existing(out, force=force)
     try:
-        name, (slots, colours), notes = points_of(shape, agents, size, spacing, font)
+        name, (slots, colours, notes) = points_of(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
         if edges is not None:
             _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
@@ -108,13 +108,14 @@ def design(
     except ValueError as error:
         raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
     limits = designs.limits(slots)
+    for note in notes:
+        console.err().print(f"Note: {shape}: {note}.")
     if out is not None:
         table = to_csv(slots, colours) if out.suffix.lower() == ".csv" else text
         write_file(out, table.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
-        data = {"name": name, "toml": text, "limits": limits, "graphs": found}
-        console.print_json(data | {"notes": notes})
+        console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
     table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "class")
     table.columns[0].no_wrap = True
@@ -122,8 +123,6 @@ def design(
         table.add_row(what, *cells)
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
-    for note in notes:
-        output.print(f"{name}: {note}", soft_wrap=True, markup=False)
     if kinds:
         output.print(table)
     if limits and kinds:
@@ -191,10 +190,10 @@ def points_of(
     size: list[float] | None = None,
     spacing: float | None = None,
     font: str | None = None,
-) -> tuple[str, Any, list[str]]:
-    """Name and `formation.point_files.Points` of a named shape, of a file of points or a drawing, or of words; notes.
+) -> tuple[str, Any]:
+    """Name and `formation.point_files.Points` of a named shape, of a file of points or a drawing, or of words.
 
-    The notes say what of a drawing is left out, and by how much, and why, points are scaled.
+    Their notes say what of a drawing is left out, and by how much, and why, points are scaled.
 
     Raises
     ------
@@ -221,7 +220,7 @@ def points_of(
             raise ValueError("--spacing has no effect on a named shape; use --size")
         if agents is None and len(form.agents) > 1:
             raise ValueError(f"takes {agents_taken(shape)}; give --agents")
-        return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None), notes
+        return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None)
     if letters is None and not Path(shape).exists():
         if Path(shape).suffix or len(Path(shape).parts) > 1:
             raise ValueError("no such file")
@@ -238,12 +237,13 @@ def points_of(
         notes += [
             f"{wide:,.4g} m wide, {high:,.4g} m high: the nearest two are {spacing:g} m apart"
         ]
-        return words if letters else Path(shape).stem, Points(points, None), notes
-    points, colours = read_points(shape)
-    kept = np.arange(len(points))
+        return words if letters else Path(shape).stem, Points(points, None, tuple(notes))
+    points, colours, doubts = read_points(shape, repeated=True)
     if agents is not None and agents != len(points):
         kept = outlines.spread(points, agents)
         points, colours = points[kept], colours and tuple(colours[k] for k in kept.tolist())
-    slots = centred(points) if spacing is None else outlines.scaled(points, spacing)
-    notes += outlines.scale_in_words(points, slots, kept)
-    return Path(shape).stem, Points(slots, colours), notes
+    if spacing is None:
+        return Path(shape).stem, Points(centred(points), colours, doubts)
+    scaled = outlines.scaled(points, spacing)
+    notes += [*doubts, *outlines.scale_in_words(points, scaled)]
+    return Path(shape).stem, Points(scaled, colours, tuple(notes))

@@ -90,13 +90,12 @@ def new(
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     keep_existing(file, force=force, other="give another name")
-    notes: list[str] = []
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
         show, formations = True, formations or asked.pop("shape")
     try:
         if show:
             spacing = 2.0 if spacing is None else spacing
-            text = _show(file, asked, formations or "sphere,helix", spacing, notes)
+            text = _show(file, asked, formations or "sphere,helix", spacing)
         elif formations is not None or spacing is not None:
             raise ValueError("--formations and --spacing are for a show: add --show")
         else:
@@ -111,19 +110,15 @@ def new(
         )
     write_file(file, text.encode())
     if json:
-        console.print_json({"file": str(file), "notes": notes} | facts(mission))
+        console.print_json({"file": str(file)} | facts(mission))
     elif not quiet:
-        for note in notes:
-            console.out().print(note, soft_wrap=True, markup=False)
         console.out().print(f"{file}: {mission.size_in_words}", soft_wrap=True)
         console.out().print(f"To fly it: rigidfleet run {file}", soft_wrap=True)
     return PASSED
 
 
-def _show(
-    file: Path, asked: dict[str, Any], formations: str, spacing: float, notes: list[str]
-) -> str:
-    """Text of a show; ``notes`` takes what is to be said of its points.
+def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) -> str:
+    """Text of a show; points in the folder of the mission are written by the name of their file.
 
     Raises
     ------
@@ -140,14 +135,14 @@ def _show(
     if agents is None:
         counts = (len(points.slots) for word in words if (points := _file_points(word)))
         agents = next(counts, _SHOWN)
-    scenes = [_scene(file, word, agents, spacing, notes) for word in words]
+    scenes = [_scene(file, word, agents, spacing) for word in words]
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
     )
 
 
-def _scene(file: Path, word: str, agents: int, spacing: float, notes: list[str]) -> Any:
-    """A formation of a show of a shape, a file or words; ``notes`` takes what is to be said of it.
+def _scene(file: Path, word: str, agents: int, spacing: float) -> Any:
+    """A formation of a show of a shape, a file or words.
 
     Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
 
@@ -165,16 +160,22 @@ def _scene(file: Path, word: str, agents: int, spacing: float, notes: list[str])
         return show_draft.scene(word, agents, spacing)
     folder, there, own = file.parent.resolve(), Path(word).resolve(), _file_points(word)
     count = agents if own is None else min(agents, len(own.slots))
-    whole = own is not None and count == len(own.slots) and there.is_relative_to(folder)
+    whole = (
+        own is not None
+        and not own.notes
+        and count == len(own.slots)
+        and there.is_relative_to(folder)
+    )
     if own and whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
         source = there.relative_to(folder).as_posix()
         return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
     try:
-        name, points, said = points_of(word, count, spacing=spacing)
+        name, points = points_of(word, count, spacing=spacing)
     except ValueError as error:
         raise ValueError(f"{word}: {error}") from None
-    notes += [f"{word}: {note}" for note in said]
-    return show_draft.points_scene(name, points, word, notes=said)
+    for note in points.notes:
+        console.err().print(f"Note: {word}: {note}.", markup=False)
+    return show_draft.points_scene(name, points, word)
 
 
 def _file_points(word: str) -> Any:
@@ -182,7 +183,9 @@ def _file_points(word: str) -> Any:
     from rigidfleet.formation.point_files import read_points
 
     return (
-        read_points(word) if Path(word).suffix.lower() != ".svg" and Path(word).is_file() else None
+        read_points(word, repeated=True)
+        if Path(word).suffix.lower() != ".svg" and Path(word).is_file()
+        else None
     )
 
 

@@ -1,183 +1,452 @@
-"""Tables of numbers with a line of names: columns in any order, and errors that name the line."""
+"""Tables of places over time: which vehicles they have, where these are and when, and what was taken for what."""
 
 from __future__ import annotations
 
-import io
-import math
 import re
-from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from collections.abc import Iterator
+from datetime import datetime
+from decimal import Decimal
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.names import AXES, DIRECTIONS, unit_of
+from rigidfleet._common.tables import DEFAULT, SEPARATORS, Table, fault, is_number
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
 
-#: Units of a column, as a factor to s, m, rad and their quotients; "" is a column without a unit.
-_UNITS = {
-    "": 1.0, "s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "ns": 1e-9, "m": 1.0, "mm": 1e-3, "cm": 1e-2,
-    "rad": 1.0, "deg": math.radians(1.0), "m_s": 1.0, "m_s2": 1.0, "m_s3": 1.0, "rad_s": 1.0,
-}  # fmt: skip
-#: Other names of columns.
-_ALIASES = {
-    "t": "time", "timestamp": "time", "id": "agent", "drone": "agent", "vehicle": "agent", "name": "agent", "px": "x",
-    "py": "y", "pz": "z",
-}  # fmt: skip
-#: Characters that no table has, and that a terminal would obey when a message shows them.
-_CONTROL = re.compile(r"[^\t\n\r\x20-\x7e\xa0-\U0010ffff]")
-#: Longest line that is read [characters].
-_LONGEST = 100_000
+#: Columns of a trajectory without names, as TUM's tools for trajectories of cameras write it.
+_TUM = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+#: Seconds since 1970 of stamps that are dates: 2001 to 2096; and units in which they are counted without saying so.
+_DATES, _TICKS = (10**9, 4 * 10**9), ("s", "ms", "us", "ns")
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
+_CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
+#: Greatest speed of a flight that is doubted, if steps are long: below; if numbers are whole: above [m/s].
+_SLOW, _FAST = 0.1, 20.0
+#: Greatest whole number of a place without a unit that is not doubted where all are slower than this [m, m/s].
+_WIDE, _CALM = 500.0, 5.0
+#: Step of times without a unit from which they are doubted, and from which they are refused [s].
+_LONG, _LONGEST = 1.0, 1000.0
+#: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
+_SHORTER = 0.5
+#: Numbers of vehicles that may take turns, and rows by which this is seen.
+_TURNS, _FIRST = range(2, 17), 1000
+#: Words for places that are wanted, not those of a vehicle; for what a row may say of itself; for units in a line.
+_ROLES = {
+    "ref",
+    "reference",
+    "setpoint",
+    "sp",
+    "target",
+    "desired",
+    "des",
+    "cmd",
+    "command",
+    "goal",
+}
+_FLAGS = re.compile(
+    r"valid|status|flag|ok|quality|lost|track|visible|occluded|fix|health", re.IGNORECASE
+)
+_UNSAID = re.compile(
+    r"\b(units?|mm|cm|ft|feet|inch(es)?|ms|us|ns|deg(rees)?|ned|down)\b", re.IGNORECASE
+)
 
 
-class Columns(NamedTuple):
-    """Columns of a table.
+class Doubt(str):
+    """A note on a file whose numbers may mean something else: a verdict tells it, and it is not flown."""
 
-    Attributes
-    ----------
-    lines : (K,) number of the line of each row, from 1
-    values : (K,) numbers of each column by its name, in s, m and rad
-    who : (K,) texts of the column ``agent``; None without one
-    """
 
+class Units(NamedTuple):
+    """What a user says of columns that do not say it: units by dimension, and the directions of x, y and z or ""."""
+
+    words: dict[str, str]
+    axes: str
+
+
+class Track(NamedTuple):
+    """Rows of one vehicle: its name, lines (K,), times (K,) [s], places and velocities (K, 3), yaws (K,) [rad]."""
+
+    name: str
     lines: Ints
-    values: Mapping[str, Floats]
-    who: np.ndarray | None
+    time: Floats
+    place: Floats
+    velocity: Floats | None
+    yaw: Floats | None
 
 
-def read_lines(data: bytes, name: str) -> tuple[list[str], str, list[str], list[int]]:
-    """The names of a table's columns, its separator, its rows as text, and the number of each row's line.
+class _Places(NamedTuple):
+    """Directions of a vehicle's axes, and the columns of its place, velocity, yaw and quaternion."""
+
+    axes: str
+    place: list[int]
+    velocity: list[int]
+    yaw: list[int]
+    quaternion: list[int]
+
+
+def units_of(units: str | None, axes: str | None) -> Units:
+    """The words of a user: units such as ``"ms,mm,deg"``, in any order, and axes such as ``"ned"``.
 
     Raises
     ------
     TrajectoryError
-        The file is no text, has no rows, or a row has another number of fields than the names.
+        A unit is unknown, or two are of one quantity; or axes are no three directions.
     """
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise TrajectoryError(
-            f"{name}: is neither text in UTF-8 nor another known format. Save a table as UTF-8, or give .skyc or .mcap."
-        ) from None
-    every = text.replace('"', "").splitlines()
-    if odd := _CONTROL.search(text):
-        line = len(f"{text[: odd.start()]}.".splitlines())
-        raise TrajectoryError(
-            f"{name}: line {line}: has the control character U+{ord(odd[0]):04X}. Remove it."
-        )
-    kept = [k for k, line in enumerate(every, 1) if line and not line.isspace() and line[0] != "#"]
-    if not kept:
-        raise TrajectoryError(f"{name}: is empty. Give a table with a line of names.")
-    head = every[kept[0] - 1]
-    comma = next((c for c in ",;\t" if c in head), ",")
-    names = [field.strip() for field in head.rstrip().rstrip(comma).split(comma)]
-    if len(head) > _LONGEST or re.fullmatch(r"[-+.\deE]+", names[0]):
-        raise TrajectoryError(
-            f"{name}: line {kept[0]}: has no names of columns. Begin with a line such as time_s,x_m,y_m,z_m."
-        )
-    rows = [every[k - 1] for k in kept[1:]]
-    for line, row in zip(kept[1:], rows, strict=True):
-        count = row.count(comma) + 1
-        if count != len(names) and not (count == len(names) + 1 and row.rstrip().endswith(comma)):
+    words: dict[str, str] = {}
+    for word in re.split(r"[,\s]+", units.strip()) if units else ():
+        dimension = (unit_of(word) or ("",))[0]
+        if dimension not in DEFAULT or dimension in words:
             raise TrajectoryError(
-                f"{name}: line {line}: has {count} fields, and the names in line {kept[0]} are {len(names)}. Is the "
-                "file cut off?"
+                f"units: {word!r}: give one unit each of time, length and angle, such as ms,mm,deg."
             )
-    if not rows:
-        raise TrajectoryError(f"{name}: has names of columns, but no rows.")
-    return names, comma, rows, kept[1:]
+        words[dimension] = word
+    axes = (axes or "").lower()
+    if axes and not _are_axes(axes):
+        raise TrajectoryError(
+            f"axes: {axes!r}: say where x, y and z point, such as enu (east, north, up) or ned."
+        )
+    return Units(words, axes)
 
 
-def numbers(
-    rows: list[str], lines: list[int], comma: str, names: list[str], which: list[int], name: str
-) -> Floats:
-    """The numbers (K, len(which)) of some columns, all finite.
-
-    Raises
-    ------
-    TrajectoryError
-        A field is not a finite number.
-    """
-    try:
-        found = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=comma, usecols=which, ndmin=2)
-    except ValueError:
-        found = None
-    if found is not None and np.isfinite(found).all():
-        return found
-    for line, row in zip(lines, rows, strict=True):
-        fields = row.split(comma)
-        for k in which:
-            told = fields[k].strip()
-            try:
-                # Python alone groups digits by "_".
-                fine = math.isfinite(float(told)) and "_" not in told
-            except ValueError:
-                fine = False
-            if not fine:
-                remedy = "Leave out rows without a position."
-                if re.fullmatch(r"[-+]?\d*,\d+", told):
-                    remedy = "Write decimals with a point."
-                raise TrajectoryError(
-                    f"{name}: line {line}: {names[k]} is {told[:40] or 'empty'}, not a finite number. {remedy}"
-                )
-    raise TrajectoryError(f"{name}: the numbers cannot be read.")
+def _are_axes(axes: str) -> bool:
+    return sorted(AXES.get(letter, (9,))[0] for letter in axes) == [0, 1, 2]
 
 
-def read_columns(
-    data: bytes, name: str, needed: Collection[str], wanted: Collection[str]
-) -> Columns:
-    """Columns by their names, in any order; names may have units (`x_m`, `x [mm]`), without one s, m or rad.
-
-    Other columns are ignored.
+def parse(data: bytes, words: Units) -> tuple[Table, list[str]]:
+    """A table of trajectories or of polynomials, and doubts of its head.
 
     Raises
     ------
-    TrajectoryError
-        As `read_lines` and `numbers` do; or a needed column is missing, or is there twice, or has an unknown unit.
+    TableError
+        It is none.
     """
-    names, comma, rows, lines = read_lines(data, name)
-    places: dict[str, int] = {}
-    factor: dict[str, float] = {}
-    for k, told in enumerate(names):
-        quantity, unit = _quantity(told, {*needed, *wanted, "agent"})
-        if quantity is None:
+    table, notes = Table(data, {len(_TUM): _TUM}, words.words), []
+    if not table.columns:
+        raise fault("is empty", "Give a table with a line of names")
+    if not table.named:
+        turned = np.linalg.norm(table.numbers(range(4, 8)), axis=1)
+        if (np.abs(turned - 1.0) > 0.01).any():
+            raise fault(
+                "has no names of columns", "Begin with a line such as time_s,x_m,y_m,z_m", 1
+            )
+        notes.append(f"8 numbers a line without names are read as TUM's: {' '.join(_TUM)}")
+    before = [line.strip() for line in table.texts[: table.line - 1] if _UNSAID.search(line)]
+    if before and words == ({}, ""):
+        doubt = f"{before[0][:60]!r} is not read: does it say units or axes? Say --units or --axes"
+        notes.append(Doubt(doubt))
+    return table, notes
+
+
+def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
+    """Times (K,) [s], and the nanoseconds since 1970 from which they count; None if they are no dates."""
+    if not (columns := table.place("time")):
+        raise table.missing("time")
+    fields = table.columns[columns[0]].tolist() or [""]
+    number = is_number(fields[0])
+    if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
+        return table.numbers(columns)[:, 0], None
+    ticks = []
+    for line, field in zip(table.lines.tolist(), fields, strict=True):
+        if (tick := _tick(field)) is None:
+            why = f"{table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
+            raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
+        ticks.append(tick)
+    unit, source = table.units["time"]
+    if not number:
+        table.units["time"], unit = ("dates" if "-" in fields[0] else "h:min:s", "the file"), "s"
+    elif not source:
+        power = next((k for k in range(4) if _DATES[0] <= ticks[0] / 1000**k < _DATES[1]), 0)
+        unit = _TICKS[power]
+        table.units["time"] = unit, "its size"
+        notes += [f"times such as {fields[0]} are read as {unit} since 1970"] * (power > 0)
+    factor = Decimal(str((unit_of(unit) or ("", 1.0))[1]))
+    since = ticks[0] * factor
+    time = np.array([float((tick - ticks[0]) * factor) for tick in ticks])
+    if _DATES[0] <= since < _DATES[1]:
+        return time, int(since * 10**9)
+    return time + float(since), None
+
+
+def _tick(field: str) -> Decimal | None:
+    """A number, or a date as seconds since 1970, or a time of a day as seconds."""
+    if date := _ISO.fullmatch(field):
+        try:
+            moment = datetime.fromisoformat(
+                f"{date[1]}T{date[2]}{(date[4] or 'Z').replace('Z', '+00:00')}"
+            )
+        except ValueError:
+            return None
+        return Decimal(int(moment.timestamp())) + Decimal(f"0.{date[3] or 0}")
+    if clock := _CLOCK.fullmatch(field):
+        return 3600 * int(clock[1]) + 60 * int(clock[2]) + Decimal(clock[3].replace(",", "."))
+    plain = field.replace(",", ".")
+    return Decimal(plain) if is_number(field) and Decimal(plain).is_finite() else None
+
+
+def read_tracks(
+    table: Table, stem: str, axes: str, notes: list[str]
+) -> tuple[list[Track], dict[str, Any]]:
+    """Rows of each vehicle of a table, and what was taken for what; doubts go into the notes.
+
+    Raises
+    ------
+    TableError
+        The table cannot be read, or does not say whose rows they are.
+    """
+    sets = _sets(table, axes, notes)
+    time, since = _times(table, notes)
+    columns = [k for own in sets.values() for part in own[1:] for k in part]
+    values = dict(zip(columns, table.numbers(columns).T, strict=True))
+    if not len(time):
+        raise fault("has names of columns, but no rows", "Is the file cut off?")
+    stack = lambda part, rows: np.column_stack([values[k][rows] for k in part])  # noqa: E731
+    groups, identity = dict.fromkeys(sets, np.arange(len(time))), []
+    main = next(iter(sets.values()))
+    if len(sets) == 1:
+        place = stack(main.place, slice(None))
+        groups, identity = _vehicles(table, time, place, columns, stem, notes)
+    elif any(q.kind == "agent" and len(table.codes(k)[1]) > 1 for k, q in enumerate(table.kinds)):
+        why = "has places of several vehicles in a row, and names of vehicles, too"
+        raise fault(why, "Keep one of them")
+    tracks = []
+    for who, rows in groups.items():
+        own = sets.get(who, main)
+        velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
+        if own.yaw:
+            yaw = _yaw(table, values[own.yaw[0]][rows], rows, notes)
+        elif own.quaternion:
+            yaw = yaws(stack(own.quaternion, rows))
+        turned = _in_enu(own.axes, stack(own.place, rows), velocity, yaw)
+        tracks.append(Track(who, table.lines[rows], time[rows], *turned))
+    said = "the option" if axes else "" if main.axes == "enu" and table.place("x") else "the file"
+    notes += map(Doubt, _doubts(table, tracks, axes=bool(said)))
+    used = {*columns, *table.place("time"), *identity}
+    return tracks, {
+        "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
+        "decimal_mark": table.decimal or ".",
+        "columns": [name for k, name in enumerate(table.names) if k in used],
+        "ignored": [name for k, name in enumerate(table.names) if k not in used],
+        "vehicles_by": [table.names[k] for k in identity],
+        "units": [f"{q} {word} ({source or 'assumed'})" for q, (word, source) in table.units.items() if q in DEFAULT],
+        "axes": f"{main.axes} ({said or 'assumed'})", "since_1970_ns": since,
+    }  # fmt: skip
+
+
+def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
+    """Columns of each vehicle that has its own; those of one if all share them.
+
+    Raises
+    ------
+    TableError
+        A place is missing, or some columns may be those of another vehicle; or names of axes contradict the option.
+    """
+    sets: dict[str, _Places] = {}
+    loose: dict[str, dict[str, int]] = {}
+    for who in dict.fromkeys(who for _, who in table.places):
+        ways = [kind for kind, own in table.places if kind in DIRECTIONS and own == who]
+        place, turned = table.place(*"xyz", who=who), axes or "enu"
+        if not place and _are_axes("".join(DIRECTIONS[way] for way in ways)):
+            place, turned = table.place(*ways, who=who), "".join(DIRECTIONS[way] for way in ways)
+            if sorted(axes or turned) != sorted(turned):
+                raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
+        kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
+        if place:
+            sets[who] = _Places(turned, place, *(table.place(*kind, who=who) for kind in kinds))
+        if own := {kind: k for (kind, x), k in table.places.items() if x == who and kind in "xyz"}:
+            loose[who] = own
+    flown = {who: own for who, own in sets.items() if who not in _ROLES} or sets
+    flown = {"": sets[""]} if "" in sets else flown
+    if not flown:
+        raise table.missing(*"xyz")
+    main = next(iter(flown))
+    for who in loose.keys() - flown.keys():
+        names = ", ".join(table.names[k] for k in loose[who].values())
+        pairs = [(table.places.get((kind, main), -1), k) for kind, k in loose[who].items()]
+        if all((table.columns[i] == table.columns[k]).all() for i, k in pairs):
             continue
-        if quantity in places:
-            raise TrajectoryError(f"{name}: has two columns for {quantity}. Keep one.")
-        if unit not in _UNITS:
-            raise TrajectoryError(
-                f"{name}: the column {told!r} has the unknown unit {unit!r}. Use s, m and rad."
-            )
-        places[quantity], factor[quantity] = k, _UNITS[unit]
-    if missing := [q for q in needed if q not in places]:
-        raise TrajectoryError(
-            f"{name}: has no column for {', '.join(missing)} among {', '.join(names)[:80]}. Name columns time_s, x_m, "
-            "y_m and z_m."
+        if who not in _ROLES and (re.search(r"\d", who) or "" not in sets):
+            remedy = "Give each vehicle its rows, or columns such as x1, y1, z1, x2, y2, z2"
+            raise fault(f"{names} may be places of another vehicle", remedy)
+        notes.append(f"the columns {names} are not read: another vehicle's are not judged")
+    return flown
+
+
+def _vehicles(
+    table: Table, time: Floats, place: Floats, used: list[int], stem: str, notes: list[str]
+) -> tuple[dict[str, Ints], list[int]]:
+    """Rows of each vehicle, and the columns that tell them apart: by their names, or by the rows themselves.
+
+    Raises
+    ------
+    TableError
+        A name is empty, or a time has two places, or two columns may be the names.
+    """
+    names, kinds, n = table.names, [q.kind for q in table.kinds], len(time)
+    part, coded = np.zeros(n, np.int64), {}
+    alone = _increases(time, part)
+    for k, q in enumerate(table.kinds):
+        if k not in used and (not q.dimension or q.kind in DIRECTIONS):
+            coded[k] = table.codes(k)
+    named = []
+    for k in sorted(coded, key=lambda k: kinds[k] != "agent"):
+        (code, labels), thing = coded[k], kinds[k] == "thing"
+        # What numbers the rows, or words for parts of a flight, are no names of vehicles.
+        counts = np.ptp(time) > 0.0 and _counts(labels, n)
+        if (
+            kinds[k] in ("agent", "thing")
+            and not counts
+            and not (thing and alone and _follow(code))
+        ):
+            named.append(k)
+            if "" in labels:
+                line = table.lines[np.flatnonzero(code == labels.index(""))[0]]
+                raise fault(f"{names[k]} is empty", "Name the vehicle", int(line))
+        elif len(labels) > 1 and (kinds[k] == "agent" or _FLAGS.search(names[k])):
+            notes.append(f"the column {names[k]!r} is not read: rows count whatever it says")
+    chosen = next(([k] for k in named if _increases(time, coded[k][0])), named)
+    part = _both(part, *(coded[k][0] for k in chosen))
+    few = [k for k in coded if k not in named and 1 < len(coded[k][1]) <= n / 2]
+    others = {k: _both(part, coded[k][0]) for k in few}
+    if unclear := not _increases(time, part):
+        apart = {k: both for k, both in others.items() if _increases(time, both)}
+    else:
+        whole = _SHORTER * _length(place, part)
+        apart = {k: both for k, both in others.items() if _length(place, both) < whole}
+        first, row = place[:_FIRST], np.arange(min(n, _FIRST))
+        whole = _SHORTER * _length(first, 0 * row)
+        turns = [p for p in _TURNS if n > 2 * p and _length(first, row % p) < whole]
+        if turns and not chosen and not apart:
+            doubt = f"rows lie apart as if {turns[0]} vehicles took turns"
+            notes.append(Doubt(f"{doubt}: give them names in a column agent"))
+    if unclear and any((both != next(iter(apart.values()))).any() for both in apart.values()):
+        told = ", ".join(names[k] for k in apart)
+        raise fault(f"the columns {told} may name vehicles", "Name one of them agent")
+    for k in [*apart][:1]:
+        chosen, part = [*chosen, k], apart[k]
+        notes.append(f"the column {names[k]!r} is taken for names of vehicles: its rows lie apart")
+    for k in named:
+        if _both(part, coded[k][0]).max() > part.max():
+            notes.append(f"the column {names[k]!r} may name vehicles, too, and is not read")
+    groups = {}
+    for rows in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
+        again = (np.diff(time[rows]) == 0.0) & (np.diff(place[rows], axis=0) != 0.0).any(axis=1)
+        if again.any():
+            k = rows[int(again.argmax()) + 1]
+            why = f"the time {time[k]:.9g} s has two places: whose?"
+            raise fault(why, "Name vehicles in a column agent", int(table.lines[k]))
+        groups["/".join(coded[k][1][coded[k][0][rows[0]]] for k in chosen) or stem] = rows
+    return groups, chosen
+
+
+def _both(*codes: Ints) -> Ints:
+    """Codes of the combinations of codes, in the order of their first rows."""
+    whole = codes[0]
+    for code in codes[1:]:
+        whole = whole * (int(code.max(initial=0)) + 1) + code
+    _, first, inverse = np.unique(whole, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[inverse]
+
+
+def _increases(time: Floats, part: Ints) -> bool:
+    """Whether times increase within each part of the rows."""
+    order = np.argsort(part, kind="stable")
+    return bool((np.diff(time[order]) > 0.0)[np.diff(part[order]) == 0].all())
+
+
+def _length(place: Floats, part: Ints) -> float:
+    """Length of the ways of all parts of the rows [m]."""
+    order = np.argsort(part, kind="stable")
+    with np.errstate(all="ignore"):
+        step = np.linalg.norm(np.diff(place[order], axis=0), axis=1)
+    return float(step[np.diff(part[order]) == 0].sum())
+
+
+def _counts(labels: list[str], rows: int) -> bool:
+    """Whether labels only number the rows."""
+    whole = [int(label) for label in labels if re.fullmatch(r"-?\d{1,15}", label)]
+    return rows > 1 and len(whole) == rows and np.ptp(np.diff(whole)) == 0
+
+
+def _follow(code: Ints) -> bool:
+    """Whether what is coded follows each other, as words for parts of a flight do."""
+    return bool((np.diff(code) != 0).sum() == code.max())
+
+
+def yaws(quaternions: Floats) -> Floats:
+    """Yaws (K,) [rad] of quaternions (K, 4), scalar last, body to world; zero without an attitude."""
+    x, y, z, w = quaternions.T
+    return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
+
+
+def _in_enu(
+    axes: str, place: Any, velocity: Floats | None, yaw: Floats | None
+) -> tuple[Floats, Floats | None, Floats | None]:
+    """Places, velocities (K, 3) and yaws (K,) in east, north, up; yaw turns from the first axis to the second."""
+    if axes == "enu":
+        return place, velocity, yaw
+    turn = np.zeros((3, 3))
+    for k, letter in enumerate(axes):
+        turn[AXES[letter][0], k] = AXES[letter][1]
+    if yaw is not None:
+        x, y, up = turn[:, :2] @ np.stack([np.cos(yaw), np.sin(yaw)])
+        yaw = None if up.any() else np.arctan2(y, x)
+    return place @ turn.T, None if velocity is None else velocity @ turn.T, yaw
+
+
+def _yaw(table: Table, yaw: Floats, rows: Ints, notes: list[str]) -> Floats | None:
+    """The yaws (K,) [rad], or None if they may be in another unit than assumed.
+
+    Raises
+    ------
+    TableError
+        A yaw changes by more than half a turn from one row to the next, in yaws of more than a turn.
+    """
+    step, far = np.abs(np.diff(yaw)), float(np.abs(yaw).max())
+    whole = far > np.pi and (yaw == np.round(yaw)).all()
+    if not table.units["angle"][1] and (whole or far > 2.0001 * np.pi):
+        span = f"{yaw.min():g} to {yaw.max():g}"
+        notes.append(
+            f"the yaw is not read: {span} may be degrees or radians. Name it yaw_deg or yaw_rad, or give the unit"
         )
-    who = None
-    if "agent" in places:
-        k = places.pop("agent")
-        who = np.array([row.split(comma, k + 1)[k].strip() for row in rows])
-        if (nameless := np.flatnonzero(who == "")).size:
-            line = lines[int(nameless[0])]
-            raise TrajectoryError(f"{name}: line {line}: agent is empty. Name the vehicle.")
-    values = numbers(rows, lines, comma, names, list(places.values()), name)
-    found = {q: values[:, i] * factor[q] for i, q in enumerate(places)}
-    return Columns(np.array(lines), found, who)
+        return None
+    if np.ptp(yaw) > 2.0001 * np.pi and step.max() > 1.0001 * np.pi:
+        k = int(step.argmax())
+        why = f"the yaw changes by {np.degrees(step[k]):.4g} deg, more than half a turn: which way?"
+        raise fault(why, "Give the right unit, or more rows", int(table.lines[rows[k + 1]]))
+    return yaw
 
 
-def _quantity(told: str, known: set[str]) -> tuple[str | None, str]:
-    """The quantity and the unit that the name of a column tells; None for an unknown one."""
-    plain = told.lower()
-    bracket = re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", plain)
-    if bracket:
-        plain = bracket[1].strip()
-        unit = bracket[2].strip().replace("/", "_").replace("^", "")
-        plain = _ALIASES.get(plain, plain)
-        return (plain, unit) if plain in known else (None, "")
-    for cut in range(plain.count("_") + 1):
-        parts = plain.split("_")
-        base, unit = "_".join(parts[: len(parts) - cut]), "_".join(parts[len(parts) - cut :])
-        base = _ALIASES.get(base, base)
-        if base in known and unit in _UNITS:
-            return base, unit
-    return None, ""
+def _doubts(table: Table, tracks: list[Track], *, axes: bool) -> Iterator[str]:
+    """What looks as if it had other units or axes than it says.
+
+    Raises
+    ------
+    TableError
+        Times without a unit are too far apart for seconds.
+    """
+    place, time = (np.concatenate([track[k] for track in tracks]) for k in (3, 2))
+    whole = (place == np.round(place)).all()
+    top, bottom, widest = place[:, 2].max(), place[:, 2].min(), np.abs(place).max()
+    if not axes and top <= 0.1 and bottom < -0.5:
+        yield f"all heights are at or below 0, down to {bottom:.4g} m: does z point down? Say --axes ned or enu"
+    with np.errstate(all="ignore"):
+        ways = [np.linalg.norm(np.diff(track.place, axis=0), axis=1) for track in tracks]
+    steps = np.concatenate([np.diff(track.time) for track in tracks])
+    step = float(np.median(steps)) if steps.size else 0.0
+    fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
+    slow = 10.0 * _SLOW if step >= 10.0 and (time == np.round(time)).all() else _SLOW
+    moves = 0.0 < fastest < slow and max(map(np.sum, ways)) > _SLOW
+    if not table.units["time"][1] and (step >= _LONGEST or (step >= _LONG and moves)):
+        told = f"as seconds, speeds reach {fastest:.3g} m/s, as milliseconds {1e3 * fastest:.3g}"
+        remedy = "Name the column time_s or time_ms, or say --units s or ms"
+        if step >= _LONGEST:
+            raise fault(f"times without a unit step by {step:g}: {told}", remedy)
+        yield f"times without a unit step by {step:g}: {told}. {remedy}"
+    likely = fastest > 2.0 * _FAST or (
+        whole and (fastest > _FAST or (widest > _WIDE and fastest < _CALM))
+    )
+    if not table.units["length"][1] and likely:
+        told = (
+            f"places without a unit reach {widest:.4g} at {fastest:.3g} m/s: are they millimetres?"
+        )
+        yield f"{told} Name the column x_m or x_mm, or say --units m or mm"

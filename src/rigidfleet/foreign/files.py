@@ -10,13 +10,15 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from rigidfleet._common.files import why_not
+from rigidfleet._common.tables import TableError
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
+from rigidfleet.foreign.columns import Units, units_of
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.math.piecewise import Piecewise
 
@@ -25,6 +27,8 @@ __all__ = ["Interpolation", "Trajectories", "read_trajectories"]
 Interpolation = Literal["linear", "cubic"]
 #: Greatest size of a file [bytes], number of files, and coordinate [m] or time [s] of a trajectory.
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
+#: Greatest number of notes on what was read.
+_NOTES = 10
 _ZIP, _MCAP, _HDF = b"PK", b"\x89MCAP0\r\n", b"\x89HDF"
 
 
@@ -38,16 +42,22 @@ class Trajectories(NamedTuple):
         A vehicle stays where its curve begins or ends before and after it
     assumed : the curve that was assumed between the points of the file, in words
     notes : what a reader of the verdict should know, in sentences without a full stop
+    read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
     """
 
     names: tuple[str, ...]
     curves: tuple[Piecewise, ...]
     assumed: str
     notes: tuple[str, ...] = ()
+    read: tuple[dict[str, Any], ...] = ()
 
 
 def read_trajectories(
-    files: str | Path | Sequence[str | Path], interpolation: Interpolation = "cubic"
+    files: str | Path | Sequence[str | Path],
+    interpolation: Interpolation = "cubic",
+    *,
+    units: str | None = None,
+    axes: str | None = None,
 ) -> Trajectories:
     """Read the trajectories of all vehicles of one or several files or folders.
 
@@ -58,6 +68,8 @@ def read_trajectories(
         it is a vehicle, and each folder in it a vehicle whose CSVs, in the order of their numbers, follow each other
     interpolation : between samples, ``cubic`` (the cubic spline through the positions, with continuous acceleration) or
         ``linear``; formats of polynomials say themselves what is between
+    units : of columns of a table that do not say theirs, of time, length and angle in any order: ``"ms,mm,deg"``
+    axes : where x, y and z of a table point: three of e, n, u, w, s and d, such as ``"ned"``
 
     Raises
     ------
@@ -74,7 +86,8 @@ def read_trajectories(
     listed = [found for path in paths for found in files_of(path)]
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
-    parts = [_of_sequence(group, interpolation) for group in listed]
+    words = units_of(units, axes)
+    parts = _on_one_clock([_of_sequence(group, interpolation, words) for group in listed], listed)
     kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
     if len(kinds) > 1:
         (_, first), (_, second), *_ = kinds.items()
@@ -94,7 +107,51 @@ def read_trajectories(
     notes += _spans(names, curves, listed, exact=exact)
     if not exact:
         curves = _common_part(curves)
-    return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes))
+    notes = [*dict.fromkeys(notes)]
+    if len(notes) > _NOTES:
+        notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
+    return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes), _alike(parts))
+
+
+def _on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[Trajectories]:
+    """The same parts, those that count their times from a date all from the first one.
+
+    Raises
+    ------
+    TrajectoryError
+        Some times are dates and others not.
+    """
+    since = [part.read[0].get("since_1970_ns") for part in parts]
+    dated = [x for x in since if x is not None]
+    if not dated:
+        return parts
+    if len(dated) < len(parts):
+        i, j = since.index(None), next(k for k, x in enumerate(since) if x is not None)
+        raise TrajectoryError(
+            f"{listed[i][0]}: has times that are no dates, and {listed[j][0]} has dates. Give all files one clock."
+        )
+    begins = [(x - min(dated)) / 1e9 for x in dated]
+    return [
+        part._replace(curves=tuple(curve.later(begin) for curve in part.curves)) if begin else part
+        for part, begin in zip(parts, begins, strict=True)
+    ]
+
+
+def _alike(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
+    """What was taken for what, once for files that are alike."""
+    every: dict[str, dict[str, Any]] = {}
+    for part in parts:
+        record = {k: v for k, v in part.read[0].items() if k not in ("rows", "since_1970_ns")}
+        nothing = {"files": 0, "vehicles": 0, "rows": 0, "begin_s": np.inf, "end_s": -np.inf}
+        own = every.setdefault(repr(record), nothing | {"rate_hz": 0.0} | record)
+        own["files"] += 1
+        own["vehicles"] += len(part.names)
+        own["rows"] += part.read[0].get("rows", 0)
+        own["begin_s"] = min(own["begin_s"], *(float(curve.time[0]) for curve in part.curves))
+        own["end_s"] = max(own["end_s"], *(float(curve.time[-1]) for curve in part.curves))
+        seconds = own["vehicles"] * (own["end_s"] - own["begin_s"])
+        own["rate_hz"] = round(own["rows"] / seconds, 6)
+    return tuple(every.values())
 
 
 def files_of(path: Path) -> list[list[Path]]:
@@ -124,9 +181,9 @@ def _order(path: Path) -> list[tuple[int, str]]:
     return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
 
 
-def _of_sequence(group: list[Path], interpolation: Interpolation) -> Trajectories:
+def _of_sequence(group: list[Path], interpolation: Interpolation, units: Units) -> Trajectories:
     """What is in the file of a vehicle, or in several that it flies one after the other."""
-    first, *others = (_of_file(path, interpolation) for path in group)
+    first, *others = (_of_file(path, interpolation, units) for path in group)
     if not others:
         return first
     if first.assumed != texts.POLYNOMIALS:
@@ -140,10 +197,11 @@ def _of_sequence(group: list[Path], interpolation: Interpolation) -> Trajectorie
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
         curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
-    return Trajectories((group[0].parent.name,), (curve,), first.assumed)
+    name = group[0].parent.name
+    return Trajectories((name,), (curve,), first.assumed, first.notes, first.read)
 
 
-def _of_file(path: Path, interpolation: Interpolation) -> Trajectories:
+def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajectories:
     """What is in one file, by its content."""
     try:
         size = path.stat().st_size
@@ -157,14 +215,28 @@ def _of_file(path: Path, interpolation: Interpolation) -> Trajectories:
     name = str(path)
     if data.startswith(_HDF):
         raise TrajectoryError(f"{name}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
+    record: dict[str, Any] = {}
+    notes: Sequence[str] = ()
     if data.startswith(_ZIP) or path.suffix.lower() == ".skyc":
         names, curves = shows.read_show(data, name)
-        read = Trajectories(names, curves, shows.BEZIER)
+        assumed = shows.BEZIER
     elif data.startswith(_MCAP) or path.suffix.lower() == ".mcap":
-        names, curves = poses.read_poses(data, name, interpolation)
-        read = Trajectories(names, curves, ASSUMED[interpolation])
+        names, curves, record["since_1970_ns"] = poses.read_poses(data, name, interpolation)
+        assumed = ASSUMED[interpolation]
     else:
-        read = Trajectories(*texts.read_text(data, path, interpolation))
+        try:
+            names, curves, assumed, notes, record = texts.read_text(
+                data, path, interpolation, units
+            )
+        except TableError as error:
+            line, _, problem, remedy = error.faults[0]
+            place = f"line {line}: " if line else ""
+            ends = "" if remedy.endswith("?") else "."
+            told = f"{name}: {place}{problem}. {remedy}{ends}".replace("?. ", "? ")
+            raise TrajectoryError(told) from None
+    read = Trajectories(tuple(names), tuple(curves), assumed, tuple(notes), (record,))
+    if (units.words or units.axes) and "units" not in record:
+        raise TrajectoryError(f"{name}: says its units and axes itself. Remove --units and --axes.")
     for who, curve in zip(read.names, read.curves, strict=True):
         _check_size(name, who, curve)
     return read

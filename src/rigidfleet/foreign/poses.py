@@ -13,9 +13,9 @@ from importlib.util import find_spec
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
+from rigidfleet.foreign.columns import yaws
 from rigidfleet.foreign.samples import sampled
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.typing import Floats
 
 _POSE = "geometry_msgs/msg/PoseStamped"
 _BILLION = 1_000_000_000
@@ -23,8 +23,10 @@ _BILLION = 1_000_000_000
 
 def read_poses(
     data: bytes, name: str, interpolation: str
-) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
-    """Names of the topics with poses, and a curve for each; times count from the first pose of the recording.
+) -> tuple[tuple[str, ...], tuple[Piecewise, ...], int | None]:
+    """Names of the topics with poses, a curve for each, and the nanoseconds since 1970 from which its times count.
+
+    If stamps are dates, times count from the first pose of the recording, otherwise (None) from zero.
 
     Raises
     ------
@@ -41,6 +43,7 @@ def read_poses(
             f"{name}: has no {_POSE}. Record the topics with the vehicles' poses."
         )
     first = min(rows[0][0] for rows in found.values())
+    dated = first > 1_000_000 * _BILLION
     curves = []
     for topic, rows in found.items():
         table = np.array([row[1:] for row in rows])
@@ -51,11 +54,11 @@ def read_poses(
             k = int(np.argmin(np.isfinite(table).all(axis=1)))
             raise TrajectoryError(f"{name}: {topic}: message {k + 1}: the pose is not finite.")
         where = lambda k, topic=topic: f"{topic}: message {k + 1}"  # noqa: E731
-        offset = 0.0 if first > 1_000_000 * _BILLION else first / _BILLION
+        offset = 0.0 if dated else first / _BILLION
         curves.append(
-            sampled(time + offset, table[:, :3], _yaws(table[:, 3:]), interpolation, name, where)
+            sampled(time + offset, table[:, :3], yaws(table[:, 3:]), interpolation, name, where)
         )
-    return tuple(found), tuple(curves)
+    return tuple(found), tuple(curves), int(first) if dated else None
 
 
 def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
@@ -106,9 +109,3 @@ def _pose(data: bytes) -> tuple[float, ...]:
     start = 16 + length
     start += -(start - 4) % 8
     return sec * _BILLION + nanosec, *struct.unpack_from(f"{order}7d", data, start)
-
-
-def _yaws(quaternions: Floats) -> Floats:
-    """Yaws (K,) [rad] of quaternions (K, 4), scalar last, body to world; zero without an attitude."""
-    x, y, z, w = quaternions.T
-    return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)

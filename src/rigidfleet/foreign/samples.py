@@ -47,8 +47,4 @@ def sampled(
     lines = through(time, position[None], told)
     if kind == "linear" or len(time) < 3:
         return lines
-    from scipy.interpolate import CubicSpline
-
-    spline = CubicSpline(time, position)
-    pieces = np.moveaxis(np.asarray(spline.c)[::-1], 0, -1)
-    return Piecewise(time, pieces).beside(Piecewise(time, lines.pieces[:, 3:]))
+    return Piecewise.cubic_spline(time, position).beside(Piecewise(time, lines.pieces[:, 3:]))

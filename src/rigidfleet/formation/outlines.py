@@ -142,8 +142,8 @@ def scaled(points: ArrayLike, spacing: float) -> Floats:
     return (p - p.mean(axis=0)) * (spacing / least)
 
 
-def scale_in_words(points: Floats, scaled: Floats, numbers: Ints) -> list[str]:
-    """By how much points (N, 3) [m], which have numbers (N,) in their file, are scaled, and why; none if by 1.
+def scale_in_words(points: Floats, scaled: Floats) -> list[str]:
+    """By how much points (N, 3) [m] are scaled, and why; none if by 1.
 
     Raises
     ------
@@ -156,10 +156,10 @@ def scale_in_words(points: Floats, scaled: Floats, numbers: Ints) -> list[str]:
     if abs(after - before) <= 1e-9 * before:
         return []
     spacing = least * after / before
-    pair = f"points {numbers[one] + 1} and {numbers[whom[one]] + 1}"
+    pair = " and ".join(f"({', '.join(f'{x:.6g}' for x in points[k])})" for k in (one, whom[one]))
     words = (
-        f"scaled by {after / before:.3g}, from {before:,.4g} m to {after:,.4g} m across: {pair} are {least:.3g} m"
-        f" apart, to become {spacing:.3g} m"
+        f"scaled by {after / before:.3g}, from {before:,.4g} m to {after:,.4g} m across: the points {pair} are"
+        f" {least:.3g} m apart, to become {spacing:.3g} m"
     )
     if typical > _UNEVEN * least or after > 2.0 * len(points) * spacing:
         raise ValueError(

@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.names import quantity_of
+from rigidfleet._common.tables import Fault, Table, TableError, fault
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Greatest size of a file of points [bytes], and number of wrong lines that are named one by one.
 _BYTES, _NAMED = 64 << 20, 10
@@ -21,8 +23,7 @@ _TYPES = {
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
     "float32": "f4", "float64": "f8",
 }  # fmt: skip
-#: Properties of a PLY file that are a colour.
-_COLOURS = ("red", "green", "blue")
+_AXES, _HUES = ["x", "y", "z"], ["red", "green", "blue"]
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -33,29 +34,35 @@ class Points(NamedTuple):
     ----------
     slots : (N, 3) [m]
     colours : "#rrggbb" of each; None if the file has no colours
+    notes : what else to know, in sentences without a full stop
     """
 
     slots: Floats
     colours: tuple[str, ...] | None
+    notes: tuple[str, ...] = ()
 
 
-def read_points(path: str | Path) -> Points:
+def read_points(path: str | Path, *, repeated: bool = False) -> Points:
     """Points from a file, one agent per row: x, y and z (or x and y, for z = 0) [m], and a colour where it has colours.
 
     - NPY (`.npy`): an array (N, 3) or (N, 2); (N, 6) with red, green and blue from 0 to 255.
-    - PLY (`.ply`): x, y and z of the vertices, which come first, and red, green and blue (of 8 bits); text or binary.
-    - Text (any other name): numbers separated by commas, semicolons or blanks; six with red, green and blue. Empty
-      lines, text after `#` and a first line of names (`x,y,z`) are ignored.
+    - PLY (`.ply`): x, y and z of the vertices, and red, green and blue, or diffuse_red and so on; text or binary.
+    - Text (any other name): a table as `assess` reads it, with columns x, y and z in any order and unit (`x_mm`), and
+      red, green and blue, or colour (`#rrggbb`). Without names: two or three numbers, or six with red, green and blue.
+
+    Parameters
+    ----------
+    repeated : whether points may repeat others, as vertices of meshes do: they are left out, and a note says so
 
     Raises
     ------
     MissionError
         The file cannot be read or has no points; with a finding for each of the first invalid lines.
     """
-    return parse_points(read_bytes(path), str(path))
+    return parse_points(read_bytes(path), str(path), repeated=repeated)
 
 
-def parse_points(data: bytes, name: str) -> Points:
+def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
     """As `read_points`, from the content of a file; its name tells the format.
 
     Raises
@@ -63,32 +70,45 @@ def parse_points(data: bytes, name: str) -> Points:
     MissionError
         As `read_points` does.
     """
-    suffix = Path(name).suffix.lower()
-    if suffix not in (".npy", ".ply"):
-        return _coloured(_text(data, name))
+    suffix, place = Path(name).suffix.lower(), "point"
     try:
-        points = _npy(data) if suffix == ".npy" else _ply(data)
-        if (why := _no_colours(points)) is not None:
-            raise ValueError(why)
+        if suffix in (".npy", ".ply"):
+            points, colours, notes = _npy(data) if suffix == ".npy" else _ply(data)
+            lines = np.arange(1, len(points) + 1)
+        else:
+            lines, points, colours, notes = _text(data)
+            place = "line"
+    except TableError as error:
+        raise MissionError(_findings(error.faults, name)) from None
     except ValueError as error:
         remedy = "write it again, with one agent per row: x, y, z [m]"
         raise MissionError([Finding(name, "", None, str(error), remedy)]) from None
-    keys = [tuple(point) for point in np.round(points[:, :3], 9).tolist()]
+    keys = [tuple(point) for point in np.round(points, 9).tolist()]
     first = {key: k for k, key in reversed(list(enumerate(keys)))}
-    findings = []
-    for k, key in enumerate(keys):
-        if not np.isfinite(points[k]).all():
-            problem, remedy = "is not finite", "write x, y, z [m] as finite numbers"
-        elif first[key] < k:
-            problem, remedy = f"repeats point {first[key] + 1}", "keep the slots apart"
-        else:
-            continue
-        findings.append(Finding(name, f"point {k + 1}", points[k].tolist(), problem, remedy))
-    if not len(points):
-        findings = [Finding(name, "", None, "has no points", "write one agent per row: x, y, z")]
-    if findings:
-        raise MissionError(_first(findings, name))
-    return _coloured(points)
+    if repeated and len(first) < len(keys):
+        notes = (
+            *notes,
+            f"{len(keys) - len(first):,} of {len(keys):,} points repeat others and are left out",
+        )
+        kept = sorted(first.values())
+        points, colours = points[kept], colours and tuple(colours[k] for k in kept)
+    else:
+        faults = []
+        for k, key in enumerate(keys):
+            if not np.isfinite(points[k]).all():
+                problem, remedy = "is not finite", "write x, y, z [m] as finite numbers"
+            elif first[key] < k:
+                of = "the point of line" if place == "line" else "point"
+                problem, remedy = f"repeats {of} {lines[first[key]]}", "keep the slots apart"
+            else:
+                continue
+            faults.append(Fault(int(lines[k]), f"{points[k].tolist()}", problem, remedy))
+        if faults or not keys:
+            raise MissionError(
+                _findings(faults, name, place)
+                or [Finding(name, "", None, "has no points", "write one agent per row: x, y, z")]
+            )
+    return Points(points, colours, notes)
 
 
 def to_csv(slots: Floats, colours: Sequence[str] | None) -> str:
@@ -101,95 +121,87 @@ def to_csv(slots: Floats, colours: Sequence[str] | None) -> str:
     return "\n".join(["x,y,z,red,green,blue", *told, ""])
 
 
-def _coloured(points: Floats) -> Points:
-    """Points from rows (N, 3), or (N, 6) with red, green and blue."""
-    if points.shape[1] == 3:
-        return Points(points, None)
-    colours = points[:, 3:].astype(np.uint8)
-    return Points(points[:, :3].copy(), tuple(f"#{row.tobytes().hex()}" for row in colours))
-
-
-def _no_colours(points: Floats) -> str | None:
-    """What is wrong with the colours of rows (N, 3) or (N, 6)."""
-    colours = points[:, 3:]
-    if ((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all():
-        return None
-    return "has colours that are no whole numbers from 0 to 255"
-
-
-def _first(findings: list[Finding], name: str) -> list[Finding]:
-    """The first findings, and how many more there are."""
-    if len(findings) > _NAMED:
-        more = f"has {len(findings) - _NAMED:,} more errors like these"
-        findings = [*findings[:_NAMED], Finding(name, "", None, more, "")]
+def _findings(faults: Sequence[Fault], name: str, place: str = "line") -> list[Finding]:
+    """Faults as findings, and how many more there are."""
+    findings = [
+        Finding(name, f"{place} {line}" if line else "", text or None, problem, remedy)
+        for line, text, problem, remedy in faults[:_NAMED]
+    ]
+    if (more := len(faults) - _NAMED) > 0:
+        findings.append(Finding(name, "", None, f"has {more:,} more errors like these", ""))
     return findings
 
 
-def _text(data: bytes, name: str) -> Floats:
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        remedy = "give a text file with one agent per line"
-        raise MissionError([Finding(name, "", None, "is not text", remedy)]) from None
-    findings, points, first = [], [], {}
-    for number, line in enumerate(lines, start=1):
-        fields = [f for f in re.split(r"\s*[,;]\s*|\s+", line.partition("#")[0].strip()) if f]
-        if not fields or (not points and not findings and _are_names(fields)):
-            continue
-        problem = remedy = ""
-        try:
-            point = [float(field) for field in fields]
-        except ValueError:
-            point = []
-            problem, remedy = "is not a point", "write x, y, z as numbers, with decimal points"
-        if "," in line and ";" in line:
-            problem, remedy = (
-                "has commas and semicolons",
-                "separate by one of them; decimal points, not commas",
+def _hexadecimal(colours: Floats, *, shares: bool) -> tuple[str, ...]:
+    """Colours of rows (N, 3) from 0 to 255, or of shares from 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        They are no colours.
+    """
+    colours = np.round(255.0 * colours) if shares else colours
+    bad = ~((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all(axis=1)
+    if bad.any():
+        k = int(bad.argmax())
+        raise ValueError(
+            f"has colours that are no whole numbers from 0 to 255, first {colours[k].tolist()} of point {k + 1}"
+        )
+    return tuple(f"#{row.tobytes().hex()}" for row in colours.astype(np.uint8))
+
+
+def _text(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str, ...]]:
+    """Lines (N,), points (N, 3), colours and notes of a table.
+
+    Raises
+    ------
+    ValueError
+        A column is not understood or there twice, or (TableError) a row has no numbers.
+    """
+    unnamed = {2: _AXES[:2], 3: _AXES, 6: [*_AXES, *_HUES]}
+    if re.search(rb"#[0-9a-fA-F]{6}\s", data):
+        unnamed[4] = [*_AXES, "colour"]
+    table, notes = Table(data, unnamed), []
+    if not table.columns:
+        return table.lines, np.zeros((0, 3)), None, ()
+    if (
+        not table.named
+        and table.separator == ","
+        and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE)
+    ):
+        raise fault(
+            "has numbers such as 00", "if commas are decimal marks, separate numbers by semicolons"
+        )
+    if not table.place("x", "y"):
+        raise table.missing("x", "y")
+    if (time := table.place("time")) and len(table.codes(time[0])[1]) > 1:
+        raise fault(
+            "has points of several times", "keep the rows of one, or fly it as a trajectory"
+        )
+    axes = [axis for axis in _AXES if table.place(axis)]
+    hues = table.place(*_HUES) if not table.place("colour") else []
+    values = table.numbers(table.place(*axes) + hues)
+    if table.decimal == "," and not table.named:
+        notes.append("commas are read as decimal marks")
+    points, colours = np.zeros((len(table.lines), 3)), None
+    points[:, [_AXES.index(axis) for axis in axes]] = values[:, : len(axes)]
+    if written := table.place("colour"):
+        colours = tuple(f"#{x.lstrip('#').lower()}" for x in table.columns[written[0]].tolist())
+        if odd := next((x for x in colours if not re.fullmatch(r"#[0-9a-f]{6}", x)), None):
+            raise fault(f"has the colour {odd[1:]!r}", "write colours as #rrggbb")
+    elif hues:
+        shares = values[:, len(axes) :].max(initial=0.0) <= 1.0
+        decimal = shares and any("." in x for k in hues for x in table.columns[k].tolist())
+        if shares and not decimal and values[:, len(axes) :].any():
+            notes.append(
+                "colours are at most 1 of 255; write shares from 0 to 1 with a point (1.0)"
             )
-        elif point and len(point) not in (2, 3, 6):
-            problem = f"has {len(point)} numbers"
-            remedy = (
-                "write x, y, z (or x, y; or x, y, z, red, green, blue); decimal points, not commas"
-            )
-        elif not np.isfinite(point).all():
-            problem, remedy = "is not finite", "write x, y, z [m] as finite numbers"
-        elif points and (len(point) == 6) != (len(points[0]) == 6):
-            problem, remedy = (
-                "has a colour, or has none, unlike the lines before",
-                "give all colours or none",
-            )
-        elif len(point) == 6 and (why := _no_colours(np.array([point]))) is not None:
-            problem, remedy = why, "write red, green and blue as whole numbers from 0 to 255"
-        if not problem:
-            point = point if len(point) == 6 else [*point, 0.0][:3]
-            at = first.setdefault(tuple(round(x, 9) for x in point[:3]), number)
-            if at != number:
-                problem, remedy = f"repeats the point of line {at}", "keep the slots apart"
-        if problem:
-            findings.append(Finding(name, f"line {number}", line.strip(), problem, remedy))
-        else:
-            points.append(point)
-    if not points and not findings:
-        remedy = "write one agent per line: x, y, z"
-        findings.append(Finding(name, "", None, "has no points", remedy))
-    if findings:
-        raise MissionError(_first(findings, name))
-    return np.array(points, dtype=np.float64)
+        colours = _hexadecimal(values[:, len(axes) :], shares=decimal)
+    return table.lines, points, colours, tuple(notes)
 
 
-def _are_names(fields: list[str]) -> bool:
-    def number(field: str) -> bool:
-        try:
-            float(field)
-        except ValueError:
-            return False
-        return True
-
-    return not any(number(f) or f[0].isdigit() for f in fields)
-
-
-def _npy(data: bytes) -> Floats:
+def _npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
+    """Points (N, 3), colours and notes of an NPY file."""
     try:
         found = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
@@ -198,51 +210,84 @@ def _npy(data: bytes) -> Floats:
         raise ValueError("is no array of numbers")
     if found.ndim != 2 or found.shape[1] not in (2, 3, 6):
         raise ValueError(f"has an array {found.shape}, not (N, 3), (N, 2) or (N, 6)")
-    points = np.zeros((len(found), max(3, found.shape[1])))
-    points[:, : found.shape[1]] = found
-    return points
+    points = np.zeros((len(found), 3))
+    points[:, : found.shape[1]] = found[:, :3]
+    if found.shape[1] < 6:
+        return points, None, ()
+    hues = found[:, 3:].astype(np.float64)
+    return (
+        points,
+        _hexadecimal(hues, shares=hues.max(initial=0.0) <= 1.0 and bool((hues % 1.0).any())),
+        (),
+    )
 
 
-def _ply(data: bytes) -> Floats:
-    """Vertices of a PLY file (Turk, The PLY polygon file format, 1994)."""
-    head, found, body = data.partition(b"end_header\n")
-    if not found:
-        head, found, body = data.partition(b"end_header\r\n")
+def _ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
+    """Points (N, 3), colours and notes: vertices of a PLY file (Turk, The PLY polygon file format, 1994)."""
+    head, *body = re.split(rb"end_header(?:\r\n|\n|\r)", data, maxsplit=1)
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
-    if not found or not lines or lines[0] != ["ply"]:
+    if not body or not lines or lines[0] != ["ply"]:
         raise ValueError("has no whole header of a PLY file")
-    order, count, columns = None, None, {}
-    element = 0
+    order, elements = None, []
     for words in lines[1:]:
         if words[:1] == ["format"] and len(words) == 3:
             order = _ORDERS.get(words[1])
-        elif words[:1] == ["element"]:
-            element += 1
-            if element == 1 and words[1:2] == ["vertex"] and words[2:] and words[2].isdigit():
-                count = int(words[2])
-        elif words[:1] == ["property"] and element == 1:
-            if len(words) != 3 or words[1] not in _TYPES:
-                raise ValueError(
-                    f"has vertices with a property that is no number: {' '.join(words)}"
-                )
-            columns[words[2]] = _TYPES[words[1]]
-    if order is None or count is None or not {"x", "y", "z"} <= columns.keys():
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and elements and len(words) > 2:
+            elements[-1][2].append(words[1:])
+    before = [name for name, *_ in elements]
+    k = before.index("vertex") if "vertex" in before else 0
+    _, count, properties = elements[k] if elements else ("", 0, [])
+    columns = {words[-1]: _TYPES.get(words[0]) for words in properties}
+    if None in columns.values():
+        odd = next(words for words in properties if words[0] not in _TYPES)
+        raise ValueError(f"has vertices with a property that is no number: {' '.join(odd)}")
+    if order is None or "vertex" not in before or not {*_AXES} <= columns.keys():
         raise ValueError("has no vertices with x, y and z, or another format than 1.0")
-    axes = [*"xyz"]
-    if all(columns.get(name) == "u1" for name in _COLOURS):
-        axes += _COLOURS
+    hues = {quantity_of(name).kind: name for name in columns}
+    names = [*_AXES, *(hues[hue] for hue in _HUES if {*_HUES} <= hues.keys())]
+    short = ValueError(f"ends before the last of its {count:,} vertices")
     if order:
-        kind = np.dtype([(name, order + number) for name, number in columns.items()])
-        if len(body) < count * kind.itemsize:
-            raise ValueError(f"ends before the last of its {count:,} vertices")
-        rows: Any = np.frombuffer(body, kind, count)
-        return np.stack([rows[axis].astype(np.float64) for axis in axes], axis=1)
-    text = body.decode("ascii", errors="replace").splitlines()[:count]
-    places = [list(columns).index(axis) for axis in axes]
-    cells = [line.split() for line in text]
-    if len(cells) < count or any(len(row) < len(columns) for row in cells):
-        raise ValueError(f"ends before the last of its {count:,} vertices")
-    return np.array([[float(row[k]) for k in places] for row in cells]).reshape(-1, len(axes))
+        kind = np.dtype([(name, order + str(number)) for name, number in columns.items()])
+        start = _skipped(body[0], order, elements[:k])
+        if len(body[0]) < start + count * kind.itemsize:
+            raise short
+        rows: Any = np.frombuffer(body[0], kind, count, start)
+        values = np.stack([rows[name].astype(np.float64) for name in names], axis=1)
+    else:
+        start = sum(number for _, number, _ in elements[:k])
+        text = [x for x in body[0].decode("ascii", errors="replace").splitlines() if x.strip()]
+        cells = [line.split() for line in text[start : start + count]]
+        if len(cells) < count or any(len(row) < len(columns) for row in cells):
+            raise short
+        places = [[*columns].index(name) for name in names]
+        values = np.array([[float(row[i]) for i in places] for row in cells]).reshape(
+            -1, len(names)
+        )
+    if len(names) == 3:
+        return values, None, ()
+    types = {columns[name] for name in names[3:]}
+    colours, shares = values[:, 3:] / (65535.0 if types == {"u2"} else 1.0), types == {"u2"}
+    if types <= {"f4", "f8"}:
+        shares = colours.max(initial=0.0) <= 1.0
+        colours = colours if shares else np.round(colours)
+    return values[:, :3].copy(), _hexadecimal(colours, shares=shares), ()
+
+
+def _skipped(body: bytes, order: str, elements: list[tuple[str, int, list[list[str]]]]) -> int:
+    """Number of bytes of the elements before the vertices."""
+    start = 0
+    for _, count, properties in elements:
+        for words in properties * count:
+            size = np.dtype(_TYPES[words[-2]]).itemsize
+            if words[0] == "list":
+                number = np.dtype(order + _TYPES[words[1]])
+                if len(body) < start + number.itemsize:
+                    raise ValueError("ends before its vertices")
+                size = number.itemsize + size * int(np.frombuffer(body, number, 1, start)[0])
+            start += size
+    return start
 
 
 def read_bytes(path: str | Path) -> bytes:

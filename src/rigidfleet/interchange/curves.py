@@ -79,7 +79,7 @@ def fit(
     t = time[:-1, None] + np.diff(time)[:, None] * _CHECKED
     wanted = source.within(_CHECKED)
 
-    def tried(i: int, j: int) -> tuple[Floats, float]:
+    def piece_over(i: int, j: int) -> tuple[Floats, float]:
         """The piece over intervals i to j - 1, and its error as a share of what is allowed."""
         ends = time[[i, j]]
         position, yaw = (
@@ -98,7 +98,7 @@ def fit(
         good, bad = i, n + 1  # the longest piece known to fit, the shortest known not to
         j = min(i + length, n)
         while good < n and bad - good > 1:
-            piece, error = tried(i, j)
+            piece, error = piece_over(i, j)
             if error <= 1.0:
                 good, best = j, piece
             elif j > i + 1:
@@ -136,9 +136,8 @@ def headings(curve: Piecewise) -> tuple[Floats, Floats]:
     times[again] += 1e-3
     needed = ~again | np.append(False, abs(np.diff(yaws)) > 1e-9)
     times, yaws = times[needed], yaws[needed]
-    level = np.append(abs(np.diff(yaws)) < 1e-12, True) & np.append(
-        True, abs(np.diff(yaws)) < 1e-12
-    )
+    flat = abs(np.diff(yaws)) < 1e-12
+    level = np.append(flat, True) & np.append(True, flat)
     level[[0, -1]] = False
     return times[~level], yaws[~level]
 

@@ -54,6 +54,13 @@ class Piecewise(NamedTuple):
         return cls(time, scaled / _widths(time, points) ** np.arange(powers))
 
     @classmethod
+    def cubic_spline(cls, time: Floats, x: Floats) -> Piecewise:
+        """Through values (K + 1, ...) at knots (K + 1,) [s], with continuous acceleration (not-a-knot at the ends)."""
+        from scipy.interpolate import CubicSpline
+
+        return cls(time, np.moveaxis(np.asarray(CubicSpline(time, x).c)[::-1], 0, -1))
+
+    @classmethod
     def b_spline(cls, control: Floats, duration: float) -> Piecewise:
         """The uniform cubic B-spline with control points (K + 3, ...) from 0 to a duration [s]."""
         spans = len(control) - 3
@@ -87,6 +94,10 @@ class Piecewise(NamedTuple):
         values = series.of_polynomials(each, after.ravel(), 1)[0]
         return values.reshape(*after.shape, *values.shape[1:])
 
+    def rate(self) -> Piecewise:
+        """Its derivative; of constants, no power is left."""
+        return Piecewise(self.time, self.pieces[..., 1:] * np.arange(1.0, self.pieces.shape[-1]))
+
     def jumps(self, orders: int) -> Floats:
         """Jumps (orders, K - 1, ...) of value and derivatives at the inner knots."""
         end = series.of_polynomials(self.pieces[:-1], np.diff(self.time)[:-1], orders)
@@ -102,6 +113,8 @@ class Piecewise(NamedTuple):
 
         Beyond its ends the curve goes on, or ``stays`` where it begins and ends.
         """
+        if np.array_equal(knots, self.time):
+            return self
         middle = 0.5 * (knots[:-1] + knots[1:])
         begin = np.clip(knots[:-1], self.time[0], self.time[-1]) if stays else knots[:-1]
         k = piece_at(self.time, middle)
@@ -112,10 +125,12 @@ class Piecewise(NamedTuple):
 
     def cut(self, times: Floats, apart: float = 0.0) -> Piecewise:
         """The same with further knots at times that lie inside, further ``apart`` [s] from any of its own."""
-        inside = times[(times > self.time[0]) & (times < self.time[-1])]
-        k = piece_at(self.time, inside)
-        far = np.minimum(inside - self.time[k], self.time[k + 1] - inside)
-        return self.on(np.union1d(self.time, inside[far > apart]))
+        return self.on(refine(self.time, times, apart))
+
+    def part(self, first: int, last: int) -> Piecewise:
+        """The pieces from a first one to before a last one."""
+        pieces = self.pieces[first:last]
+        return Piecewise(self.time[first : first + len(pieces) + 1], pieces)
 
     def between(self, start: float, end: float) -> Piecewise:
         """The part from a start to an end [s] within it."""
@@ -160,6 +175,14 @@ def piece_at(knots: Floats, t: Floats, side: Literal["left", "right"] = "right")
     return np.clip(np.searchsorted(knots, t, side=side) - 1, 0, len(knots) - 2)
 
 
+def refine(knots: Floats, times: Floats, apart: float = 0.0) -> Floats:
+    """Knots with further ones at times that lie inside, further ``apart`` [s] from any of them."""
+    inside = times[(times > knots[0]) & (times < knots[-1])]
+    k = piece_at(knots, inside)
+    far = np.minimum(inside - knots[k], knots[k + 1] - inside)
+    return np.union1d(knots, inside[far > apart])
+
+
 def common_knots(curves: Sequence[Piecewise]) -> Floats:
     """Knots (K + 1,) [s] of several curves together; those nearer to each other than `SAME` are one."""
     times = np.unique(np.concatenate([curve.time for curve in curves]))
@@ -182,8 +205,13 @@ def join(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
         raise ValueError(
             f"{len(curves):,} trajectories with {len(knots):,} times in all are more than {most:,} coefficients"
         )
-    moved = [pad(curve.on(knots, stays=True).pieces, powers) for curve in curves]
-    return Piecewise(knots, np.stack(moved, axis=1))
+    inner = curves[0].pieces.shape[1:-1]
+    # Coefficients of one power lie side by side in memory: arithmetic on long rows is fast.
+    rows = np.zeros((powers, len(knots) - 1, len(curves), *inner))
+    for i, curve in enumerate(curves):
+        pieces = curve.on(knots, stays=True).pieces
+        rows[: pieces.shape[-1], :, i] = np.moveaxis(pieces, -1, 0)
+    return Piecewise(knots, np.moveaxis(rows, 0, -1))
 
 
 def pad(pieces: Floats, powers: int) -> Floats:

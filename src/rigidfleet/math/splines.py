@@ -54,12 +54,9 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Float
     full *= powers
     t = times / unit
     if inner > 0:
-        A = np.zeros((inner, 3, 3, inner))  # jumps of three derivatives, by each unknown
-        for m in range(3):
-            for k in range(inner):
-                one = np.zeros((4, inner + 2, 1))
-                one[m + 1, k + 1] = 1.0
-                A[:, :, m, k] = _jumps(t, one)[..., 0]
+        each = np.zeros((4, inner + 2, 3, inner))
+        each[1:, 1:-1] = np.eye(3 * inner).reshape(3, inner, 3, inner)
+        A = _jumps(t, each)  # (inner, 3, 3, inner): jumps of three derivatives, by each unknown
         b = -_jumps(t, full)
         for k, velocity in enumerate(v):
             if not np.isnan(velocity).any():

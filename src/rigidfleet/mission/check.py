@@ -193,7 +193,9 @@ def _agents(collector: FindingCollector, parts: dict[str, Any]) -> None:
         if given != n and collector.right(("agents",), key):
             problem = f"has {given} entries for {n} agents"
             collector.add(("agents", key), problem, f"give one entry per agent, {n} in all")
-    for i, j in formations.coincident(agents.position):
+    # Without a formation, nothing divides by distances: the start may be one that others flew.
+    shaped = look_up(collector.data, ("formations",))
+    for i, j in formations.coincident(agents.position) if shaped else ():
         problem = f"agents {i + 1} and {j + 1} start at the same point"
         collector.add(("agents", "position", j), problem, "move them apart", agents.position[j])
     if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):

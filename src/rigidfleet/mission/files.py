@@ -22,6 +22,7 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
+from rigidfleet.foreign.columns import Doubt
 from rigidfleet.foreign.curves import curve_to_rows, least_jerk
 from rigidfleet.foreign.files import files_of, read_trajectories
 from rigidfleet.foreign.samples import ASSUMED
@@ -96,6 +97,8 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
         told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
+        if named.becomes == "trajectories":
+            named.table.pop("units", None), named.table.pop("axes", None)
         named.table[named.becomes] = rows
         written = "".join(f"  {row!r},\n" for row in rows)
         line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
@@ -147,7 +150,8 @@ def _named(data: dict[str, Any]) -> Iterator[_Named]:
         data.get(key) for key in ("formations", "agents", "obstacles", "phases")
     )
     for k, phase in _with_file(phases, "follow", "trajectories"):
-        read = partial(_trajectories, yaw=phase.get("yaw") == "file")
+        said = {key: phase[key] for key in ("units", "axes") if isinstance(phase.get(key), str)}
+        read = partial(_trajectories, yaw=phase.get("yaw") == "file", said=said)
         yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
@@ -191,20 +195,26 @@ def _points(data: bytes, name: str) -> Content:
     return Content(found.slots.tolist(), found.colours)
 
 
-def _trajectories(_: bytes, name: str, *, yaw: bool) -> Content:
-    """Pieces of each vehicle; with a ``yaw`` if that is asked for.
+def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Content:
+    """Pieces of each vehicle; with a ``yaw`` if that is asked for. What the file leaves in doubt is not flown.
 
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     try:
-        found = read_trajectories(name)
+        read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
     except TrajectoryError as error:
         raise _unread(name, "", error) from None
-    curves = [curve.later(-curve.time[0]) for curve in found.curves]
-    if found.assumed in ASSUMED.values():
+    for doubt in read.notes:
+        if isinstance(doubt, Doubt):
+            raise unread(
+                name, doubt, "say units or axes beside the file: units = 'ms', axes = 'ned'"
+            )
+    curves = [curve.later(-curve.time[0]) for curve in read.curves]
+    if read.assumed in ASSUMED.values():
         curves = [least_jerk(curve) for curve in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
-        raise unread(name, "has no yaw", "remove yaw = 'file', or give a file with a yaw")
+        why = next((note for note in read.notes if "yaw" in note), "has no yaw")
+        raise unread(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
     return Content([curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves])
 
 

@@ -501,6 +501,14 @@ class Follow(Cruising):
         description="file of the trajectories, relative to the mission file: one for the virtual body, or one for each "
         "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place",
     )
+    units: str | None = Field(
+        None,
+        description="units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'",
+    )
+    axes: str | None = Field(
+        None,
+        description="where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d",
+    )
     trajectories: Trajectories | None = Field(
         None,
         description="of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
@@ -526,7 +534,7 @@ class Follow(Cruising):
         return data
 
     @cached_property
-    def curve(self) -> Piecewise:
+    def pieces(self) -> Piecewise:
         """All trajectories as one from 0 [s]: pieces (K, N, 4, P) [m, rad].
 
         Raises

@@ -401,9 +401,13 @@ def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float |
         if collector.right(path, "file", "trajectories"):
             collector.add((*path, "file"), problem, remedy)
         return
-    if p.file is not None:
-        collector.add((*path, "file"), "is given beside its numbers", "remove one of the two")
-        return
+    for key in ("file", "units", "axes"):
+        if getattr(p, key) is not None:
+            problem = (
+                "is given beside its numbers" if key == "file" else "is for files, not for numbers"
+            )
+            collector.add((*path, key), problem, "remove one of the two")
+            return
     for i, rows in enumerate(p.trajectories):
         lengths = {len(row) for row in rows}
         if len(lengths) > 1 or (min(lengths) - 1) % CHANNELS or min(row[0] for row in rows) <= 0.0:
@@ -420,7 +424,7 @@ def _follow(collector: FindingCollector, p: Follow, path: Keys, longest: float |
                 collector.add((*where, i), problem, remedy, None)
                 return
     try:
-        _ = p.curve
+        _ = p.pieces
     except ValueError as error:
         collector.add(where, str(error), "give all vehicles the same times, or fewer", None)
 

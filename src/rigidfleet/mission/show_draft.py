@@ -76,11 +76,9 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
     return Scene(shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n')
 
 
-def points_scene(
-    name: str, points: Points, source: str, *, by_name: bool = False, notes: Sequence[str] = ()
-) -> Scene:
-    """A formation of points, written as numbers, with notes on them as comments, or by the name of their file."""
-    slots, colours = points
+def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
+    """A formation of points, written as numbers, with their notes as comments, or by the name of their file."""
+    slots, colours, notes = points
     if by_name:
         return Scene(name, slots, f"slots = {json.dumps(source)}\n")
     lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"

@@ -156,7 +156,7 @@ def _followed(
     assert now.pose is not None
     assert now.slots is not None
     pose, slots = now.pose, now.slots
-    way = phase.curve
+    way = phase.pieces
     length = t_end - now.t if phase.travel is None else phase.travel
     scale = length / way.time[-1]
     knots, pieces = way.time * scale, way.pieces * scale ** -np.arange(float(way.pieces.shape[-1]))
@@ -198,7 +198,7 @@ def misled(mission: Mission, phase: Phase, now: PhaseState) -> str:
     if not isinstance(phase, Follow) or now.pose is None or now.slots is None:
         return ""
     pose = now.pose
-    knots, pieces = phase.curve
+    knots, pieces = phase.pieces
     first = pieces[0, :, :3, :2]
     alone = pieces.shape[1] == 1
     place = pose.r[None] if alone else pose.r + now.slots @ pose.T

@@ -94,15 +94,10 @@ def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
     After the last knot, the CM and the rotation vector continue at the rates they have there. Times are the last axis,
     also in memory, here and in `slot_series`: arithmetic on long rows is fast.
     """
-    knots = motion.knots
-    inside = np.minimum(time, knots[-1])
-    low = piece_at(knots, inside)
-    rows = motion.coefficients.transpose(2, 1, 0)[..., low]  # (P, 6, K)
-    x = series.of_polynomials(
-        rows.reshape(len(rows), -1).T, np.tile(inside - knots[low], 6), ORDERS
-    )
-    x = x.reshape(ORDERS, 6, -1)
-    beyond = time > knots[-1]
+    way = Piecewise(motion.knots, motion.coefficients)
+    inside = np.minimum(time, way.time[-1])
+    x = np.ascontiguousarray(np.moveaxis(way.series(inside, ORDERS), 1, -1))
+    beyond = time > inside
     x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
     x[2:, :, beyond] = 0.0
     cm, phi = x[:, :3], x[:, 3:]

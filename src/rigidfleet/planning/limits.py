@@ -17,6 +17,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
+from rigidfleet.planning.certificate import of_agents
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.vehicles import air_force
 from rigidfleet.typing import Floats, Ints
@@ -122,7 +123,7 @@ def reached(
     best: list[Reached | None] = [None] * len(limits)
     for first in range(0, n, step):
         who = np.arange(first, min(first + step, n))
-        x = slot_derivatives(_of(reference, who), motion, time, 4)
+        x = slot_derivatives(of_agents(reference, who), motion, time, 4)
         for k, limit in enumerate(limits):
             if not np.isfinite(limit.most[who]).any():
                 continue
@@ -142,11 +143,6 @@ def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Flo
     blend = np.linspace(reference.t0, reference.t0 + reference.T_b, _PHASE)
     blend = blend[(blend >= begin) & (blend <= end)]
     return np.unique(np.concatenate([np.linspace(begin, end, _PHASE), inside, knots, blend]))
-
-
-def _of(reference: Reference, who: Ints) -> Reference:
-    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
-    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 
 
 def _highest(
@@ -173,7 +169,7 @@ def _highest(
         low, high = time[max(k - 1, 0)], time[min(k + 1, len(time) - 1)]
         for _ in range(_TIMES):
             near = np.linspace(low, high, _FINE)
-            y = slot_derivatives(_of(reference, agent), motion, near, 4)
+            y = slot_derivatives(of_agents(reference, agent), motion, near, 4)
             values = (limit.quantity(y, agent) / limit.most[agent])[:, 0]
             j = int(values.argmax())
             best = max(best, (values[j], near[j], int(agent[0])))

@@ -59,9 +59,7 @@ class Transfer(NamedTuple):
 
     def at(self, time: ArrayLike) -> Floats:
         """Positions (K, N, 3) [m] at times (K,) [s] from the start; at rest before and after."""
-        spans = len(self.control) - 3
-        u = np.clip(np.asarray(time) / self.duration * spans, 0.0, spans)
-        return np.tensordot(_basis(u, spans), self.control, axes=1)
+        return self.pieces().at(np.clip(time, 0.0, self.duration))
 
 
 def least_duration(

@@ -1,4 +1,4 @@
-"""The extremes of a flight in continuous time, found by the kernel's monitor phase by phase.
+"""The extremes of curves in continuous time, found by the kernel's monitor: of a flight's, or of others'.
 
 `rigidfleet.kernel.monitor` says how extremes are found. This module chooses the pairs to monitor: all pairs of a
 small fleet, and the near pairs of a large one. The list of near pairs is renewed before any other pair can have come
@@ -21,7 +21,8 @@ from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Mission, Obstacle
+from rigidfleet.mission import Limits, Mission, Obstacle
+from rigidfleet.mission.model import Fleet
 from rigidfleet.result import DIRECTIONS, PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
@@ -96,23 +97,27 @@ def _idle_integrator(size: _Size) -> records.IntegratorState | None:
         return None
 
 
-def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...]) -> Ints:
-    """Whether agents stand on obstacles at the start (N,)."""
-    below = proximity.below(position, radius, obstacles, np.zeros(len(radius)), PAD)
+def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...], t: float) -> Ints:
+    """Whether agents stand on obstacles at a time [s] (N,)."""
+    below = proximity.below(position, radius, obstacles, np.full(len(radius), t), PAD)
     return np.any(below, axis=0).astype(np.int64)
 
 
 _standing_kept = kept(_standing)
 
 
-class Extremes:
-    """Monitors a flight and reports the worst values of each phase."""
+class CurveWatch:
+    """Watches curves of vehicles, and reports their worst values in continuous time."""
 
-    def __init__(self, mission: Mission) -> None:
-        agents, limits = mission.agents, mission.limits
-        self.n = mission.n_agents
-        self.radius = np.array(agents.radius, dtype=float)
-        self._take_obstacles(mission.obstacles)
+    monitor: native.Watch
+
+    def __init__(
+        self, fleet: Fleet, obstacles: Sequence[Obstacle], limits: Limits, t: float = 0.0
+    ) -> None:
+        """Watch vehicles that begin at a time [s]."""
+        self.n = len(fleet.radius)
+        self.radius = np.array(fleet.radius, dtype=float)
+        self._take_obstacles(obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
         self.stacks = self.n <= _FEW or limits.separation_below is not None
@@ -127,18 +132,10 @@ class Extremes:
         self.low = np.full((self.n, 3), np.inf)
         # Obstacles that are not boxes may be large, and are not to be kept.
         standing = _standing_kept if self.solids is None else _standing
-        self.stood = standing(mission.fleet.position, self.radius, mission.obstacles)
+        self.stood = standing(fleet.position, self.radius, tuple(obstacles), t)
         self.standing = self.stood.copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
-        self.state: records.IntegratorState | None = None  # of the integrator that is monitored
-        self.size: _Size | None = None  # for which there is a monitor
-        self._thread: ThreadPoolExecutor | None = None  # of large formations
-        self._taking: Future[None] | None = None
-        self._touching: Future[None] | None = None
-        self.of_vehicles: dict[str, Extremum] = {}
-        self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
-        self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
         self._list_all()
 
@@ -150,12 +147,31 @@ class Extremes:
             self.solids, corners = joined([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
-    def among(self, obstacles: Sequence[Obstacle]) -> None:
-        """Continue among these obstacles; the first of them are those before."""
-        self._take_obstacles(obstacles)
-        if self.size is not None:
-            found = self.monitor.monitor
-            self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
+    def _begin_monitor(self, states: int, gauge: int, steps: int) -> None:
+        """Begin to monitor trails of so many states, forces and steps."""
+        self.monitor = native.Watch(
+            records.monitor(
+                self.radius, self.boxes, self.fence, states, gauge,
+                worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
+                standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
+                struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
+            )
+        )  # fmt: skip
+
+    def take_curves(self, clock: Floats, points: Floats) -> None:
+        """Take curves of fourth degree with starts and lengths (S, 2) [s], by control points (S, 5, 6N).
+
+        The first 3N are positions [m], the others velocities [m/s], world axes.
+        """
+        # Of a problem, the monitor of curves reads how many vehicles there are, and of an integrator the trail alone.
+        problem, work, state = packing.examples()[:3]
+        problem = problem._replace(vehicles=problem.vehicles._replace(m=np.ones(self.n)))
+        trail = state.trail._replace(clock=clock, points=points)
+        if "monitor" not in vars(self):
+            self._begin_monitor(points.shape[2], 0, 0)
+        self.take_path(
+            problem, work, state._replace(trail=trail, count=np.array([0, 0, 0, 0, len(clock), 0]))
+        )
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
@@ -163,162 +179,15 @@ class Extremes:
         deepest = min(found, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
-    @property
-    def reusable(self) -> bool:
-        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
-        return self.n <= _FEW and bool(self.left.all())
-
-    def restart(self) -> None:
-        """Forget the flight that was monitored."""
-        self.worst[:] = self.none
-        self.low.fill(np.inf)
-        self.when.fill(0.0)
-        self.who.fill(-1)
-        self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
-        if self.size is not None:
-            flags = self.monitor.monitor.flags
-            flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
-
-    def begin(
-        self,
-        y: Floats,
-        t: float,
-        edges: int,
-        *,
-        rtol: float,
-        atol: Floats,
-        states: int | None = None,
-        aside: bool = False,
-    ) -> records.IntegratorState:
-        """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
-
-        ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
-        thread.
-        """
-        size = len(y), states or len(y), self.n, edges, self.directed
-        known = size == self.size
-        if not known:
-            self.let_go()
-        state = self.state or _idle_integrator(size)
-        if state is None:
-            trail = records.trail(*size[1:])
-            state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
-        else:
-            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
-        self.state, self.size = state, size
-        if not known:
-            steps, gauge = state.trail.gauge.shape
-            found = records.monitor(
-                self.radius, self.boxes, self.fence, size[1], gauge,
-                worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
-                standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-                struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
-            )  # fmt: skip
-            self.monitor = native.Watch(found)
-            if aside:
-                # Memory costs far more time when it is first touched than ever after. The rows that the integrator
-                # reaches after it has handed over steps are touched while it flies these.
-                half = self._half(state)
-                self._touching = self._beside().submit(state.trail.points[half:].fill, 0.0)
-        return state
-
-    def let_go(self) -> None:
-        """Let the monitors of other flights use the integrator."""
-        if self.state is not None and self.size is not None and self.n <= _FEW:
-            idle = _idle.setdefault(self.size, [])
-            if len(idle) < _KEPT:
-                idle.append(self.state)
-        self.state = None
-
-    @staticmethod
-    def _half(state: records.IntegratorState) -> int:
-        """Steps that fit into the trail beside as many others and one that has stayed."""
-        return (len(state.trail.clock) - 1) // 2
-
-    def _beside(self) -> ThreadPoolExecutor:
-        """The other thread."""
-        if self._thread is None:
-            from concurrent.futures import ThreadPoolExecutor
-
-            self._thread = ThreadPoolExecutor(1)
-        return self._thread
-
-    def lose(self, lost: Bools) -> None:
-        """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
-        for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
-            # It was near an obstacle when it was lost, and is no longer landing.
-            value, t, b = self.low[i]
-            if value < self.worst[records.FLYING]:
-                self.worst[records.FLYING], self.when[records.FLYING] = value, t
-                self.who[records.FLYING] = i, int(b)
-            self.low[i, 0] = np.inf
-        self.left[:] = ~lost
-        gone, left = np.flatnonzero(lost), np.flatnonzero(~lost)
-        struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
-        self.struck = np.ascontiguousarray(struck)
-        self._list_all()
-        self.state = self.size = None  # other vehicles are monitored from now on
-
-    def take(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
-    ) -> None:
-        """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        flags, steps = self.monitor.monitor.flags, int(state.count[4])
-        new: Ints = np.arange(int(flags[3]), steps)
-        listed = int(flags[records.LISTED])
-        rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, new)
-        flags[:3] = flags[3], steps, 2 if last else 1
-        if self.n > _FEW:
-            for step in new:
-                self._step(problem, work, state, step)
-            flags = self.monitor.monitor.flags
-            flags[:3] = steps, steps, 2 if last else 1
-        self.monitor(problem, work, state)
-        self._find_contacts(problem, work, state, rows)
-
-    def room(self, state: records.IntegratorState) -> int:
-        """Number of steps for which the trail has room beside those that another thread evaluates."""
-        half, steps = self._half(state), int(state.count[4])
-        if self._touching is not None:
-            if not steps:
-                return half
-            self._touching.result()
-            self._touching = None
-        return half + 1 - steps  # at first, or after one that has stayed
-
-    def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
-        """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
-
-        Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
-        """
-        taken, count = state._replace(count=state.count.copy()), state.count
-        # The last step stays, until its neighbour is known.
-        count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)
-        self._taking = self._beside().submit(self._take_aside, problem, work, taken)
-
-    def _take_aside(self, *given: Any) -> None:
-        self.take(*given, last=False)
-        packing.forget()  # the phase may be over before this thread packs others
-
-    def wait(self) -> None:
-        """Wait until the steps that were handed over are evaluated."""
-        if self._taking is not None:
-            error = self._taking.exception()  # Ctrl-C ends the waiting, not the evaluation
-            self._taking = None
-            if error is not None:
-                raise error
-
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
-        """Evaluate the paths alone of the steps in the trail, not the forces."""
-        steps, flags = int(state.count[4]), self.monitor.monitor.flags
+        """Evaluate the paths alone of the steps in a trail, not the forces."""
+        steps = int(state.count[4])
         self._take_solids(problem, state, np.arange(steps))
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
             return
-        flags[:3] = 0, steps, 0
+        self.monitor.monitor.flags[:3] = 0, steps, 0
         self.monitor(problem, work, state)
         self._find_contacts(problem, work, state, _rows(state, np.arange(steps)))
 
@@ -373,74 +242,6 @@ class Extremes:
         for row in _rows(state, steps):
             obstacles.watch(trail.points[row], trail.clock[row], laid, self.solids, watched)
 
-    def take_vehicles(
-        self,
-        state: fleet.SampledState,
-        vehicles: fleet.Quadrotors,
-        gone: Bools,
-        lost: Bools,
-        ticks: int,
-    ) -> None:
-        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far.
-
-        Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
-        """
-        rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
-        for k, kind, sign in _SAMPLED:
-            self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
-        load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
-        self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
-        found: dict[str, Extremum] = {}
-        if rotors.any():
-            peak = np.where(rotors[:, None], state.peak, -1.0)
-            share = peak / vehicles.force[:, 1:]
-            i, j = (int(k) for k in np.unravel_index(int(share.argmax()), share.shape))
-            found["rotor_force"] = Extremum(float(peak[i, j]), float(state.peak_time[i, j]), i, j)
-            upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
-            i = int(upright.argmin())
-            angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
-            found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
-        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
-        i = int(error.argmax())
-        if error[i] > 0.0:
-            found["tracking_error"] = Extremum(
-                float(error[i]), float(state.worst_time[i, fleet.ERROR]), i, -1
-            )
-        share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
-        i = int(share.argmax())
-        found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
-        self.of_vehicles = found
-
-    def _avoided(self) -> dict[str, Extremum]:
-        """What avoidance in flight has recorded of the phase so far, by name."""
-        given, found = self.avoidance, dict[str, Extremum]()
-        if given is None:
-            return found
-        ticks = max(int(given.count[avoidance.TICKS]), 1)
-        for name, kind in (("barrier", avoidance.BARRIER), ("guard", avoidance.GUARD)):
-            acted = given.acted[kind]
-            i = int(acted.argmax())
-            if acted[i]:
-                first = float(given.first[kind].min())
-                found[name] = Extremum(int(acted[i]) / ticks, first, i, -1)
-        for name, kind in (
-            ("guarantee", avoidance.PAIR),
-            ("clearance_guarantee", avoidance.OBSTACLE),
-        ):
-            (value, t), who = given.margin[kind].tolist(), given.between[kind].tolist()
-            if math.isfinite(value):
-                found[name] = Extremum(value, t, *who)
-            (t, value), who = given.lost[kind].tolist(), given.loser[kind].tolist()
-            if math.isfinite(t):
-                found[f"{name}_lost"] = Extremum(value, t, *who)
-        return found
-
-    def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
-        """Take the least of the agents' values into account; of equal ones, the first in time."""
-        if len(who) and (value := float(values.min())) < self.worst[kind]:
-            i = int(np.where(values == value, times, np.inf).argmin())
-            self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
-
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
@@ -452,8 +253,6 @@ class Extremes:
         }
         if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
             found["tension"] = tension._replace(value=-tension.value)
-        if self.of_vehicles or self.avoidance is not None or self.led:
-            found |= self.of_vehicles | self._avoided() | self.led
         return found
 
     def phase(self) -> dict[str, Extremum]:
@@ -461,7 +260,6 @@ class Extremes:
         found = self.so_far()
         self.worst[_OF_PHASE] = self.none[_OF_PHASE]
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
-        self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
@@ -575,6 +373,247 @@ class Extremes:
         self.monitor = native.Watch(
             before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
         )
+
+
+class Extremes(CurveWatch):
+    """Monitors a flight and reports the worst values of each phase."""
+
+    def __init__(self, mission: Mission) -> None:
+        super().__init__(mission.fleet, mission.obstacles, mission.limits)
+        self.state: records.IntegratorState | None = None  # of the integrator that is monitored
+        self.size: _Size | None = None  # for which there is a monitor
+        self._thread: ThreadPoolExecutor | None = None  # of large formations
+        self._taking: Future[None] | None = None
+        self._touching: Future[None] | None = None
+        self.of_vehicles: dict[str, Extremum] = {}
+        self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
+        self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
+
+    def among(self, obstacles: Sequence[Obstacle]) -> None:
+        """Continue among these obstacles; the first of them are those before."""
+        self._take_obstacles(obstacles)
+        if self.size is not None:
+            found = self.monitor.monitor
+            self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
+
+    @property
+    def reusable(self) -> bool:
+        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
+        return self.n <= _FEW and bool(self.left.all())
+
+    def restart(self) -> None:
+        """Forget the flight that was monitored."""
+        self.worst[:] = self.none
+        self.low.fill(np.inf)
+        self.when.fill(0.0)
+        self.who.fill(-1)
+        self.standing[:] = self.stood
+        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
+        if self.size is not None:
+            flags = self.monitor.monitor.flags
+            flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
+
+    def begin(
+        self,
+        y: Floats,
+        t: float,
+        edges: int,
+        *,
+        rtol: float,
+        atol: Floats,
+        states: int | None = None,
+        aside: bool = False,
+    ) -> records.IntegratorState:
+        """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
+
+        ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
+        thread.
+        """
+        size = len(y), states or len(y), self.n, edges, self.directed
+        known = size == self.size
+        if not known:
+            self.let_go()
+        state = self.state or _idle_integrator(size)
+        if state is None:
+            trail = records.trail(*size[1:])
+            state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
+        else:
+            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
+        self.state, self.size = state, size
+        if not known:
+            steps, gauge = state.trail.gauge.shape
+            self._begin_monitor(size[1], gauge, steps)
+            if aside:
+                # Memory costs far more time when it is first touched than ever after. The rows that the integrator
+                # reaches after it has handed over steps are touched while it flies these.
+                half = self._half(state)
+                self._touching = self._beside().submit(state.trail.points[half:].fill, 0.0)
+        return state
+
+    def let_go(self) -> None:
+        """Let the monitors of other flights use the integrator."""
+        if self.state is not None and self.size is not None and self.n <= _FEW:
+            idle = _idle.setdefault(self.size, [])
+            if len(idle) < _KEPT:
+                idle.append(self.state)
+        self.state = None
+
+    @staticmethod
+    def _half(state: records.IntegratorState) -> int:
+        """Steps that fit into the trail beside as many others and one that has stayed."""
+        return (len(state.trail.clock) - 1) // 2
+
+    def _beside(self) -> ThreadPoolExecutor:
+        """The other thread."""
+        if self._thread is None:
+            from concurrent.futures import ThreadPoolExecutor
+
+            self._thread = ThreadPoolExecutor(1)
+        return self._thread
+
+    def lose(self, lost: Bools) -> None:
+        """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
+        for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
+            # It was near an obstacle when it was lost, and is no longer landing.
+            value, t, b = self.low[i]
+            if value < self.worst[records.FLYING]:
+                self.worst[records.FLYING], self.when[records.FLYING] = value, t
+                self.who[records.FLYING] = i, int(b)
+            self.low[i, 0] = np.inf
+        self.left[:] = ~lost
+        gone, left = np.flatnonzero(lost), np.flatnonzero(~lost)
+        struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
+        self.struck = np.ascontiguousarray(struck)
+        self._list_all()
+        self.state = self.size = None  # other vehicles are monitored from now on
+
+    def take(
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
+    ) -> None:
+        """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
+        flags, steps = self.monitor.monitor.flags, int(state.count[4])
+        new: Ints = np.arange(int(flags[3]), steps)
+        listed = int(flags[records.LISTED])
+        rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
+        self._take_solids(problem, state, new)
+        flags[:3] = flags[3], steps, 2 if last else 1
+        if self.n > _FEW:
+            for step in new:
+                self._step(problem, work, state, step)
+            flags = self.monitor.monitor.flags
+            flags[:3] = steps, steps, 2 if last else 1
+        self.monitor(problem, work, state)
+        self._find_contacts(problem, work, state, rows)
+
+    def room(self, state: records.IntegratorState) -> int:
+        """Number of steps for which the trail has room beside those that another thread evaluates."""
+        half, steps = self._half(state), int(state.count[4])
+        if self._touching is not None:
+            if not steps:
+                return half
+            self._touching.result()
+            self._touching = None
+        return half + 1 - steps  # at first, or after one that has stayed
+
+    def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
+        """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
+
+        Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
+        """
+        taken, count = state._replace(count=state.count.copy()), state.count
+        # The last step stays, until its neighbour is known.
+        count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)
+        self._taking = self._beside().submit(self._take_aside, problem, work, taken)
+
+    def _take_aside(self, *given: Any) -> None:
+        self.take(*given, last=False)
+        packing.forget()  # the phase may be over before this thread packs others
+
+    def wait(self) -> None:
+        """Wait until the steps that were handed over are evaluated."""
+        if self._taking is not None:
+            error = self._taking.exception()  # Ctrl-C ends the waiting, not the evaluation
+            self._taking = None
+            if error is not None:
+                raise error
+
+    def take_vehicles(
+        self,
+        state: fleet.SampledState,
+        vehicles: fleet.Quadrotors,
+        gone: Bools,
+        lost: Bools,
+        ticks: int,
+    ) -> None:
+        """Take the extremes that a sampled flight keeps by itself, of a phase of some ticks so far.
+
+        Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
+        """
+        rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
+        for k, kind, sign in _SAMPLED:
+            self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
+        load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
+        self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
+        found: dict[str, Extremum] = {}
+        if rotors.any():
+            peak = np.where(rotors[:, None], state.peak, -1.0)
+            share = peak / vehicles.force[:, 1:]
+            i, j = (int(k) for k in np.unravel_index(int(share.argmax()), share.shape))
+            found["rotor_force"] = Extremum(float(peak[i, j]), float(state.peak_time[i, j]), i, j)
+            upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
+            i = int(upright.argmin())
+            angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
+            found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
+        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
+        i = int(error.argmax())
+        if error[i] > 0.0:
+            found["tracking_error"] = Extremum(
+                float(error[i]), float(state.worst_time[i, fleet.ERROR]), i, -1
+            )
+        share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
+        i = int(share.argmax())
+        found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
+        self.of_vehicles = found
+
+    def _avoided(self) -> dict[str, Extremum]:
+        """What avoidance in flight has recorded of the phase so far, by name."""
+        given, found = self.avoidance, dict[str, Extremum]()
+        if given is None:
+            return found
+        ticks = max(int(given.count[avoidance.TICKS]), 1)
+        for name, kind in (("barrier", avoidance.BARRIER), ("guard", avoidance.GUARD)):
+            acted = given.acted[kind]
+            i = int(acted.argmax())
+            if acted[i]:
+                first = float(given.first[kind].min())
+                found[name] = Extremum(int(acted[i]) / ticks, first, i, -1)
+        for name, kind in (
+            ("guarantee", avoidance.PAIR),
+            ("clearance_guarantee", avoidance.OBSTACLE),
+        ):
+            (value, t), who = given.margin[kind].tolist(), given.between[kind].tolist()
+            if math.isfinite(value):
+                found[name] = Extremum(value, t, *who)
+            (t, value), who = given.lost[kind].tolist(), given.loser[kind].tolist()
+            if math.isfinite(t):
+                found[f"{name}_lost"] = Extremum(value, t, *who)
+        return found
+
+    def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
+        """Take the least of the agents' values into account; of equal ones, the first in time."""
+        if len(who) and (value := float(values.min())) < self.worst[kind]:
+            i = int(np.where(values == value, times, np.inf).argmin())
+            self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
+
+    def so_far(self) -> dict[str, Extremum]:
+        """Extremes of the phase under way, by name."""
+        return super().so_far() | self.of_vehicles | self._avoided() | self.led
+
+    def phase(self) -> dict[str, Extremum]:
+        """Extremes of the phase that ends, by name; start those of the next one."""
+        found = super().phase()
+        self.of_vehicles, self.avoidance, self.led = {}, None, {}
+        return found
 
 
 @cache

@@ -216,7 +216,7 @@ def assemble(
         p.given.motion if isinstance(p.given, Unevaluated) else (p.given.r, p.given.v)
         for p in pieces
     ]
-    places = _Places(
+    places = Places(
         [
             p.given.y
             if isinstance(p.given, Unevaluated) and not p.given.problem.body_formulation
@@ -230,10 +230,10 @@ def assemble(
             (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),
             partial(_recorded, mission, pieces, time, flown),
         ),
-        (CLOSE, partial(_close, mission, worst, places, time)),
+        (CLOSE, partial(distances, mission, worst, places, time)),
         (LATER, partial(_references, mission, [(p.time, p.led) for p in pieces])),
         (("singular_value",), partial(_singular_values, places, [p.edges for p in pieces])),
-        (("mission_text",), partial(_text, mission)),
+        (("mission_text",), partial(text_of, mission)),
     ]
     now: dict[str, Any] = {}
     if all(isinstance(p.given, Unevaluated) for p in pieces):
@@ -316,7 +316,8 @@ def _recorded(
     }
 
 
-def _text(mission: Mission) -> dict[str, str]:
+def text_of(mission: Mission) -> dict[str, str]:
+    """The text of a mission, as a result has it."""
     return {"mission_text": mission.text}
 
 
@@ -326,10 +327,10 @@ def _left(mission: Mission, time: Floats) -> Bools | None:
     return None if time[-1] <= lost_at.min() else time[:, None] <= lost_at
 
 
-def _close(
+def distances(
     mission: Mission,
     worst: Sequence[dict[str, Extremum]],
-    places: _Places,
+    places: Places,
     time: Floats,
 ) -> dict[str, Any]:
     """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme."""
@@ -496,7 +497,7 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-class _Places:
+class Places:
     """Positions of a flight, from ``parts`` (K, N, 3), or (K, ...) if they are states that begin with positions."""
 
     def __init__(self, parts: Sequence[Floats], n: int) -> None:
@@ -510,7 +511,7 @@ class _Places:
         return np.concatenate(rows).reshape(-1, self.n, 3)
 
 
-def _singular_values(places: _Places, edges: Sequence[Ints]) -> dict[str, Floats]:
+def _singular_values(places: Places, edges: Sequence[Ints]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
     ``edges`` are those of each piece. In formations of some tens of agents it is computed at some samples of each

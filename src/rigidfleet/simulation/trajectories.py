@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +19,33 @@ from numpy.typing import ArrayLike
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
-from rigidfleet.kernel.problem import workspace
-from rigidfleet.math import proximity, series
+from rigidfleet.math import series
 from rigidfleet.math.bernstein import SIZES, greatest
-from rigidfleet.math.piecewise import Piecewise, common_knots, join
+from rigidfleet.math.piecewise import (
+    Piecewise,
+    common_knots,
+    join,
+    pad,
+    piece_at,
+    refine,
+)
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.plan import plan_phase
-from rigidfleet.planning.reference import PhaseState
 from rigidfleet.result import Extremum, PhaseRecord, Result
+from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
-from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.typing import Floats
+from rigidfleet.simulation.extremes import CurveWatch
+from rigidfleet.simulation.recording import Places, distances, text_of
+from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
 _CLOSE, _PARTS = 1e-6, 256
 #: Greatest jump of a position between two pieces [m]; a larger one is no flight.
 _JUMP = 1e-3
-#: Numbers of a result, and of a part of the pieces that is processed together.
-_MOST, _TOGETHER = 5e8, 4_000_000
-#: Time between samples [s], unless the trajectory itself has more; about so many in all.
-_STEP, _SAMPLES = 0.05, 2_000_000
+#: Numbers of a result, and of a block of pieces that is processed together.
+_MOST, _TOGETHER = 5e8, 400_000
+#: Time between samples [s], unless the trajectory itself has more; about so many in all, and steps of all vehicles
+#: beside obstacles.
+_STEP, _SAMPLES, _WATCHED = 0.05, 400_000, 2_000_000
 #: Where a start is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
@@ -48,6 +56,8 @@ NAMES = {
 }
 #: Limits of a mission that positions over time do not show.
 UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
+#: What of a mission trajectories are judged by, beside radii and masses.
+_JUDGING = "schema_version", "name", "title", "limits", "obstacles", "gravity", "geodetic_origin"
 #: Name of the only phase.
 PHASE = "flight"
 
@@ -105,24 +115,18 @@ def trajectories(
     MissionError
         A limit is invalid.
     """
-    t = _checked("time", time, 1)
-    states = [_checked("position", position, 3)]
-    lacks = ""
-    for what, given in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
-        if given is None:
+    t = _array("time", time, None)
+    states = [_array("position", position, len(t), None, 3)]
+    shape, lacks = states[0].shape, ""
+    for what, values in (("velocity", velocity), ("acceleration", acceleration), ("jerk", jerk)):
+        if values is None:
             lacks = lacks or what
         elif lacks:
             raise ResultError(
                 f"without {lacks}, {what} says nothing. Give {lacks}, or leave {what} out."
             )
         else:
-            states.append(_checked(what, given, 3))
-    shape = (len(t), states[0].shape[1], 3)
-    for what, x in zip(("position", "velocity", "acceleration", "jerk"), states, strict=False):
-        if x.shape != shape:
-            raise ResultError(
-                f"{what} has shape {x.shape}, expected {shape}: samples, vehicles, x y z."
-            )
+            states.append(_array(what, values, *shape))
     if len(t) < 2:
         raise ResultError("a trajectory needs two samples or more.")
     if not (np.diff(t) > 0).all():
@@ -130,39 +134,37 @@ def trajectories(
         raise ResultError(
             f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
         )
+    # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
     first, knots = intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
-    yaws = None if yaw is None else np.unwrap(_checked("yaw", yaw, 2), axis=0)
-    if yaws is not None and yaws.shape != shape[:2]:
-        raise ResultError(f"yaw has shape {yaws.shape}, expected {shape[:2]}: samples, vehicles.")
-    # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
+    yaws = np.full(shape[:2], np.nan) if yaw is None else _array("yaw", yaw, *shape[:2])
+    x, angle = np.stack(states), np.unwrap(yaws, axis=0)[None, ..., None]
+    way, turned = (Piecewise.of_ends(knots, y[:, first], y[:, first + 1]) for y in (x, angle))
+    how = NAMES[2 * len(states) - 1]
     if cubic and len(states) == 1:
-        from scipy.interpolate import CubicSpline
-
-        spline = CubicSpline(knots, np.append(states[0][first], states[0][-1:], axis=0))
-        position = Piecewise(knots, np.moveaxis(spline.c[::-1], 0, -1))
-        how = ASSUMED["cubic"]
-    else:
-        x = np.stack(states)
-        position = Piecewise.of_ends(knots, x[:, first], x[:, first + 1])
-        how = NAMES[2 * len(states) - 1]
-    angle = (np.full(shape[:2], np.nan) if yaws is None else yaws)[None, ..., None]
-    turned = Piecewise.of_ends(knots, angle[:, first], angle[:, first + 1])
+        _refuse_jumps(way)
+        way, how = Piecewise.cubic_spline(knots, way.at(knots)), ASSUMED["cubic"]
     return of_curve(
-        position.beside(turned), how,
+        way.beside(turned), how,
         mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
     )  # fmt: skip
 
 
-def _checked(name: str, given: ArrayLike, dimensions: int) -> Floats:
+def _array(name: str, values: ArrayLike, *sizes: int | None) -> Floats:
+    """Finite numbers of these sizes, of which None is any but none."""
     try:
-        x = np.asarray(given, dtype=np.float64)
+        x = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise ResultError(f"{name} is no array of numbers.") from None
-    if x.ndim != dimensions or not x.size:
+    if x.ndim != len(sizes) or not x.size:
         raise ResultError(
-            f"{name} has shape {x.shape}; it needs {dimensions} dimensions, none of them empty."
+            f"{name} has shape {x.shape}; it needs {len(sizes)} dimensions, none of them empty."
+        )
+    if any(size not in (None, own) for size, own in zip(sizes, x.shape, strict=True)):
+        expected = ", ".join("any" if size is None else f"{size}" for size in sizes)
+        raise ResultError(
+            f"{name} has shape {x.shape}, expected ({expected}): samples, vehicles, axes."
         )
     if not np.isfinite(x).all():
         where = ", ".join(str(k + 1) for k in np.argwhere(~np.isfinite(x))[0])
@@ -181,7 +183,9 @@ def judged_as(
     ground: float | None = None,
     name: str = "trajectories",
 ) -> Mission:
-    """The mission against which trajectories are judged: one phase, in which nothing is commanded.
+    """What trajectories are judged against: radii, limits and obstacles, as the mission that readers of a result need.
+
+    It is data of one phase in which nothing is commanded. Nothing plans or flies it.
 
     Parameters
     ----------
@@ -201,28 +205,17 @@ def judged_as(
         The mission has another number of vehicles.
     """
     phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": max(duration, 1e-3)}
+    agents: dict[str, Any] = {"position": start.tolist()}
     if mission is not None:
-        given = mission if isinstance(mission, Mission) else load_mission(mission)
-        if given.n_agents != len(start):
+        own = mission if isinstance(mission, Mission) else load_mission(mission)
+        if own.n_agents != len(start):
             raise ResultError(
-                f"the mission {given.name!r} has {given.n_agents} agents, and there are {len(start)} trajectories."
+                f"the mission {own.name!r} has {own.n_agents} agents, and there are {len(start)} trajectories."
             )
-        kept = (
-            "schema_version",
-            "name",
-            "title",
-            "limits",
-            "obstacles",
-            "gravity",
-            "geodetic_origin",
-        )
-        data = {key: x for key, x in given.to_dict().items() if key in kept}
+        data = {key: x for key, x in own.to_dict().items() if key in _JUDGING}
         bounds = data.get("limits", {})
         data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
-        agents: dict[str, Any] = {
-            "radius": list(given.agents.radius),
-            "mass": list(given.agents.mass),
-        }
+        agents |= {"radius": list(own.agents.radius), "mass": list(own.agents.mass)}
     else:
         if "separation_below" in (limits or {}) and radius == 0.0:
             raise ResultError(
@@ -233,19 +226,9 @@ def judged_as(
         data = {"schema_version": 1, "name": name, "limits": bounds}
         if ground is not None:
             data["obstacles"] = [{"kind": "ground", "height": ground}]
-        agents = {"radius": radius, "mass": 1.0}
-    agents["position"] = _told_apart(start).tolist()
+        agents |= {"radius": radius, "mass": 1.0}
     step = {"output_step": phase["duration"]} if duration < _STEP else {}
-    return Mission.from_dict(data | step | {"agents": agents, "phases": [phase]}, "the limits")
-
-
-def _told_apart(start: Floats) -> Floats:
-    """Starts (N, 3) of which no two are equal: a mission refuses what the verdict on the curves has to judge."""
-    _, first, again = np.unique(start, axis=0, return_index=True, return_inverse=True)
-    twice = np.flatnonzero(first[again.ravel()] != np.arange(len(start)))
-    found = start.copy()
-    found[twice, 2] += 1e-6 * np.arange(1, len(twice) + 1)
-    return found
+    return Mission.from_plain(data | step | {"agents": agents, "phases": [phase]}, "the limits")
 
 
 def of_curve(
@@ -268,19 +251,34 @@ def of_curve(
     """
     if abs(curve.time[0]) > _CLOCK or curve.time[0] < 0.0:
         curve = curve.later(-curve.time[0])
-    _continuous(curve)
-    n, span = curve.pieces.shape[1], float(curve.time[-1] - curve.time[0])
-    step = max(_STEP, span * n / _SAMPLES)
-    grid = curve.time[0] + step * np.arange(1, math.ceil(span / step))
-    _bounded(n, len(curve.time) + len(grid))
-    curve = curve.cut(grid, 1e-6)
-    time, state, yaw = _samples(curve)
-    mission = judged_as(state[0, 0], span, **judged)
+    _refuse_jumps(curve)
+    time, n, powers = curve.time, curve.pieces.shape[1], curve.pieces.shape[-1]
+    span = float(time[-1] - time[0])
+    # Samples are at all knots, and between them so that none is further from the next one than a step.
+    step = max(_STEP, span * n / _SAMPLES) * (1.0 + 1e-9)
+    parts = np.ceil(np.diff(time) / step).astype(np.int64)
+    _refuse_too_many(n, int(parts.sum()) + 1)
+    start = curve.at(time[:1])[0, :, :3]
+    mission = judged_as(start, span, **judged)
+    watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, float(time[0]))
+    # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
+    near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
+    grid = time[0] + near * np.arange(1, math.ceil(span / near))
+    fastest: dict[str, Extremum] = {}
+    together = max(1, _TOGETHER // (4 * n * powers))
+    for k in range(0, len(parts), together):  # in blocks, to save memory
+        block = curve.part(k, k + together)
+        way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
+        _watch(watch, way, grid)
+        _accelerations(fastest, way, directed=watch.directed)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    _put_extremes(record, mission, Piecewise(curve.time, curve.pieces[:, :, :3]))
-    if curve.pieces.shape[-1] < 3:  # lines turn at once at samples
+    record.extremes.update(watch.phase())
+    watch.flight([record])
+    record.extremes.update(fastest)
+    at, state, yaws = _samples(curve, parts)
+    if powers < 3:  # lines turn at once at samples
         state[2:] = np.nan
-    return _result(mission, record, time, state, yaw, interpolation, names)
+    return _result(mission, record, at, state, yaws, interpolation, names)
 
 
 def of_curves(
@@ -298,11 +296,11 @@ def of_curves(
     ResultError, MissionError
         As for `of_curve`.
     """
-    _bounded(len(curves), len(common_knots(curves)))
+    _refuse_too_many(len(curves), len(common_knots(curves)))
     return of_curve(join(curves), interpolation, names=names, **judged)
 
 
-def _bounded(n: int, times: int) -> None:
+def _refuse_too_many(n: int, times: int) -> None:
     """Refuse more numbers than a result may have.
 
     Raises
@@ -318,7 +316,7 @@ def _bounded(n: int, times: int) -> None:
         )
 
 
-def _continuous(curve: Piecewise) -> None:
+def _refuse_jumps(curve: Piecewise) -> None:
     """Refuse trajectories that jump.
 
     Raises
@@ -334,103 +332,89 @@ def _continuous(curve: Piecewise) -> None:
         )
 
 
-def _samples(curve: Piecewise) -> tuple[Floats, Floats, Floats]:
-    """Times (K',), states (4, K', N, 3), yaws and their rates (2, K', N): one sample at each end of a piece.
+def _samples(curve: Piecewise, parts: Ints) -> tuple[Floats, Floats, Floats]:
+    """Times (K,) [s], position to jerk (4, K, N, 3), and yaw and its rate (2, K, N), at ends of equal parts of pieces.
 
-    Where states jump, there are two. Where the rate of yaw jumps, it is the mean.
+    Where states jump, there are two samples. Where the rate of yaw jumps, it is the mean.
     """
-    begin, end = curve.ends(4)
-    first, last = begin[..., :3], end[..., :3]
-    before, after = last[:, :-1], first[:, 1:]
-    scale = 1.0 + np.abs(after).max(axis=(1, 2, 3), initial=0.0)
-    jump = (np.abs(after - before) > 1e-9 * scale[:, None, None, None]).any(axis=(0, 2, 3))
-    again = np.flatnonzero(jump) + 1
-    k = np.sort(np.concatenate([np.arange(len(curve.time)), again]))
-    later = np.append(False, k[1:] == k[:-1])  # the second sample of a jump
-    time = curve.time[k]
-    time[later] = np.nextafter(time[later], np.inf)
-    state = np.concatenate([first, last[:, -1:]], axis=1)[:, k]
-    state[:, np.flatnonzero(later) - 1] = before[:, again - 1]
-    left, right = (
-        np.concatenate(x, axis=1)[:2, k][..., 3]
-        for x in ((begin[:, :1], end), (begin, end[:, -1:]))
-    )
-    return time, state, np.stack([right[0], (left[1] + right[1]) / 2])
+    time, (pieces, n, _, powers) = curve.time, curve.pieces.shape
+    together = max(1, _TOGETHER // (4 * n * powers))
+    greatest_of = np.abs(curve.pieces[:, :, :3, :4]).max(axis=(0, 1, 2))
+    scale = 1.0 + series.derivatives(pad(greatest_of, 4))
+    ends = np.append(np.zeros(pieces - 1, dtype=np.bool_), True)  # which pieces have a sample there
+    turn = np.zeros((pieces + 1, n))  # half of the jumps of yaw's rate
+    for k in range(0, pieces - 1, together):
+        jumps = curve.part(k, k + together + 1).jumps(4)
+        turn[k + 1 : k + 1 + jumps.shape[1]] = 0.5 * jumps[1, ..., 3]
+        jumps = np.abs(jumps[..., :3]) > 1e-9 * scale[:, None, None, None]
+        ends[k : k + jumps.shape[1]] |= jumps.any(axis=(0, 2, 3))
+    count = parts + ends
+    k = np.repeat(np.arange(pieces), count)
+    first = np.cumsum(count) - count
+    share = (np.arange(len(k)) - first[k]) / parts[k]
+    at = time[k] + np.diff(time)[k] * share
+    at[share == 1.0] = time[1:][ends]
+    again = np.flatnonzero(ends[:-1]) + 1
+    at[first[again]] = np.nextafter(time[again], np.inf)
+    state, yaw = np.empty((4, len(k), n, 3)), np.empty((2, len(k), n))
+    for row in range(0, len(k), together):
+        rows = slice(row, row + together)
+        after = np.diff(time)[k[rows]] * share[rows]
+        x = series.derivatives(series.of_polynomials(curve.pieces[k[rows]], after, 4))
+        state[:, rows], yaw[:, rows] = x[..., :3], x[:2, ..., 3]
+    yaw[1, share == 0.0] -= turn[k[share == 0.0]]
+    yaw[1, share == 1.0] += turn[k[share == 1.0] + 1]
+    return at, state, yaw
 
 
-def _put_extremes(record: PhaseRecord, mission: Mission, curve: Piecewise) -> None:
-    """Give the phase the extremes of the curves, in continuous time."""
-    n = mission.n_agents
-    extremes = Extremes(mission)
-    r, v = curve.states(curve.time[:1], 2)[:, 0]
-    problem = plan_phase(mission, mission.phases[0], PhaseState(0.0, r, v)).problem
-    work = workspace(n, 0)
-    y = np.zeros(6 * n)
-    state = extremes.begin(y, record.t_start, 0, rtol=1e-9, atol=np.ones_like(y))
-    trail = state.trail
-    powers = curve.pieces.shape[-1]
-    together = max(1, _TOGETHER // (n * 3 * powers))
-    row, best = 0, {}
-    for begin in range(0, len(curve.pieces), together):
-        c = curve.pieces[begin : begin + together]
-        t, h = curve.time[begin : begin + len(c)], np.diff(curve.time[begin : begin + len(c) + 1])
-        for k, parts in enumerate(_parts(c, h)):
-            for part in range(parts):
-                width = h[k] / parts
-                x = part * width + width * records.KNOTS
-                x = series.of_polynomials(np.broadcast_to(c[k], (5, *c[k].shape)), x, 2)
-                trail.clock[row] = t[k] + part * width, width
-                trail.points[row] = records.FROM_KNOTS @ x.reshape(2, 5, -1).swapaxes(0, 1).reshape(
-                    5, -1
-                )
-                row += 1
-                if row == len(trail.clock):
-                    _take(extremes, problem, work, state, row)
-                    row = 0
-        part = Piecewise(curve.time[begin : begin + len(c) + 1], c)
-        _accelerations(best, part, directed=extremes.directed)
-    _take(extremes, problem, work, state, row)
-    record.extremes.update(extremes.phase())
-    extremes.flight([record])
-    record.extremes.update(best)
+def _split(time: Floats, parts: Ints) -> Floats:
+    """Knots (sum of the parts + 1,) [s] that cut each interval between times (K + 1,) into equal parts (K,)."""
+    k = np.repeat(np.arange(len(parts)), parts)
+    share = (np.arange(len(k)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[k]
+    return np.append(time[k] + np.diff(time)[k] * share, time[-1])
 
 
-def _take(
-    extremes: Extremes, problem: Any, work: Any, state: records.IntegratorState, rows: int
-) -> None:
-    state.count[4] = rows
-    extremes.take_path(problem, work, state)
+def _watch(watch: CurveWatch, way: Piecewise, grid: Floats) -> None:
+    """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree."""
+    knots = refine(way.time, grid, 1e-6)
+    k = piece_at(way.time, 0.5 * (knots[:-1] + knots[1:]))
+    share = np.diff(knots) / np.diff(way.time)[k]
+    knots = _split(knots, np.ceil(_parts(way)[k] * share - 1e-9).astype(np.int64))
+    together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
+    for first in range(0, len(knots) - 1, together):
+        part = way.on(knots[first : first + together + 1])
+        at = [x.within(records.KNOTS) for x in (part, part.rate())]
+        points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
+        clock = np.column_stack([part.time[:-1], np.diff(part.time)])
+        watch.take_curves(clock, records.FROM_KNOTS @ points)
 
 
-def _parts(c: Floats, h: Floats) -> list[int]:
-    """Into how many parts each piece (M, N, 3, P) of width h (M,) is cut, to be within `_CLOSE` of fourth degree."""
-    beyond = np.abs(c[..., 5:]).max(axis=(1, 2), initial=0.0)
-    power = np.arange(5, c.shape[-1])
-    parts = np.ones(len(c), dtype=np.int64)
-    while True:
-        # Of a position, and of a velocity in the time of a part.
-        off = (beyond * (h / parts)[:, None] ** power * (1.0 + power)).sum(axis=1)
-        wide = (off > _CLOSE) & (parts < _PARTS)
-        if not wide.any():
-            return parts.tolist()
-        parts[wide] *= 2
+def _parts(way: Piecewise) -> Ints:
+    """Into how many parts each piece (K, N, 3, P) is cut, to be within `_CLOSE` of curves of fourth degree.
+
+    About any place of a piece of width h, power p has a coefficient of at most sum_j C(j, p) |c_j| h^(j - p). What is
+    beyond the fourth counts of a position, and of a velocity in the time of a part.
+    """
+    power = np.arange(way.pieces.shape[-1])
+    weight = [sum((1 + p) * math.comb(j, p) for p in range(5, j + 1)) for j in power.tolist()]
+    size = np.abs(way.pieces).max(axis=(1, 2)) * np.diff(way.time)[:, None] ** power
+    return np.ceil((size @ np.array(weight) / _CLOSE) ** 0.2).clip(1, _PARTS).astype(np.int64)
 
 
 def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
-    n, powers = curve.pieces.shape[1], curve.pieces.shape[-1]
-    if powers < 3:
+    n = curve.pieces.shape[1]
+    if curve.pieces.shape[-1] < 3:
         return
-    power = np.arange(2, powers)
-    a = Piecewise(curve.time, curve.pieces[..., 2:] * (power * (power - 1)))
-    points = a.bernstein().reshape(-1, 3, powers - 2)
+    points = curve.rate().rate().bernstein()
+    points = points.reshape(-1, *points.shape[2:])
     for way in SIZES if directed else ("",):
         name = f"{way}_acceleration".lstrip("_")
-        found, known = greatest(points, SIZES[way]), best.get(name)
-        if known is None or found.value > known.value:
-            k, i = divmod(found.curve, n)
+        peak, known = greatest(points, SIZES[way]), best.get(name)
+        if known is None or peak.value > known.value:
+            k, i = divmod(peak.curve, n)
             t, end = curve.time[k : k + 2]
-            best[name] = Extremum(found.value, float(t + found.place * (end - t)), i, -1)
+            best[name] = Extremum(peak.value, float(t + peak.place * (end - t)), i, -1)
 
 
 def _result(
@@ -444,37 +428,29 @@ def _result(
 ) -> Result:
     r, v, a, j = state
     k, n = r.shape[:2]
-    left = np.ones((k, n), dtype=np.bool_)
-    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    close = proximity.Closeness._make(x.copy() for x in close)
-    nothing, none = np.full((k, n, 3), np.nan), np.zeros((k, 0))
-    cm, cm_velocity = r.mean(axis=1), v.mean(axis=1)
-    unknown: dict[str, Any] = {
-        name: np.full((k, size), np.nan)
-        for names, size in (
-            (("attitude", "attitude_reference", "frame"), 4),
-            (("rates", "rates_reference"), 3),
-            (("wrench_asked", "wrench_achieved"), 6),
-        )
-        for name in names
+    turned = np.nan_to_num(yaw, copy=False)
+    sizes = {"time": k, "agent": n, "axis": 3, "quaternion": 4, "wrench": 6, "edge": 0}
+    nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
+    known: dict[str, Any] = {
+        "time": time, "phase": np.zeros(k, dtype=np.int64), "position": r, "velocity": v, "acceleration": a,
+        "slot_position": r, "slot_velocity": v, "slot_acceleration": a, "slot_jerk": j,
+        "yaw": turned[0], "yaw_rate": turned[1],
+        "cm": r.mean(axis=1), "cm_velocity": v.mean(axis=1), "edges": np.zeros((0, 2), dtype=np.int64),
+    }  # fmt: skip
+    known |= {"cm_reference": known["cm"], "cm_velocity_reference": known["cm_velocity"]}
+    unknown = {
+        name: nothing(*(sizes[dim] for dim in x.dims))
+        for name, x in VARIABLES.items()
+        if not x.optional and name not in (*known, *CLOSE)
     }
-    edged = (
-        "distance",
-        "distance_reference",
-        "distance_rate_reference",
-        "constraint",
-        "integral",
-        "multiplier",
-    )
-    empty: dict[str, Any] = dict.fromkeys(edged, none)
-    return Result(
-        time=time, phase=np.zeros(k, dtype=np.int64), position=r, velocity=v, acceleration=a,
-        slot_position=r, slot_velocity=v, slot_acceleration=a, slot_jerk=j,
-        yaw=np.nan_to_num(yaw[0]), yaw_rate=np.nan_to_num(yaw[1]),
-        input_force=nothing, constraint_force=nothing, external_force=nothing, thrust=nothing[..., 0],
-        cm=cm, cm_velocity=cm_velocity, cm_reference=cm, cm_velocity_reference=cm_velocity,
-        edges=np.zeros((0, 2), dtype=np.int64), **empty, singular_value=np.full(k, np.nan),
-        separation=close.separation, separation_pair=close.pair, clearance=close.clearance,
-        clearance_agent=close.agent, clearance_obstacle=close.obstacle, **unknown, phases=[record],
-        mission_text=mission.text, statistics={"interpolation": interpolation, "names": list(names)},
+    result = Result(
+        **known, **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
+        statistics={"interpolation": interpolation, "names": list(names)},
+        later=[
+            (CLOSE, partial(distances, mission, [record.extremes], Places([r], n), time)),
+            (("mission_text",), partial(text_of, mission)),
+        ],
     )  # fmt: skip
+    # Its text is written where the result is, and need not be read.
+    vars(result)["mission"] = mission
+    return result

@@ -1,0 +1,153 @@
+"""Names of columns that people use, and units: which quantity a column has, of which vehicle."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+#: Units by dimension and factor to s, m and rad.
+_UNITS = {
+    "time": {1.0: "s sec secs second", 1e-3: "ms msec millisecond", 1e-6: "us usec microsecond",
+             1e-9: "ns nsec nsecs nanosec nanosecond", 60.0: "min", 3600.0: "h"},
+    "length": {1.0: "m metre meter", 1e-3: "mm millimetre millimeter", 1e-2: "cm centimetre centimeter", 1e3: "km",
+               0.3048: "ft feet", 0.0254: "in inch"},
+    "angle": {1.0: "rad radian", math.radians(1.0): "deg degree"},
+}  # fmt: skip
+_UNIT = {
+    word: (dimension, factor)
+    for dimension, units in _UNITS.items()
+    for factor, words in units.items()
+    for word in words.split()
+}
+#: Axis and sign of each direction, from east, north and up; and names of columns after directions.
+AXES = {"e": (0, 1.0), "w": (0, -1.0), "n": (1, 1.0), "s": (1, -1.0), "u": (2, 1.0), "d": (2, -1.0)}
+DIRECTIONS = {name: name[0] for name in ("north", "east", "south", "west", "down", "up")}
+_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
+_AXIS, _HUE = (
+    re.compile(r"(pos|vel|acc|[ptvajq])?([xyzw])"),
+    re.compile(r"(?:led|diffuse|colou?r|rgb)?[ _.]*(r|g|b)(?:ed|reen|lue)?"),
+)
+_WORDS = {
+    # Beside an axis: a place, a velocity, an acceleration, a jerk, a quaternion; or none of them.
+    "": "p t pos position pose translation location coordinate point local world global odom map rs r wb estimate "
+        "field msg data transform enu state",
+    "v": "v vel velocity twist linear", "a": "a acc acceleration", "j": "j jerk",
+    "q": "q quat quaternion orientation rotation attitude",
+    "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
+            "gyro mag torque force thrust gyr ang euler rpy bias w b",
+    "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
+    "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world",
+    "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
+             "rigid track sysid mav uri callsign tail craft bot ship rover",
+    "thing": "id name uid uuid object marker label ns namespace child entity node tag target device model actor "
+             "player serial instance hostname key",
+    "thing too": "no nr num number system frame index idx subject",
+    "yaw": "yaw psi", "colour": "color colour rgb hex", "latitude": "lat latitude",
+    "longitude": "lon lng long longitude",
+}  # fmt: skip
+_IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
+_ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}
+_HUES = {"r": "red", "g": "green", "b": "blue"}
+_DIMENSIONS = {"": "length", "v": "length/time", "a": "length/time2", "j": "length/time3"}
+
+
+class Quantity(NamedTuple):
+    """What a name of a column says.
+
+    Attributes
+    ----------
+    kind : time; x, y, z, or a direction; vx, ax, jx, qx, ...; yaw, yaw_rate; agent or thing (names of vehicles, or
+        perhaps of other things); red, green, blue, colour; latitude, longitude; duration, x^0, ...; "" if it is not
+        understood
+    unit : as it is written; "" without one
+    who : the vehicle, if the name has one (``drone1_x``)
+    """
+
+    kind: str
+    unit: str = ""
+    who: str = ""
+
+    @property
+    def dimension(self) -> str:
+        """Dimension of the quantity: time, length, angle or quotients of them; "" for names and the like."""
+        if place := re.fullmatch(r"([vaj]?)[xyz]", self.kind):
+            return _DIMENSIONS[place[1]]
+        special = {"time": "time", "duration": "time", "yaw": "angle", "yaw_rate": "angle/time"}
+        return "length" if self.kind in DIRECTIONS else special.get(self.kind, "")
+
+
+def unit_of(text: str) -> tuple[str, float] | None:
+    """Dimension of a unit, and its factor to s, m and rad; None if it is unknown."""
+    plain = text.strip().lower().replace("µ", "u").replace("μ", "u").replace("°", "deg")
+    known = _UNIT.get(plain) or (_UNIT.get(plain.rstrip("s")) if len(plain) > 3 else None)
+    parts = re.fullmatch(r"([a-z]+)[/_ *·]+([a-z]+)\^?-?(\d?)", plain)
+    if known or parts is None or parts[1] not in _UNIT or parts[2] not in _UNIT:
+        return known
+    (above, factor), (below, divisor) = _UNIT[parts[1]], _UNIT[parts[2]]
+    power = int(parts[3] or 1)
+    return f"{above}/{below}{power if power > 1 else ''}", factor / divisor**power
+
+
+@cache
+def quantity_of(name: str) -> Quantity:
+    """The quantity, unit and vehicle of a column's name."""
+    if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
+        plain = _plain(bracket[1])
+        return plain._replace(unit=bracket[2].strip()) if plain.kind else plain
+    plain, parts = _plain(name), name.split("_")
+    for cut in (2, 1) if not plain.kind or plain.who else ():
+        unit, short = "_".join(parts[-cut:]), _plain("_".join(parts[:-cut]))
+        if short.kind and (unit_of(unit) or ("",))[0] == short.dimension:
+            return short._replace(unit=unit)
+    return plain
+
+
+def _plain(name: str) -> Quantity:
+    """The quantity and vehicle of a name without a unit."""
+    plain = name.strip().lower().replace(" ", "")
+    words = [word.lower() for word in _WORD.findall(name)]
+    every = {*words}
+    if re.fullmatch(r"duration|(x|y|z|yaw)\^[0-7]", plain) or plain in DIRECTIONS:
+        return Quantity(plain)
+    if re.fullmatch(r"p?[neud]", plain):
+        return Quantity(next(way for way in DIRECTIONS if way[0] == plain[-1]))
+    units = [word for word in words if _UNIT.get(word, ("",))[0] == "time"]
+    if every & _IS["time"] and every <= _IS["time"] | _IS["time too"] | {*units}:
+        return Quantity("time", units[-1] if units else "")
+    if (
+        every & (_IS["agent"] | _IS["thing"])
+        and every <= _IS["agent"] | _IS["thing"] | _IS["thing too"]
+    ):
+        return Quantity("agent" if every & _IS["agent"] else "thing")
+    if hue := _HUE.fullmatch(plain):
+        return Quantity(_HUES[hue[1]])
+    for kind in ("colour", "latitude", "longitude"):
+        if words and every <= _IS[kind]:
+            return Quantity(kind)
+    for k in (len(words) - 1, 0) if words else ():
+        rest = words[:k] + words[k + 1 :]
+        beside = {*rest}
+        if words[k] in _IS["yaw"]:
+            who = "".join(word for word in rest if word not in _IS["q"] | _IS[""])
+            return Quantity("yaw_rate") if who == "rate" else Quantity("yaw", who=who)
+        axis = _AXIS.fullmatch(words[k])
+        if axis is None or beside & _IS["none"]:
+            continue
+        kind = _ABBREVIATED.get(axis[1], axis[1]) if axis[1] else None
+        kinds = [x for x in "vajq" if beside & _IS[x] - _IS[""]] if kind is None else [kind]
+        kind = kinds[0] if kinds else ""
+        if axis[2] != "w" or kind == "q":
+            return Quantity(
+                kind + axis[2], who="".join(w for w in rest if w not in _IS[kind] | _IS[""])
+            )
+    return Quantity("")
+
+
+def understood(names: Sequence[str]) -> int:
+    """How many of a line's fields are names of columns; 0 if it has no place and nothing else besides."""
+    kinds = [kind for name in names if (kind := quantity_of(name).kind)]
+    places = {*DIRECTIONS, "x", "y", "latitude", "x^0"}
+    return len(kinds) if len(kinds) > 1 and places & {*kinds} else 0

@@ -1,0 +1,332 @@
+"""Tables of text that others wrote: comments, lines before the names, separators, decimal marks, rows and units."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet._common.names import quantity_of, understood, unit_of
+from rigidfleet.typing import Floats, Ints
+
+#: Separators in the order in which they are tried, with their names.
+SEPARATORS = {";": "semicolon", "\t": "tab", ",": "comma", " ": "blanks"}
+#: Units without a word of the file or the user.
+DEFAULT = {"time": "s", "length": "m", "angle": "rad"}
+#: Characters that no table has, and that a terminal would obey when a message shows them.
+_CONTROL = re.compile(r"[^\t\n\r\x20-\x7e\xa0-\U0010ffff]")
+#: What follows a row, and is none of its colours.
+_REMARK = re.compile(r"\s+#(?![0-9a-fA-F]{6}\b).*")
+_COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
+_TEXT = np.dtypes.StringDType()
+#: Lines among which names are sought, and by which a separator is chosen; rows read together; characters of a line.
+_HEAD, _SAMPLE, _TOGETHER, _LONGEST = 200, 20, 1 << 14, 100_000
+
+
+class Fault(NamedTuple):
+    """One error in a table: the line (from 1; 0: the whole file), its text, what is wrong, and the remedy."""
+
+    line: int
+    text: str
+    problem: str
+    remedy: str
+
+
+class TableError(ValueError):
+    """A table cannot be read; it has at least one fault."""
+
+    def __init__(self, *faults: Fault) -> None:
+        self.faults = faults
+        super().__init__(f"{faults[0].problem}. {faults[0].remedy}")
+
+
+def fault(problem: str, remedy: str, line: int = 0, text: str = "") -> TableError:
+    """The error of a single fault."""
+    return TableError(Fault(line, text, problem, remedy))
+
+
+class Table:
+    """A table of text with K rows, whose columns are understood by their names.
+
+    Attributes
+    ----------
+    names, kinds : of the columns: as they are written, and the `names.Quantity` that each is
+    line : of the names, from 1; of the first row, where there are none
+    separator, decimal : a key of `SEPARATORS`, and the decimal mark of numbers; "" until one is no plain number
+    named : whether the file has names
+    lines : (K,) of the rows, from 1
+    columns : texts (K,) of each column
+    texts : all lines of the file
+    places : number of the column of each quantity, by kind and vehicle
+    units : of each dimension the word, and where it is from: "" if it is assumed
+
+    Parameters
+    ----------
+    words : units of columns that do not say theirs, by dimension
+    unnamed : names of the columns where the file has none, by their number
+
+    Raises
+    ------
+    TableError
+        The file is no table, has names that are not understood, an unknown unit, or two columns for a quantity.
+    """
+
+    def __init__(
+        self, data: bytes, unnamed: Mapping[int, list[str]], words: Mapping[str, str] | None = None
+    ) -> None:
+        self.texts, self.words = _lines(data), words or {}
+        self.line, start, self.names, below, self.separator, width = _head(self.texts)
+        rows = _rows(self.texts, start, width, self.separator, self.line)
+        self.lines, self.columns, self._faults = rows
+        self.named, self.decimal = bool(self.names), ""
+        if not self.named and width:
+            if width not in unnamed:
+                why = f"has no names of columns that are understood, and {width} numbers"
+                raise fault(why, "Begin with a line such as time_s,x_m,y_m,z_m", self.line)
+            self.names, below = unnamed[width], [""] * width
+        self.kinds = [quantity_of(name) for name in self.names]
+        self.places: dict[tuple[str, str], int] = {}
+        self.units: dict[str, tuple[str, str]] = {}
+        self._factors = [self._unit(k, row) for k, row in enumerate(below)]
+
+    def _unit(self, k: int, below: str) -> float:
+        """Take a column as a quantity, and give the factor of its unit, which a row below the names may say."""
+        name, (kind, said, who), dimension = self.names[k], self.kinds[k], self.kinds[k].dimension
+        if kind in ("", "agent", "thing"):
+            return 1.0
+        first = self.places.setdefault((kind, who), k)
+        if self.names[first] != name or (self.columns[first] != self.columns[k]).any():
+            raise fault(f"has two columns for {kind}: {self.names[first]!r}, {name!r}", "Keep one")
+        option = self.words.get(dimension, "")
+        words = [word for word in (said, below, option, DEFAULT.get(dimension, "")) if word]
+        if not dimension or not words:
+            return 1.0
+        known = [unit_of(word) for word in words[:-1] or words]
+        column = f"the column {name!r}"
+        if known[0] is None or known[0][0] != dimension:
+            raise fault(f"{column} has the unknown unit {words[0]!r}", "Use s, m and rad")
+        if any(unit != known[0] for unit in known):
+            raise fault(f"{column} is in {words[0]!r}, but also in {words[1]!r}", "Remove one")
+        if kind != "duration":
+            source = "the file" if said or below else "the option" if option else ""
+            first_source = self.units.setdefault(dimension, (words[0], source))[1]
+            if bool(source) != bool(first_source):
+                raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
+        return known[0][1]
+
+    def place(self, *kinds: str, who: str = "") -> list[int]:
+        """Columns of some quantities; empty unless all are there."""
+        columns = [self.places.get((kind, who), -1) for kind in kinds]
+        return [] if -1 in columns else columns
+
+    def missing(self, *kinds: str) -> TableError:
+        """The error of a table without some quantities."""
+        if self.place("latitude"):
+            return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
+        missing = ", ".join(kind for kind in kinds if not self.place(kind))
+        why = f"has no column for {missing} among {', '.join(self.names)[:80]}"
+        return fault(why, "Name columns x_m, y_m and z_m, and time_s for trajectories")
+
+    def codes(self, column: int) -> tuple[Ints, list[str]]:
+        """Codes (K,) of a column's texts, and the texts, in the order of their first rows."""
+        known: dict[str, int] = {}
+        codes = [known.setdefault(x, len(known)) for x in self.columns[column].tolist()]
+        return np.array(codes, dtype=np.int64), [*known]
+
+    def numbers(self, which: Sequence[int]) -> Floats:
+        """Numbers (K, M) of some columns, all finite, in s, m and rad.
+
+        A comma is a decimal mark if no number has a point, and not all are such that it may separate thousands.
+
+        Raises
+        ------
+        TableError
+            A field is no finite number, or a row has another number of fields.
+        """
+        values = np.zeros((len(self.lines), len(which)))
+        faults = {fault.line: fault for fault in self._faults}
+        odd = [i for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
+        if odd and not self.decimal:
+            columns = [self.columns[k].tolist() for k in self.places.values()]
+            every = [_REMARK.sub("", x) for column in columns for x in column]
+            comma = not all(_THOUSANDS.fullmatch(x) for x in every if _COMMA.fullmatch(x))
+            point = any("." in x and is_number(x) for x in every)
+            self.decimal = "," if comma and not point else "."
+        for i in odd:
+            for row, written in enumerate(self.columns[which[i]].tolist()):
+                field = _REMARK.sub("", written)
+                plain = field.replace(self.decimal, ".")
+                if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
+                    values[row, i] = float(plain)
+                    continue
+                line, name = int(self.lines[row]), self.names[which[i]]
+                why = f"{name} is {field[:40] or 'empty'}, not a finite number"
+                remedy = "Leave out rows without a position"
+                remedy = "Write decimals with a point" if _COMMA.fullmatch(field) else remedy
+                faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
+        if faults:
+            raise TableError(*(faults[line] for line in sorted(faults)))
+        return values * [self._factors[k] for k in which]
+
+
+def _take(fields: np.ndarray, values: Floats) -> bool:
+    """Whether all fields are plain finite numbers, which are put into ``values``."""
+    try:
+        values[:] = fields.astype(np.float64)
+    except ValueError:
+        return False
+    # Python alone groups digits by "_".
+    return bool(np.isfinite(values).all()) and not (np.strings.find(fields, "_") >= 0).any()
+
+
+def is_number(field: str) -> bool:
+    """Whether a field is a number, with a decimal point or comma; "nan" and "inf" are."""
+    try:
+        float(field)
+    except ValueError:
+        return _COMMA.fullmatch(field.strip()) is not None
+    return "_" not in field
+
+
+def split(line: str, separator: str) -> list[str]:
+    """Fields of a line, without blanks around them; blanks before a unit in brackets separate nothing."""
+    if separator == " ":
+        line = re.sub(r"\s+(?=[\[(])", "\xa0", line).replace("\t", " ").strip()
+    try:
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:
+        return [line]
+    plain = [field.replace("\xa0", " ").strip() for field in fields]
+    return plain[:-1] if len(plain) > 1 and not plain[-1] else plain
+
+
+def _lines(data: bytes) -> list[str]:
+    """The lines of a file.
+
+    Raises
+    ------
+    TableError
+        It is no text.
+    """
+    wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+    try:
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        why = "is neither text in UTF-8 nor another known format"
+        raise fault(why, "Save a table as UTF-8") from None
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if odd := _CONTROL.search(text):
+        line = text.count("\n", 0, odd.start()) + 1
+        raise fault(f"has the control character U+{ord(odd[0]):04X}", "Remove it", line)
+    return text.split("\n")
+
+
+def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
+    """Line of the names, number of lines before the rows, names, units in a row below them, separator, and width."""
+    head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
+    if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
+        raise fault("has no names of columns that are understood", "Give shorter lines", long)
+    bare = [texts[k].lstrip("#") for k in head]
+    most = [max(sum(map(is_number, split(line, s))) for s in SEPARATORS) for line in bare]
+    rows = [k for k, count in zip(head, most, strict=True) if count > 1]
+    first = next((k for k in rows if texts[k][0] != "#"), len(texts))
+    start, names, own = _names(texts, [k for k in head if k < first], first)
+    if not names:
+        # Before rows without names, a line that begins with # may be one of them.
+        start = min(rows, default=len(texts))
+    below = [x for x in texts[start : start + _HEAD] if x.strip()]
+    below = ([x for x in below if x[0] != "#"] or below)[:_SAMPLE]
+    fits = {s: _fitting(below, len(names), s) for s in SEPARATORS}
+    separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
+    width, line = len(names) or fits[separator][1], start + (not names)
+    row = [x.strip("[]()") for x in split(below[0], separator)] if below else []
+    units = [""] * width
+    if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
+        units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1
+    above = [k for k in head if not names and k < start and texts[k][0] != "#"]
+    for k in [k for k in above if len(split(texts[k], separator)) == width]:
+        why = f"has no names of columns that are understood: {texts[k][:60]}"
+        raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
+    return line, start, names, units, separator, width
+
+
+def _names(texts: list[str], head: list[int], first: int) -> tuple[int, list[str], str]:
+    """Line, from 1, names and separator: of all lines, the one that is understood best."""
+    counts = {len(split(line, s)) for line in texts[first : first + 1] for s in SEPARATORS}
+    best, names = (False, 0.0), (0, [], "")
+    for k in head:
+        for separator in reversed(SEPARATORS):
+            fields = split(texts[k].lstrip("#% \t"), separator)
+            score = len(fields) in counts, understood(fields) / max(1, len(fields))
+            if score[1] > 0.0 and score >= best:
+                best, names = score, (k + 1, fields, separator)
+    return names
+
+
+def _fitting(lines: list[str], width: int, separator: str) -> tuple[int, int]:
+    """How many lines are rows by a separator, and their width: without names, those of numbers and colours alone."""
+    rows = [split(_REMARK.sub("", line), separator) for line in lines]
+    colour = re.compile(r"#[0-9a-fA-F]{6}")
+    fine = [
+        len(row) for row in rows
+        if len(row) == width or (not width and len(row) > 1 and all(is_number(x) or colour.fullmatch(x) for x in row))
+    ]  # fmt: skip
+    return len(fine), Counter(fine).most_common(1)[0][0] if fine else 0
+
+
+def _rows(
+    texts: list[str], start: int, width: int, separator: str, names: int
+) -> tuple[Ints, list[np.ndarray], list[Fault]]:
+    """Lines of the rows, texts of the columns, and faults; read in blocks, as rows of texts take much memory."""
+    lines = islice(texts, start, None)
+    if separator == " ":
+        lines = (line.replace("\t", " ").strip() for line in lines)
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    what = f"fields, and the names in line {names} are {width}"
+    what = what if names <= start else f"numbers, unlike the lines before with {width}"
+    numbers, blocks, faults, line = [], [], [], start
+    try:
+        while block := list(islice(reader, _TOGETHER)):
+            own = list(range(line + 1, (line := start + reader.line_num) + 1))
+            if len(own) != len(block):
+                raise csv.Error("a quotation mark is not closed")
+            if not all(len(row) == width and row[0] and row[0][0] != "#" for row in block):
+                read = [
+                    _row(texts[k - 1].strip(), row, width, separator)
+                    for k, row in zip(own, block, strict=True)
+                ]
+                for k, row in zip(own, read, strict=True):
+                    if row and len(row) != width:
+                        why = f"has {len(row)} {what}"
+                        faults.append(Fault(k, texts[k - 1].strip(), why, "Is the file cut off?"))
+                own = [k for k, row in zip(own, read, strict=True) if row and len(row) == width]
+                block = [row for row in read if row and len(row) == width]
+            numbers += own
+            blocks.append([np.array(x, _TEXT) for x in zip(*block, strict=True)])
+    except csv.Error as error:
+        raise fault(f"cannot be read: {error}", "Write it again", start + reader.line_num) from None
+    parts = [*zip(*filter(None, blocks), strict=True)] or [[np.array([], _TEXT)]] * width
+    columns = [np.strings.strip(np.concatenate(part)) for part in parts]
+    return np.array(numbers, dtype=np.int64), columns, faults
+
+
+def _row(text: str, fields: list[str], width: int, separator: str) -> list[str] | None:
+    """The fields of a row that is not like the others; None for an empty line and a comment.
+
+    A line that begins with # is a row if it has as many fields as one, or numbers alone behind its first field.
+    """
+    if not any(field.strip() for field in fields):
+        return None
+    if len(fields) == width + 1 and not fields[-1].strip():
+        fields = fields[:-1]
+    if len(fields) != width:
+        fields = split(_REMARK.sub("", text), separator)
+    is_row = len(fields) == width or (len(fields) > 2 and all(map(is_number, fields[1:])))
+    return fields if text[0] != "#" or is_row else None
