@@ -236,6 +236,22 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     return Content(rows, notes=notes)
 
 
+#: A height that no terrain has [m], and one by which files mark cells without data besides such heights.
+_NOWHERE, _MARK = 9000.0, -999.0
+#: The remedy for these.
+FILL = "fill the cells, for example from their neighbours, or cut the map"
+
+
+def without_data(heights: Any) -> str:
+    """Where heights (I, J) [m] have cells without data, as elevation models mark them (NaN, -9999, -32768, ...)."""
+    z = np.asarray(heights, dtype=float)
+    cells = np.argwhere(~(np.abs(z) < _NOWHERE) | (z == _MARK))
+    if not len(cells):
+        return ""
+    i, j = cells[0]
+    return f"has {len(cells):,} cells without data, the first in row {i + 1}, column {j + 1}: {z[i, j]:g}"
+
+
 def _heights(data: bytes, name: str) -> Content:
     """Numbers of a CSV or NPY file, row by row."""
     try:
@@ -248,9 +264,11 @@ def _heights(data: bytes, name: str) -> Content:
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
         raise unread(name, "is not a table of numbers", remedy) from None
-    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+    if found.ndim == 2 and (why := without_data(found)):
+        raise unread(name, why, FILL)
+    if found.ndim != 2 or not found.size:
         remedy = "give two or more rows of heights [m]"
-        raise unread(name, "is not a table of finite numbers", remedy)
+        raise unread(name, "is not a table of numbers", remedy)
     if found.size > bounds.HEIGHTS:
         problem = f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
         raise unread(name, problem, "use a coarser grid")

@@ -492,10 +492,8 @@ class Result:
         from rigidfleet.mission import KINDS  # takes long to load
 
         off = np.full(self.n_agents, np.inf)
-        ground = max(
-            (o.height for o in self.mission.obstacles if o.kind == "ground"), default=-np.inf
-        )
-        over = self.position[:, :, 2] - self.mission.fleet.radius - ground
+        over = self.position[:, :, 2] - self.mission.fleet.radius
+        over = over - self.mission.height_at(*np.moveaxis(self.position, 2, 0))
         down = self.left & (over <= PAD)
         for i, phase in enumerate(self.phases):
             k = self.samples(i).stop - 1
