@@ -33,7 +33,7 @@ _AXIS, _HUE = (
 _WORDS = {
     # Beside an axis: a place, a velocity, an acceleration, a jerk, a quaternion; or none of them.
     "": "p t pos position pose translation location coordinate point local world global odom map rs r wb estimate "
-        "field msg data transform enu state",
+        "field msg data transform state",
     "v": "v vel velocity twist linear", "a": "a acc acceleration", "j": "j jerk",
     "q": "q quat quaternion orientation rotation attitude",
     "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
@@ -48,8 +48,14 @@ _WORDS = {
     "yaw": "yaw psi", "colour": "color colour rgb hex", "latitude": "lat latitude",
     "longitude": "lon lng long longitude",
 }  # fmt: skip
+#: Frames by their names, and where x, y and z point; forward, left, up and forward, right, down are not turned.
+_FRAMES = {"enu": "enu", "ned": "ned", "nwu": "nwu", "neu": "neu", "flu": "enu", "frd": "esd"}
 _IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}
+#: Words for places that are wanted, not those of a vehicle.
+ROLES = frozenset("ref reference setpoint sp target desired des cmd command goal".split())
+#: A letter alone, and what a quantity is nothing without: an acceleration without a velocity, ...
+_LETTER, _AFTER = r"(?<![^\W_])[a-z](?![^\W_])", {"a": "vx", "j": "ax", "q": "qw"}
 _HUES = {"r": "red", "g": "green", "b": "blue"}
 _DIMENSIONS = {"": "length", "v": "length/time", "a": "length/time2", "j": "length/time3"}
 
@@ -95,12 +101,14 @@ def unit_of(text: str) -> tuple[str, float] | None:
 def quantity_of(name: str) -> Quantity:
     """The quantity, unit and vehicle of a column's name."""
     if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
+        if bracket[2].strip().lower() in _FRAMES:
+            return _plain(f"{bracket[1]}_{bracket[2]}")
         plain = _plain(bracket[1])
         return plain._replace(unit=bracket[2].strip()) if plain.kind else plain
     plain, parts = _plain(name), name.split("_")
     for cut in (2, 1) if not plain.kind or plain.who else ():
         unit, short = "_".join(parts[-cut:]), _plain("_".join(parts[:-cut]))
-        if short.kind and (unit_of(unit) or ("",))[0] == short.dimension:
+        if (known := unit_of(unit)) and known[0] == short.dimension:
             return short._replace(unit=unit)
     return plain
 
@@ -127,6 +135,8 @@ def _plain(name: str) -> Quantity:
     for kind in ("colour", "latitude", "longitude"):
         if words and every <= _IS[kind]:
             return Quantity(kind)
+    frames = [_FRAMES[word] for word in words if word in _FRAMES]
+    words = [word for word in words if word not in _FRAMES]
     for k in (len(words) - 1, 0) if words else ():
         rest = words[:k] + words[k + 1 :]
         beside = {*rest}
@@ -140,10 +150,44 @@ def _plain(name: str) -> Quantity:
         kinds = [x for x in "vajq" if beside & _IS[x] - _IS[""]] if kind is None else [kind]
         kind = kinds[0] if kinds else ""
         if axis[2] != "w" or kind == "q":
-            return Quantity(
-                kind + axis[2], who="".join(w for w in rest if w not in _IS[kind] | _IS[""])
-            )
+            who = "".join(w for w in rest if w not in _IS[kind] | _IS[""])
+            if frames and kind == "":
+                letter = frames[0]["xyz".index(axis[2])]
+                return Quantity(next(d for d in DIRECTIONS if d[0] == letter), who=who)
+            return Quantity(kind + axis[2], who=who)
     return Quantity("")
+
+
+def of_columns(names: Sequence[str]) -> list[Quantity]:
+    """The quantities of all columns of a table.
+
+    A letter such as a, v or b beside three axes is a quantity (`a_x`: an acceleration). It is a vehicle, perhaps one
+    that is not read, where others written alike are vehicles (`x_a`, `x_b`, `x_cf1`), or the quantity says nothing here.
+    """
+    kinds = [quantity_of(name) for name in names]
+    known, place = {q.kind for q in kinds}, {name.lower(): k for k, name in enumerate(names)}
+    alike: dict[str, dict[str, tuple[list[int], str]]] = {}
+    for name in place:
+        for cut in re.finditer("x", name):
+            ends = name[: cut.start()], name[cut.end() :]
+            own = [place.get(axis.join(ends), -1) for axis in "xyz"]
+            letters = re.findall(_LETTER, re.sub(r"[\[(].*|_m$", "", " ".join(ends)))
+            if -1 not in own:
+                rest = re.sub(_LETTER, "", "X".join(ends), count=1)
+                same = alike.setdefault(re.sub(r"[^\W_]+", "a", " ".join(ends)), {})
+                same[letters[0] if len(letters) == 1 else "".join(ends)] = own, quantity_of(rest).unit
+    for shape, same in alike.items():
+        whose = {kinds[own[0]].who for own, _ in same.values() if kinds[own[0]].kind == "x"}
+        vehicles = bool(whose - ROLES - _IS["agent"] - {""}) and not {"p", "v"} <= same.keys()
+        vehicles |= not known & {"x", *DIRECTIONS} and len(same) > 1 and bool(same.keys() - {*"vajqw"})
+        first = shape.startswith(" ") and "" not in whose
+        for letter, (own, unit) in same.items():
+            kind = kinds[own[0]].kind
+            lone = not kind or first or _AFTER.get(kind[0], kind) not in known
+            if len(letter) == 1 and (vehicles or lone):
+                for k, axis in zip(own, "xyz", strict=True):
+                    kinds[k] = Quantity(axis, unit, letter)
+    return kinds
 
 
 def understood(names: Sequence[str]) -> int:

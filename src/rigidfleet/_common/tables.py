@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import quantity_of, understood, unit_of
+from rigidfleet._common.names import of_columns, understood, unit_of
 from rigidfleet.typing import Floats, Ints
 
 #: Separators in the order in which they are tried, with their names.
@@ -91,7 +91,7 @@ class Table:
                 why = f"has no names of columns that are understood, and {width} numbers"
                 raise fault(why, "Begin with a line such as time_s,x_m,y_m,z_m", self.line)
             self.names, below = unnamed[width], [""] * width
-        self.kinds = [quantity_of(name) for name in self.names]
+        self.kinds = of_columns(self.names)
         self.places: dict[tuple[str, str], int] = {}
         self.units: dict[str, tuple[str, str]] = {}
         self._factors = [self._unit(k, row) for k, row in enumerate(below)]

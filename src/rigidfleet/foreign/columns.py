@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import AXES, DIRECTIONS, unit_of
+from rigidfleet._common.names import AXES, DIRECTIONS, ROLES, quantity_of, unit_of
 from rigidfleet._common.tables import DEFAULT, SEPARATORS, Table, fault, is_number
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
@@ -31,19 +31,7 @@ _LONG, _LONGEST = 1.0, 1000.0
 _SHORTER = 0.5
 #: Numbers of vehicles that may take turns, and rows by which this is seen.
 _TURNS, _FIRST = range(2, 17), 1000
-#: Words for places that are wanted, not those of a vehicle; for what a row may say of itself; for units in a line.
-_ROLES = {
-    "ref",
-    "reference",
-    "setpoint",
-    "sp",
-    "target",
-    "desired",
-    "des",
-    "cmd",
-    "command",
-    "goal",
-}
+#: Words for what a row may say of itself; for units in a line.
 _FLAGS = re.compile(
     r"valid|status|flag|ok|quality|lost|track|visible|occluded|fix|health", re.IGNORECASE
 )
@@ -230,8 +218,9 @@ def read_tracks(
             yaw = yaws(stack(own.quaternion, rows))
         turned = _in_enu(own.axes, stack(own.place, rows), velocity, yaw)
         tracks.append(Track(who, table.lines[rows], time[rows], *turned))
-    said = "the option" if axes else "" if main.axes == "enu" and table.place("x") else "the file"
-    notes += map(Doubt, _doubts(table, tracks, axes=bool(said)))
+    named = table.kinds[main.place[0]].kind in DIRECTIONS
+    said = "the option" if axes else "the file" if named else ""
+    notes += _doubts(table, tracks, axes=bool(said))
     used = {*columns, *table.place("time"), *identity}
     return tracks, {
         "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
@@ -266,7 +255,7 @@ def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
             sets[who] = _Places(turned, place, *(table.place(*kind, who=who) for kind in kinds))
         if own := {kind: k for (kind, x), k in table.places.items() if x == who and kind in "xyz"}:
             loose[who] = own
-    flown = {who: own for who, own in sets.items() if who not in _ROLES} or sets
+    flown = {who: own for who, own in sets.items() if who not in ROLES} or sets
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
         raise table.missing(*"xyz")
@@ -276,10 +265,14 @@ def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
         pairs = [(table.places.get((kind, main), -1), k) for kind, k in loose[who].items()]
         if all((table.columns[i] == table.columns[k]).all() for i, k in pairs):
             continue
-        if who not in _ROLES and (re.search(r"\d", who) or "" not in sets):
+        if who not in ROLES and (re.search(r"\d", who) or "" not in sets):
             remedy = "Give each vehicle its rows, or columns such as x1, y1, z1, x2, y2, z2"
             raise fault(f"{names} may be places of another vehicle", remedy)
-        notes.append(f"the columns {names} are not read: another vehicle's are not judged")
+        notes.append(f"the columns {names} are not read: if a vehicle is there, it is not judged")
+    for who, own in flown.items():
+        columns = [table.names[k] for k in own.place]
+        if who and quantity_of(columns[0]).who != who.lower():
+            notes.append(f"the columns {', '.join(columns)} are read as places of a vehicle {who!r}")
     return flown
 
 
