@@ -65,7 +65,7 @@ class Table:
     columns : texts (K,) of each column
     texts : all lines of the file
     places : number of the column of each quantity, by kind and vehicle
-    units : of each dimension the word, and where it is from: "" if it is assumed
+    units : of each dimension of columns that were read the word, and where it is from: "" if it is assumed
 
     Parameters
     ----------
@@ -94,16 +94,25 @@ class Table:
         self.kinds = of_columns(self.names)
         self.places: dict[tuple[str, str], int] = {}
         self.units: dict[str, tuple[str, str]] = {}
-        self._factors = [self._unit(k, row) for k, row in enumerate(below)]
+        self._below = below
+        for k, (kind, _, who) in enumerate(self.kinds):
+            if kind in ("", "agent", "thing"):
+                continue
+            first = self.places.setdefault((kind, who), k)
+            if self.names[first] != self.names[k] or (self.columns[first] != self.columns[k]).any():
+                names = f"{self.names[first]!r}, {self.names[k]!r}"
+                raise fault(f"has two columns for {kind}: {names}", "Keep one")
 
-    def _unit(self, k: int, below: str) -> float:
-        """Take a column as a quantity, and give the factor of its unit, which a row below the names may say."""
-        name, (kind, said, who), dimension = self.names[k], self.kinds[k], self.kinds[k].dimension
-        if kind in ("", "agent", "thing"):
-            return 1.0
-        first = self.places.setdefault((kind, who), k)
-        if self.names[first] != name or (self.columns[first] != self.columns[k]).any():
-            raise fault(f"has two columns for {kind}: {self.names[first]!r}, {name!r}", "Keep one")
+    def factor(self, k: int) -> float:
+        """The factor of the unit of a column, which a row below the names may say.
+
+        Raises
+        ------
+        TableError
+            The unit is unknown, said twice in other ways, or said for some columns of a dimension only.
+        """
+        name, said, below = self.names[k], self.kinds[k].unit, self._below[k]
+        dimension = self.kinds[k].dimension
         option = self.words.get(dimension, "")
         words = [word for word in (said, below, option, DEFAULT.get(dimension, "")) if word]
         if not dimension or not words:
@@ -114,11 +123,10 @@ class Table:
             raise fault(f"{column} has the unknown unit {words[0]!r}", "Use s, m and rad")
         if any(unit != known[0] for unit in known):
             raise fault(f"{column} is in {words[0]!r}, but also in {words[1]!r}", "Remove one")
-        if kind != "duration":
-            source = "the file" if said or below else "the option" if option else ""
-            first_source = self.units.setdefault(dimension, (words[0], source))[1]
-            if bool(source) != bool(first_source):
-                raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
+        source = "the file" if said or below else "the option" if option else ""
+        first_source = self.units.setdefault(dimension, (words[0], source))[1]
+        if bool(source) != bool(first_source):
+            raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
         return known[0][1]
 
     def place(self, *kinds: str, who: str = "") -> list[int]:
@@ -150,7 +158,7 @@ class Table:
         TableError
             A field is no finite number, or a row has another number of fields.
         """
-        values = np.zeros((len(self.lines), len(which)))
+        factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
         odd = [i for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
         if odd and not self.decimal:
@@ -176,7 +184,7 @@ class Table:
                 faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
         if faults:
             raise TableError(*(faults[line] for line in sorted(faults)))
-        return values * [self._factors[k] for k in which]
+        return values * factors
 
 
 def _take(fields: np.ndarray, values: Floats) -> bool:
@@ -254,7 +262,7 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1
     above = [k for k in head if not names and k < start and texts[k][0] != "#"]
-    for k in [k for k in above if len(split(texts[k], separator)) == width]:
+    for k in [k for k in above if width in (0, len(split(texts[k], separator)))]:
         why = f"has no names of columns that are understood: {texts[k][:60]}"
         raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
     return line, start, names, units, separator, width
@@ -266,7 +274,10 @@ def _names(texts: list[str], head: list[int], first: int) -> tuple[int, list[str
     best, names = (False, 0.0), (0, [], "")
     for k in head:
         for separator in reversed(SEPARATORS):
-            fields = split(texts[k].lstrip("#% \t"), separator)
+            line = texts[k].lstrip("#% \t")
+            fields, whole = split(line, separator), split(f"{line}.", separator)
+            if len(whole) > len(fields) and len(whole) in counts:
+                fields.append("")  # a last column without a name
             score = len(fields) in counts, understood(fields) / max(1, len(fields))
             if score[1] > 0.0 and score >= best:
                 best, names = score, (k + 1, fields, separator)

@@ -21,12 +21,9 @@ _TUM = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 _DATES, _TICKS = (10**9, 4 * 10**9), ("s", "ms", "us", "ns")
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
 _CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
-#: Greatest speed of a flight that is doubted, if steps are long: below; if numbers are whole: above [m/s].
-_SLOW, _FAST = 0.1, 20.0
-#: Greatest whole number of a place without a unit that is not doubted where all are slower than this [m, m/s].
-_WIDE, _CALM = 500.0, 5.0
-#: Step of times without a unit from which they are doubted, and from which they are refused [s].
-_LONG, _LONGEST = 1.0, 1000.0
+#: Greatest speed that is doubted where steps are a second or longer, ten times that from ten seconds on, and the least
+#: one that is doubted; places that are doubted where they are whole numbers and all are slower [m/s, m, m/s].
+_SLOW, _FAST, _WIDE, _CALM = 0.1, 40.0, 500.0, 5.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
 _SHORTER = 0.5
 #: Numbers of vehicles that may take turns, and rows by which this is seen.
@@ -110,7 +107,9 @@ def parse(data: bytes, words: Units) -> tuple[Table, list[str]]:
     """
     table, notes = Table(data, {len(_TUM): _TUM}, words.words), []
     if not table.columns:
-        raise fault("is empty", "Give a table with a line of names")
+        bare = any(line.strip() for line in table.texts)
+        why = "has no names of columns that are understood" if bare else "is empty"
+        raise fault(why, "Give a table with a line of names such as time_s,x_m,y_m,z_m")
     if not table.named:
         turned = np.linalg.norm(table.numbers(range(4, 8)), axis=1)
         if (np.abs(turned - 1.0) > 0.01).any():
@@ -133,7 +132,7 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
         return table.numbers(columns)[:, 0], None
-    ticks = []
+    ticks, _ = [], table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
         if (tick := _tick(field)) is None:
             why = f"{table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
@@ -213,7 +212,7 @@ def read_tracks(
             raise fault(f"{who!r} has no position", "Leave it out")
         velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
         if own.yaw:
-            yaw = _yaw(table, values[own.yaw[0]][rows], rows, notes)
+            yaw = _yaw(table, values[own.yaw[0]][rows], time[rows], rows, notes)
         elif own.quaternion:
             yaw = yaws(stack(own.quaternion, rows))
         turned = _in_enu(own.axes, stack(own.place, rows), velocity, yaw)
@@ -321,8 +320,8 @@ def _vehicles(
         whole = _SHORTER * _length(first, 0 * row)
         turns = [p for p in _TURNS if n > 2 * p and _length(first, row % p) < whole]
         if turns and not chosen and not apart:
-            doubt = f"rows lie apart as if {turns[0]} vehicles took turns"
-            notes.append(Doubt(f"{doubt}: give them names in a column agent"))
+            why = f"rows lie apart as if {turns[0]} vehicles took turns"
+            raise fault(why, "Name vehicles in a column agent")
     if unclear and any((both != next(iter(apart.values()))).any() for both in apart.values()):
         told = ", ".join(names[k] for k in apart)
         raise fault(f"the columns {told} may name vehicles", "Name one of them agent")
@@ -398,7 +397,7 @@ def _in_enu(
     return place @ turn.T, None if velocity is None else velocity @ turn.T, yaw
 
 
-def _yaw(table: Table, yaw: Floats, rows: Ints, notes: list[str]) -> Floats | None:
+def _yaw(table: Table, yaw: Floats, time: Floats, rows: Ints, notes: list[str]) -> Floats | None:
     """The yaws (K,) [rad], or None if they may be in another unit than assumed.
 
     Raises
@@ -414,7 +413,8 @@ def _yaw(table: Table, yaw: Floats, rows: Ints, notes: list[str]) -> Floats | No
             f"the yaw is not read: {span} may be degrees or radians. Name it yaw_deg or yaw_rad, or give the unit"
         )
         return None
-    if np.ptp(yaw) > 2.0001 * np.pi and step.max() > 1.0001 * np.pi:
+    ordered = (np.diff(time) > 0.0).all()
+    if ordered and np.ptp(yaw) > 2.0001 * np.pi and step.max() > 1.0001 * np.pi:
         k = int(step.argmax())
         why = f"the yaw changes by {np.degrees(step[k]):.4g} deg, more than half a turn: which way?"
         raise fault(why, "Give the right unit, or more rows", int(table.lines[rows[k + 1]]))
@@ -422,36 +422,32 @@ def _yaw(table: Table, yaw: Floats, rows: Ints, notes: list[str]) -> Floats | No
 
 
 def _doubts(table: Table, tracks: list[Track], *, axes: bool) -> Iterator[str]:
-    """What looks as if it had other units or axes than it says.
-
-    Raises
-    ------
-    TableError
-        Times without a unit are too far apart for seconds.
-    """
+    """What is assumed of units, and what looks as if it had other units or axes."""
     place, time = (np.concatenate([track[k] for track in tracks]) for k in (3, 2))
-    whole = (place == np.round(place)).all()
-    top, bottom, widest = place[:, 2].max(), place[:, 2].min(), np.abs(place).max()
+    top, bottom = place[:, 2].max(), place[:, 2].min()
     if not axes and top <= 0.1 and bottom < -0.5:
-        yield f"all heights are at or below 0, down to {bottom:.4g} m: does z point down? Say --axes ned or enu"
+        why = f"all heights are at or below 0, down to {bottom:.4g} m"
+        yield Doubt(f"{why}: does z point down? Say --axes ned or enu")
+    things = {"time": "times", "length": "places"}
+    things |= {"angle": "yaws"} if any(track.yaw is not None for track in tracks) else {}
+    assumed = [
+        f"{things[q]} as {word}"
+        for q, (word, source) in table.units.items()
+        if q in things and not source
+    ]
+    if not assumed or not table.named:
+        return
+    note = f"no unit is said: {', '.join(assumed)}"
     with np.errstate(all="ignore"):
         ways = [np.linalg.norm(np.diff(track.place, axis=0), axis=1) for track in tracks]
     steps = np.concatenate([np.diff(track.time) for track in tracks])
     step = float(np.median(steps)) if steps.size else 0.0
     fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
-    slow = 10.0 * _SLOW if step >= 10.0 and (time == np.round(time)).all() else _SLOW
-    moves = 0.0 < fastest < slow and max(map(np.sum, ways)) > _SLOW
-    if not table.units["time"][1] and (step >= _LONGEST or (step >= _LONG and moves)):
-        told = f"as seconds, speeds reach {fastest:.3g} m/s, as milliseconds {1e3 * fastest:.3g}"
-        remedy = "Name the column time_s or time_ms, or say --units s or ms"
-        if step >= _LONGEST:
-            raise fault(f"times without a unit step by {step:g}: {told}", remedy)
-        yield f"times without a unit step by {step:g}: {told}. {remedy}"
-    likely = fastest > 2.0 * _FAST or (
-        whole and (fastest > _FAST or (widest > _WIDE and fastest < _CALM))
-    )
-    if not table.units["length"][1] and likely:
-        told = (
-            f"places without a unit reach {widest:.4g} at {fastest:.3g} m/s: are they millimetres?"
-        )
-        yield f"{told} Name the column x_m or x_mm, or say --units m or mm"
+    slow = step >= 1.0 and 0.0 < fastest < _SLOW * (10.0 if step >= 10.0 else 1.0)
+    slow &= max(map(np.sum, ways)) > _SLOW and not table.units["time"][1]
+    whole = (place == np.round(place)).all() and np.abs(place).max() > _WIDE
+    fast = (fastest > _FAST or (whole and fastest < _CALM)) and not table.units["length"][1]
+    if slow or fast:
+        note += f", so that speeds reach {fastest:.3g} m/s. Name columns such as time_ms and x_mm, or say --units"
+        note = Doubt(f"{note} ms or s, mm or m")
+    yield note

@@ -230,7 +230,7 @@ def judged_as(
         if ground is not None:
             data["obstacles"] = [{"kind": "ground", "height": ground}]
         agents |= {"radius": radius, "mass": 1.0}
-    step = min(lasting, max(_STEP, 1e-5 * lasting))  # which nothing flies
+    step = min(lasting, max(_STEP, 1e-5 * lasting, 6.1e-8 * lasting * len(start)))  # not flown
     more = {"output_step": step, "agents": agents, "phases": [phase]}
     return Mission.from_plain(data | more, "the limits")
 
