@@ -275,6 +275,19 @@ def test_positions_that_freeze_are_told(tmp_path):
     assert not said(judged(hover), "repeat to the last digit")
 
 
+def test_a_jump_after_a_standstill_is_told(tmp_path):
+    """Lost while it was slow, and there again far away; one that starts by ever longer steps is not doubted."""
+    fast = np.cumsum(np.clip(0.02 * (EVERY - 3), 0.001, 0.2))
+    lost = np.where((EVERY > 3) & (EVERY < 7.95), fast[30], fast)
+    for x, doubted in (
+        (lost, True),
+        (np.maximum(EVERY - 5, 0) ** 3 - np.maximum(3 - EVERY, 0) ** 3, False),
+    ):
+        place = lambda t, x=x: np.stack([x, 0 * t, 2 + 0 * t], 1)  # noqa: E731
+        path = table(tmp_path / "t.csv", {"A": (EVERY, place)})
+        assert said(judged(path), "repeat to the last digit", "'A' from 3 to 7.9 s") == doubted
+
+
 def test_notes_stand_beside_passed(tmp_path, capsys):
     """In the terminal, in verdict.json and on the page of the report."""
     times = np.delete(EVERY, [50, 51, 52])
@@ -327,6 +340,30 @@ def test_no_vehicle_hides_in_a_folder(name, tmp_path, capsys):
         assert code == BAD_INPUT
         assert f"{folder / name}: may be a further vehicle" in capsys.readouterr().err
         assert main(["assess", str(folder_of(tmp_path / "two")), "--separation", "0.5"]) == PASSED
+
+
+def test_vehicles_are_named_by_their_folders(tmp_path, capsys):
+    """Tables of one name in folders of their own: two that meet fail by the names of the folders."""
+    for name, stem in (("a", "way.csv"), ("b", "way.CSV")):
+        (tmp_path / "all" / name).mkdir(parents=True)
+        table(tmp_path / "all" / name / stem, {name: MEET[name]}, HEAD.replace("agent", "note"))
+    (tmp_path / "all" / "__MACOSX").mkdir()
+    (tmp_path / "all" / "__MACOSX" / "._way.csv").write_bytes(b"\0\5\x16\7Mac OS X")
+    read = read_trajectories(tmp_path / "all")
+    assert read.names == ("a", "b")
+    assert not judged(tmp_path / "all", separation=0.5).passed
+
+
+@pytest.mark.parametrize(
+    "name", ["._a.csv", "Thumbs.db", "desktop.ini", ".~lock.a.csv#", ".DS_Store"]
+)
+def test_what_systems_put_beside_files_is_left_out(name, tmp_path):
+    """It is named in a note, and hides no vehicle: a table under such a name is refused."""
+    folder = folder_of(tmp_path)
+    (folder / name).write_bytes(b"\0\5\x16\7\0Mac OS X")
+    assert said(judged(folder, separation=0.5), f"of 'mix', {name} is not read")
+    with pytest.raises(TrajectoryError, match="may be a further vehicle"):
+        read_trajectories(folder_of(tmp_path, name))
 
 
 @pytest.mark.parametrize("name", ["bag.mcap", "show.skyc", "bag.MCAP"])
@@ -418,6 +455,18 @@ def test_another_zero_is_no_clock_of_obstacles(begin, tmp_path):
         rf.RigidfleetError, match=f"begin at {begin:.9g} s, and obstacles move from 0 s on"
     ):
         judged(path, mission=str(tmp_path / "ball.toml"))
+
+
+def test_dates_are_no_clock_of_obstacles(tmp_path, capsys):
+    """Where obstacles move from 0 s on, nobody knows where they are at a date: refused."""
+    (tmp_path / "ball.toml").write_text(BALL)
+    for clock in ("{:.1f}", "2024-05-01T00:00:0{:.1f}Z"):
+        begin = 0.0 if "T" in clock else 1.7e9
+        rows = "".join(f"{clock.format(begin + t)},0,0,5\n" for t in range(9))
+        (tmp_path / "t.csv").write_text("time,x_m,y_m,z_m\n" + rows)
+        command = ["assess", str(tmp_path / "t.csv"), "--mission", str(tmp_path / "ball.toml")]
+        assert main(command) == BAD_INPUT
+        assert "and obstacles move from 0 s on" in " ".join(capsys.readouterr().err.split())
 
 
 # -- what expands ------------------------------------------------------------------------------------

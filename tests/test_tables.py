@@ -67,6 +67,15 @@ SAME = {
     + "".join(f"{k},{row}\n" for k, row in enumerate(lines(plain).splitlines())),
     "numbered messages": "id,time,agent,x,y,z\n"
     + "".join(f"{k},{row}\n" for k, row in enumerate(lines(plain).splitlines())),
+    "numbered times": "time,agent,frame,x,y,z\n"
+    + lines(lambda t, i, x, y, z: f"{t},{i},{int(2 * t)},{x},{y},{z}"),
+    "a heading": "time,agent,heading (deg),x,y,z\n"
+    + lines(lambda t, i, x, y, z: f"{t},{i},{10 * t},{x},{y},{z}"),
+    "a battery": "time,agent,battery,x,y,z\n"
+    + lines(lambda t, i, x, y, z: f"{t},{i},{16 - t},{x},{y},{z}"),
+    "a last column without a name": HEAD.strip() + ",\n" + lines(lambda *v: plain(*v) + ",7"),
+    "units beside columns that are not read": "time_s,agent,x_m,y_m,z_m,n,x_raw,y_std\n"
+    + lines(lambda *v: plain(*v) + f",7,{v[2]},1"),
     "two frames": "time,frame_id,child_frame_id,x,y,z\n"
     + lines(lambda t, i, x, y, z: f"{t},map,cf{i},{x},{y},{z}"),
     "wide": "t,x1,y1,z1,x2,y2,z2\n" + alone(lambda t, i, x, y, z: f"{t},{x},{y},{z},{x},4.5,2.5"),
@@ -123,8 +132,22 @@ SAME = {
             "t,agent,e,n,u",
         )
     },
-    "north, east, down": "time,agent,north,east,down\n"
-    + lines(lambda t, i, x, y, z: f"{t},{i},{y},{x},{-z}"),
+    **{
+        head: f"time,agent,{head}\n" + lines(lambda t, i, x, y, z: f"{t},{i},{y},{x},{-z}")
+        for head in (
+            "north,east,down",
+            "x_ned,y_ned,z_ned",
+            "ned_x,ned_y,ned_z",
+            "pos_ned_x,pos_ned_y,pos_ned_z",
+            "local_ned.x,local_ned.y,local_ned.z",
+            "x (NED),y (NED),z (NED)",
+            "x_ned [m],y_ned [m],z_ned [m]",
+        )
+    },
+    **{
+        head: f"time,agent,{head}\n" + lines(plain)
+        for head in ("x_enu,y_enu,z_enu", "flu_x,flu_y,flu_z", "x (ENU),y (ENU),z (ENU)")
+    },
     "seconds since 1970": dated(lambda t: f"{1.7e9 + t:.6f}"),
     "dates": dated(lambda t: f"2024-05-01T12:00:{int(t):02d}.{int(t % 1 * 1000):03d}Z"),
     "dates with a blank": dated(lambda t: f"2024-05-01 23:59:{int(t) + 50}.{int(t % 1 * 1e6):06d}"),
@@ -169,6 +192,46 @@ def test_utf_16_is_read(tmp_path):
     """What a spreadsheet calls Unicode text."""
     (tmp_path / "t.csv").write_text(HEAD + lines(plain), encoding="utf-16")
     judged_as_meant(read_trajectories(tmp_path / "t.csv"))
+
+
+WIDE = [
+    "t,x_a,y_a,z_a,x_b,y_b,z_b",
+    "t,a.x,a.y,a.z,b.x,b.y,b.z",
+    "t,xa,ya,za,xb,yb,zb",
+    "t,x_v,y_v,z_v,x_cf1,y_cf1,z_cf1",
+    "t,x_w1,y_w1,z_w1,x_q2,y_q2,z_q2,x_cf3,y_cf3,z_cf3",
+    "t,x_r,y_r,z_r,x_alpha,y_alpha,z_alpha",
+    "t,x_t [m],y_t [m],z_t [m],x_u [m],y_u [m],z_u [m]",
+    "t,a_x_m,a_y_m,a_z_m,c_x_m,c_y_m,c_z_m",
+    "t,pos_x_a,pos_y_a,pos_z_a,pos_x_d,pos_y_d,pos_z_d",
+    "t,p_x,p_y,p_z,q_x,q_y,q_z",
+    "t,x,y,z,x_b,y_b,z_b",
+    "t,x,y,z,a_x,a_y,a_z",
+    "t,x,y,z,bx,by,bz",
+    "t,x_max,y_max,z_max,x_anna,y_anna,z_anna",
+    "t,x_p,y_p,z_p,x_v,y_v,z_v",
+]
+
+
+@pytest.mark.parametrize("head", WIDE)
+def test_vehicles_beside_each_other_are_not_lost(head, tmp_path, capsys):
+    """Two that are 3.04 m apart fail at 4 m whatever letter is the name of one, or a note names its columns."""
+    (tmp_path / "t.csv").write_text(
+        head
+        + "\n"
+        + alone(
+            lambda t, i, x, y, z: f"{t},{x},{y},{z},{x},4.5,2.5" + f",{x},7.5,3" * ("cf3" in head)
+        )
+    )
+    code = main(["assess", str(tmp_path / "t.csv"), "--json"])
+    notes = " ".join(json.loads(capsys.readouterr().out)["notes"])
+    read = read_trajectories(tmp_path / "t.csv")
+    if len(read.curves) > 1:
+        judged_as_meant(read, len(read.curves))
+        assert main(["assess", str(tmp_path / "t.csv"), "--separation", "4"]) == FAILED
+    else:
+        assert code == PASSED
+        assert "are not read" in notes or "velocities of the table are up to" in notes
 
 
 NOTED = {
@@ -220,6 +283,30 @@ def test_vehicles_that_take_turns_are_told_apart(tmp_path):
 
 
 REFUSED = {
+    "names that nobody knows": (
+        "elapsed,who,xcoord,ycoord,zcoord\n" + lines(lambda t, i, *r: f"{t},a{i},{r[0]},0,5"),
+        "no names of columns that are understood: elapsed,who,xcoord",
+    ),
+    "no names": (
+        lines(lambda t, i, x, y, z: f"{t},a{i},{x},{y},{z}"),
+        "has no names of columns that are understood",
+    ),
+    "rows out of order, with yaws": (
+        "t,x,y,z,yaw_deg\n0,0,0,1,0\n2,2,0,1,400\n1,1,0,1,200\n",
+        "goes back behind",
+    ),
+    "vehicles that take turns, with yaws": (
+        "t,x,y,z,yaw_deg\n"
+        + "".join(f"{k / 10},{k % 2 * 9},{k / 10},5,{k % 2 * 200 + 9 * k}\n" for k in range(60)),
+        "as if 2 vehicles took turns",
+    ),
+    "vehicles that follow each other": (
+        "t,name,x,y,z\n"
+        + "".join(
+            f"{k / 10 + (k > 29)},{'ab'[k > 29]},{k / 10 + 9 * (k > 29)},0,5\n" for k in range(60)
+        ),
+        "'a' has samples from 0 to 2.9 s, and others",
+    ),
     "nobody": ("time,x,y,z\n" + lines(lambda t, i, x, y, z: f"{t},{x},{y},{z}"), "has two places"),
     "teams": (
         "time,team,x,y,z\n" + lines(lambda t, i, x, y, z: f"{t},{i % 2},{x},{y},{z}", 4),
@@ -355,7 +442,7 @@ UNSAID = {
 
 @pytest.mark.parametrize("head", UNSAID)
 def test_units_that_nobody_says_are_noted(head, tmp_path, capsys):
-    """Beside "passed", in the terminal and in JSON: a flight in feet that is judged in metres does not pass in silence."""
+    """Beside "passed", in the terminal and in JSON: a flight in feet is not judged in metres in silence."""
     width = head.count(",") + 1
     (tmp_path / "t.csv").write_text(
         head + "\n" + "".join(",".join([f"{0.1 * k:.1f}"] * width) + "\n" for k in range(40))

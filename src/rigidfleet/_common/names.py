@@ -38,6 +38,7 @@ _WORDS = {
     "q": "q quat quaternion orientation rotation attitude",
     "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
             "gyro mag torque force thrust gyr ang euler rpy bias w b",
+    "wanted": "ref reference setpoint sp target desired des cmd command goal",
     "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
     "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world",
     "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
@@ -52,10 +53,10 @@ _WORDS = {
 _FRAMES = {"enu": "enu", "ned": "ned", "nwu": "nwu", "neu": "neu", "flu": "enu", "frd": "esd"}
 _IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}
-#: Words for places that are wanted, not those of a vehicle.
-ROLES = frozenset("ref reference setpoint sp target desired des cmd command goal".split())
+#: Words for places that are wanted, or for no places, beside those of a vehicle.
+ROLES = _IS["none"] | _IS["wanted"]
 #: A letter alone, and what a quantity is nothing without: an acceleration without a velocity, ...
-_LETTER, _AFTER = r"(?<![^\W_])[a-z](?![^\W_])", {"a": "vx", "j": "ax", "q": "qw"}
+_LETTER, _AFTER = r"(?<![^\W_])[a-z]\d*(?![^\W_])", {"a": "vx", "j": "ax", "q": "qw"}
 _HUES = {"r": "red", "g": "green", "b": "blue"}
 _DIMENSIONS = {"": "length", "v": "length/time", "a": "length/time2", "j": "length/time3"}
 
@@ -162,7 +163,7 @@ def of_columns(names: Sequence[str]) -> list[Quantity]:
     """The quantities of all columns of a table.
 
     A letter such as a, v or b beside three axes is a quantity (`a_x`: an acceleration). It is a vehicle, perhaps one
-    that is not read, where others written alike are vehicles (`x_a`, `x_b`, `x_cf1`), or the quantity says nothing here.
+    that is not read, where others written alike are vehicles (`x_a`, `x_cf1`), or the quantity says nothing here.
     """
     kinds = [quantity_of(name) for name in names]
     known, place = {q.kind for q in kinds}, {name.lower(): k for k, name in enumerate(names)}
@@ -171,27 +172,30 @@ def of_columns(names: Sequence[str]) -> list[Quantity]:
         for cut in re.finditer("x", name):
             ends = name[: cut.start()], name[cut.end() :]
             own = [place.get(axis.join(ends), -1) for axis in "xyz"]
-            letters = re.findall(_LETTER, re.sub(r"[\[(].*|_m$", "", " ".join(ends)))
+            words = re.findall(r"[^\W_]+", re.sub(r"[\[(].*|_m$", "", " ".join(ends)))
+            letters = [word for word in words if re.fullmatch(r"[a-z]\d*", word)]
             if -1 not in own:
-                rest = re.sub(_LETTER, "", "X".join(ends), count=1)
+                unit = quantity_of(re.sub(_LETTER, "", "X".join(ends), count=1)).unit
                 same = alike.setdefault(re.sub(r"[^\W_]+", "a", " ".join(ends)), {})
-                same[letters[0] if len(letters) == 1 else "".join(ends)] = own, quantity_of(rest).unit
+                same[letters[0] if len(letters) == 1 else "".join(words)] = own, unit
     for shape, same in alike.items():
         whose = {kinds[own[0]].who for own, _ in same.values() if kinds[own[0]].kind == "x"}
-        vehicles = bool(whose - ROLES - _IS["agent"] - {""}) and not {"p", "v"} <= same.keys()
-        vehicles |= not known & {"x", *DIRECTIONS} and len(same) > 1 and bool(same.keys() - {*"vajqw"})
+        letters = {word[:1] for word in same}
+        vehicles = whose - ROLES - _IS["agent"] - {""} and not {"p", "v"} <= letters
+        lost = len(same) > 1 and letters - {*"vajqw"} and not known & {"x", *DIRECTIONS}
         first = shape.startswith(" ") and "" not in whose
-        for letter, (own, unit) in same.items():
+        for word, (own, unit) in same.items():
             kind = kinds[own[0]].kind
             lone = not kind or first or _AFTER.get(kind[0], kind) not in known
-            if len(letter) == 1 and (vehicles or lone):
+            short = re.fullmatch(r"[a-z]\d*", word)
+            if (vehicles and not kind) or (short and (vehicles or lost or lone)):
                 for k, axis in zip(own, "xyz", strict=True):
-                    kinds[k] = Quantity(axis, unit, letter)
+                    kinds[k] = Quantity(axis, unit, word)
     return kinds
 
 
 def understood(names: Sequence[str]) -> int:
     """How many of a line's fields are names of columns; 0 if it has no place and nothing else besides."""
-    kinds = [kind for name in names if (kind := quantity_of(name).kind)]
+    kinds = [q.kind for q in of_columns(names) if q.kind]
     places = {*DIRECTIONS, "x", "y", "latitude", "x^0"}
     return len(kinds) if len(kinds) > 1 and places & {*kinds} else 0

@@ -116,8 +116,9 @@ def assess(
             axes=axes,
         )
         result = of_curves(
-            read.curves, read.assumed, names=read.names, away=read.away, mission=mission, separation=separation,
-            limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground, name=_name(files[0]),
+            read.curves, read.assumed, names=read.names, away=read.away, since=read.since, mission=mission,
+            separation=separation, limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground,
+            name=_name(files[0]),
         )  # fmt: skip
         result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     verdict = judge(result)

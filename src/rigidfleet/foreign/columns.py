@@ -26,6 +26,9 @@ _CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
 _SLOW, _FAST, _WIDE, _CALM = 0.1, 40.0, 500.0, 5.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
 _SHORTER = 0.5
+#: Rows of a vehicle, at least, where a column that is no name of one tells them apart; and the step in time and place
+#: from one part of a flight to the next, in greatest ones within them.
+_ROWS, _CONTINUES = 3, 5.0
 #: Numbers of vehicles that may take turns, and rows by which this is seen.
 _TURNS, _FIRST = range(2, 17), 1000
 #: Words for what a row may say of itself; for units in a line.
@@ -271,7 +274,9 @@ def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
     for who, own in flown.items():
         columns = [table.names[k] for k in own.place]
         if who and quantity_of(columns[0]).who != who.lower():
-            notes.append(f"the columns {', '.join(columns)} are read as places of a vehicle {who!r}")
+            notes.append(
+                f"the columns {', '.join(columns)} are read as places of a vehicle {who!r}"
+            )
     return flown
 
 
@@ -299,7 +304,7 @@ def _vehicles(
         if (
             kinds[k] in ("agent", "thing")
             and not counts
-            and not (thing and alone and _follow(code))
+            and not (thing and alone and _follow(code, time, place))
         ):
             named.append(k)
             if "" in labels:
@@ -310,7 +315,9 @@ def _vehicles(
     chosen = next(([k] for k in named if _increases(time, coded[k][0])), named)
     part = _both(part, *(coded[k][0] for k in chosen))
     few = [k for k in coded if k not in named and 1 < len(coded[k][1]) <= n / 2]
+    few = [k for k in few if not table.has_unit(k) and not _measures(coded[k][1])]
     others = {k: _both(part, coded[k][0]) for k in few}
+    others = {k: both for k, both in others.items() if _ROWS * (both.max() + 1) <= n}
     if unclear := not _increases(time, part):
         apart = {k: both for k, both in others.items() if _increases(time, both)}
     else:
@@ -371,9 +378,17 @@ def _counts(labels: list[str], rows: int) -> bool:
     return rows > 1 and len(whole) == rows and np.ptp(np.diff(whole)) == 0
 
 
-def _follow(code: Ints) -> bool:
-    """Whether what is coded follows each other, as words for parts of a flight do."""
-    return bool((np.diff(code) != 0).sum() == code.max())
+def _measures(labels: list[str]) -> bool:
+    """Whether labels are numbers of which some are not whole, as names are not."""
+    return all(map(is_number, labels)) and not all(x.strip("-+").isdecimal() for x in labels)
+
+
+def _follow(code: Ints, time: Floats, place: Floats) -> bool:
+    """Whether what is coded follows each other on one way, as words for parts of a flight do."""
+    change = np.diff(code) != 0
+    steps = np.column_stack([np.diff(time), np.linalg.norm(np.diff(place, axis=0), axis=1)])
+    usual = np.max(steps[~change], axis=0, initial=0.0)
+    return bool(change.sum() == code.max() and (steps[change] <= _CONTINUES * usual).all())
 
 
 def yaws(quaternions: Floats) -> Floats:
@@ -423,7 +438,7 @@ def _yaw(table: Table, yaw: Floats, time: Floats, rows: Ints, notes: list[str]) 
 
 def _doubts(table: Table, tracks: list[Track], *, axes: bool) -> Iterator[str]:
     """What is assumed of units, and what looks as if it had other units or axes."""
-    place, time = (np.concatenate([track[k] for track in tracks]) for k in (3, 2))
+    place = np.concatenate([track.place for track in tracks])
     top, bottom = place[:, 2].max(), place[:, 2].min()
     if not axes and top <= 0.1 and bottom < -0.5:
         why = f"all heights are at or below 0, down to {bottom:.4g} m"

@@ -55,6 +55,7 @@ class Trajectories(NamedTuple):
     notes : what a reader of the verdict should know, in sentences without a full stop
     read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
     away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
+    since : seconds since 1970 from which times count; 0 if they are no dates
     """
 
     names: tuple[str, ...]
@@ -63,6 +64,7 @@ class Trajectories(NamedTuple):
     notes: tuple[str, ...] = ()
     read: tuple[dict[str, Any], ...] = ()
     away: bool = False
+    since: float = 0.0
 
 
 def read_trajectories(
@@ -118,8 +120,12 @@ def read_trajectories(
     names = [name for part in parts for name in part.names]
     sources = [group[0] for part, group in zip(parts, listed, strict=True) for _ in part.names]
     if len(set(names)) < len(names):
-        names = [f"{group[0].stem}" if len(part.names) == 1 else f"{group[0].stem}/{name}"
-                 for part, group in zip(parts, listed, strict=True) for name in part.names]  # fmt: skip
+        stems = [group[0].stem for group in listed]
+        # Tables of one name are told apart by their folders.
+        files = [group[0].stem if stems.count(stem) == 1 else group[0].resolve().parent.name
+                 for stem, group in zip(stems, listed, strict=True)]  # fmt: skip
+        names = [file if len(part.names) == 1 else f"{file}/{name}"
+                 for part, file in zip(parts, files, strict=True) for name in part.names]  # fmt: skip
     if len(set(names)) < len(names):
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
@@ -129,7 +135,8 @@ def read_trajectories(
         notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
     sampled = parts[0].assumed in ASSUMED.values()
     away = spans == "away" or (sampled and spans == "refuse")
-    read = Trajectories(tuple(names), curves, parts[0].assumed, (), _alike(parts), away)
+    since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
+    read = Trajectories(tuple(names), curves, parts[0].assumed, (), _alike(parts), away, since)
     notes += _doubts(read, sources, spans, gaps) if sampled else []
     return read._replace(notes=(*left_out, *notes, *_spans(read)))
 
@@ -185,7 +192,7 @@ def files_of(path: Path) -> list[list[Path]]:
     """
     if not path.is_dir():
         return [[path]]
-    inside = sorted(path.iterdir(), key=_order)
+    inside = [p for p in sorted(path.iterdir(), key=_order) if not _is_hidden(p)]
     kinds = {p.suffix.lower() for p in inside if p.is_file()} & _SUFFIXES
     if len(kinds) > 1:
         raise TrajectoryError(
@@ -195,7 +202,11 @@ def files_of(path: Path) -> list[list[Path]]:
         return [[p] for p in inside if p.suffix.lower() in kinds and p.is_file()]
     folders = [p for p in inside if p.is_dir()]
     groups = [
-        [p for p in sorted(folder.iterdir(), key=_order) if p.suffix.lower() == ".csv"]
+        [
+            p
+            for p in sorted(folder.iterdir(), key=_order)
+            if p.suffix.lower() == ".csv" and not _is_hidden(p)
+        ]
         for folder in folders
     ]
     if not groups or not all(groups):
@@ -226,7 +237,7 @@ def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
     read = {p for group in listed for p in group}
     rest = [p for p in sorted(path.rglob("*"), key=_order) if p.is_file() and p not in read]
     for p in rest:
-        hidden = p.suffix.lower() in _SUFFIXES
+        hidden = p.suffix.lower() in _SUFFIXES and not _is_hidden(p)
         with suppress(TrajectoryError):
             hidden = hidden or bool(_of_file(p, "linear", units_of(None, None)))
         if hidden:
@@ -236,6 +247,11 @@ def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
             )
     names = _some([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
+
+
+def _is_hidden(path: Path) -> bool:
+    """Whether a file or folder is no one's own, as what systems put beside others."""
+    return path.name.startswith((".", "__MACOSX"))
 
 
 def _some(things: Sequence[object]) -> str:
@@ -369,8 +385,11 @@ def _doubts(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -
         holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
         moves = np.linalg.norm(np.diff(curve.pieces[:, :3, 0], axis=0), axis=1)
         moving = np.flatnonzero(moves > 1e-9)
-        fast = moves[moving] > 0.5 * np.median(moves[moving]) if len(moving) else moving > 0
-        for k in np.flatnonzero((np.diff(moving) > _REPEATED) & fast[:-1] & fast[1:]).tolist():
+        # A vehicle that stood begins to move by ever longer steps, or was slow before, too.
+        sizes = np.append(moves[moving], np.inf)
+        fast = sizes > 0.5 * np.median(sizes)
+        odd = (fast[:-2] & fast[1:-1]) | (sizes[1:-1] > 1.5 * sizes[2:])
+        for k in np.flatnonzero((np.diff(moving) > _REPEATED) & odd).tolist():
             start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]
             frozen.append(f"{name!r} from {start:g} to {stop:g} s")
     notes = []

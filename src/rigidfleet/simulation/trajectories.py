@@ -241,6 +241,7 @@ def of_curve(
     *,
     names: Sequence[str] = (),
     spans: Sequence[Sequence[float]] = (),
+    since: float = 0.0,
     **judged: Any,
 ) -> Result:
     """A result of a curve (K, N, 4, P) of x, y, z [m] and yaw [rad]; see `trajectories`. Yaw is NaN if it is not known.
@@ -250,12 +251,13 @@ def of_curve(
     interpolation : what the curves are, in words
     names : of the vehicles, where they come from
     spans : from when to when [s] each vehicle is there; empty: all always are
+    since : time of another clock from which times count [s]; no clock of obstacles that move, unless it is 0
     judged : see `judged_as`
 
     Raises
     ------
     ResultError
-        A vehicle jumps, or there are too many numbers.
+        A vehicle jumps, there are too many numbers, or obstacles move by another clock.
     MissionError
         A limit is invalid.
     """
@@ -270,9 +272,10 @@ def of_curve(
     _refuse_too_many(n, int(parts.sum()) + 1)
     start = curve.at(time[:1])[0, :, :3]
     mission = judged_as(start, span, **judged)
-    if zero and any(thing.solid.moves for thing in mission.obstacles):
+    if (zero or since) and any(thing.solid.moves for thing in mission.obstacles):
         raise ResultError(
-            f"the trajectories begin at {zero:.9g} s, and obstacles move from 0 s on. Let both count from one zero."
+            f"the trajectories begin at {since + zero:.12g} s, and obstacles move from 0 s on. Let both count from one "
+            "zero."
         )
     watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, float(time[0]))
     # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
