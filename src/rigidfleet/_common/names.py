@@ -54,7 +54,7 @@ _FRAMES = {"enu": "enu", "ned": "ned", "nwu": "nwu", "neu": "neu", "flu": "enu",
 _IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}
 #: Words for places that are wanted, or for no places, beside those of a vehicle.
-ROLES = _IS["none"] | _IS["wanted"]
+ROLES = _IS["none"] - {"w", "b"} | _IS["wanted"]
 #: A letter alone, and what a quantity is nothing without: an acceleration without a velocity, ...
 _LETTER, _AFTER = r"(?<![^\W_])[a-z]\d*(?![^\W_])", {"a": "vx", "j": "ax", "q": "qw"}
 _HUES = {"r": "red", "g": "green", "b": "blue"}
