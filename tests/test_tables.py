@@ -154,7 +154,6 @@ SAME = {
     "dates with a zone": dated(
         lambda t: f"2024-05-01T12:00:{int(t):02d}.{int(t % 1 * 1e9):09d}+02:00"
     ),
-    "hours": dated(lambda t: f"0:00:{t:05.2f}"),
     "CR": (HEAD + lines(plain)).replace("\n", "\r"),
     "CRLF": (HEAD + lines(plain)).replace("\n", "\r\n"),
     "a duration": HEAD.strip() + ",duration\n" + lines(lambda *v: plain(*v) + ",0.5"),
@@ -417,11 +416,11 @@ def test_words_that_contradict_are_refused(said, cause, tmp_path):
         (1, 0.3, ""),
         (0.1, 0.001, ""),
         (1, 15, ""),
-        (1, 50, "50"),
+        (1, 50, ""),
     ],
 )
-def test_units_are_doubted_both_ways(step, way, note, tmp_path):
-    """What was taken is said, and speeds far below or above those of vehicles are in doubt; what is usual is not."""
+def test_units_are_in_doubt_where_nothing_moves(step, way, note, tmp_path):
+    """What was taken is said, and speeds far below those of vehicles are in doubt; what is usual is not."""
     rows = "".join(f"{step * k},{way * k},0,5\n" for k in range(60))
     (tmp_path / "t.csv").write_text("time,x,y,z\n" + rows)
     (said,) = read_trajectories(tmp_path / "t.csv").notes

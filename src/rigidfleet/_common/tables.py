@@ -129,12 +129,6 @@ class Table:
             raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
         return known[0][1]
 
-    def has_unit(self, k: int) -> bool:
-        """Whether the name of a column ends with a unit: it is a quantity, be it understood or not."""
-        return re.search(r"[\[(].*[\])]\s*$", self.names[k]) is not None or (
-            unit_of(self.names[k].rpartition("_")[2]) is not None and "_" in self.names[k]
-        )
-
     def place(self, *kinds: str, who: str = "") -> list[int]:
         """Columns of some quantities; empty unless all are there."""
         columns = [self.places.get((kind, who), -1) for kind in kinds]

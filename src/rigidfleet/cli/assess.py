@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rigidfleet.cli import console, drawing
 from rigidfleet.cli.codes import FAILED, PASSED
@@ -13,6 +13,8 @@ from rigidfleet.errors import RigidfleetError
 
 #: Options that a mission replaces.
 _OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
+#: Options that say how files are read.
+_READ = ("interpolation", "spans", "gaps", "units", "axes")
 
 
 def assess(
@@ -85,7 +87,7 @@ def assess(
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
     if out is not None:
         drawing.prepare()
-    given = {
+    given: dict[str, Any] = {
         "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
         "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
         "units": units, "axes": axes,
@@ -107,14 +109,7 @@ def assess(
             told = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
             raise RigidfleetError(told)
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        read = read_trajectories(
-            files,
-            interpolation or "cubic",
-            spans=spans or "refuse",
-            gaps=gaps or "refuse",
-            units=units,
-            axes=axes,
-        )
+        read = read_trajectories(files, **{key: given[key] for key in _READ if key in chosen})
         result = of_curves(
             read.curves, read.assumed, names=read.names, away=read.away, since=read.since, mission=mission,
             separation=separation, limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground,

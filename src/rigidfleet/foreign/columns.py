@@ -20,14 +20,12 @@ _TUM = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 #: Seconds since 1970 of stamps that are dates: 2001 to 2096; and units in which they are counted without saying so.
 _DATES, _TICKS = (10**9, 4 * 10**9), ("s", "ms", "us", "ns")
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
-_CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
-#: Greatest speed that is doubted where steps are a second or longer, ten times that from ten seconds on, and the least
-#: one that is doubted; places that are doubted where they are whole numbers and all are slower [m/s, m, m/s].
-_SLOW, _FAST, _WIDE, _CALM = 0.1, 40.0, 500.0, 5.0
+#: Greatest speed of a flight that is doubted, if steps are so long [m/s, s].
+_SLOW, _LONG = 0.1, 1.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
 _SHORTER = 0.5
-#: Rows of a vehicle, at least, where a column that is no name of one tells them apart; and the step in time and place
-#: from one part of a flight to the next, in greatest ones within them.
+#: Rows of a part, on average, from which on its way is no shorter because it is a part (that of a heading, a battery);
+#: and the greatest step in time and place from one part of a flight to the next, in those within parts.
 _ROWS, _CONTINUES = 3, 5.0
 #: Numbers of vehicles that may take turns, and rows by which this is seen.
 _TURNS, _FIRST = range(2, 17), 1000
@@ -143,7 +141,7 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
         ticks.append(tick)
     unit, source = table.units["time"]
     if not number:
-        table.units["time"], unit = ("dates" if "-" in fields[0] else "h:min:s", "the file"), "s"
+        table.units["time"], unit = ("dates", "the file"), "s"
     elif not source:
         power = next((k for k in range(4) if _DATES[0] <= ticks[0] / 1000**k < _DATES[1]), 0)
         unit = _TICKS[power]
@@ -158,7 +156,7 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
 
 
 def _tick(field: str) -> Decimal | None:
-    """A number, or a date as seconds since 1970, or a time of a day as seconds."""
+    """A number, or a date as seconds since 1970."""
     if date := _ISO.fullmatch(field):
         try:
             moment = datetime.fromisoformat(
@@ -167,8 +165,6 @@ def _tick(field: str) -> Decimal | None:
         except ValueError:
             return None
         return Decimal(int(moment.timestamp())) + Decimal(f"0.{date[3] or 0}")
-    if clock := _CLOCK.fullmatch(field):
-        return 3600 * int(clock[1]) + 60 * int(clock[2]) + Decimal(clock[3].replace(",", "."))
     plain = field.replace(",", ".")
     return Decimal(plain) if is_number(field) and Decimal(plain).is_finite() else None
 
@@ -315,7 +311,6 @@ def _vehicles(
     chosen = next(([k] for k in named if _increases(time, coded[k][0])), named)
     part = _both(part, *(coded[k][0] for k in chosen))
     few = [k for k in coded if k not in named and 1 < len(coded[k][1]) <= n / 2]
-    few = [k for k in few if not table.has_unit(k) and not _measures(coded[k][1])]
     others = {k: _both(part, coded[k][0]) for k in few}
     others = {k: both for k, both in others.items() if _ROWS * (both.max() + 1) <= n}
     if unclear := not _increases(time, part):
@@ -376,11 +371,6 @@ def _counts(labels: list[str], rows: int) -> bool:
     """Whether labels only number the rows."""
     whole = [int(label) for label in labels if re.fullmatch(r"-?\d{1,15}", label)]
     return rows > 1 and len(whole) == rows and np.ptp(np.diff(whole)) == 0
-
-
-def _measures(labels: list[str]) -> bool:
-    """Whether labels are numbers of which some are not whole, as names are not."""
-    return all(map(is_number, labels)) and not all(x.strip("-+").isdecimal() for x in labels)
 
 
 def _follow(code: Ints, time: Floats, place: Floats) -> bool:
@@ -456,13 +446,11 @@ def _doubts(table: Table, tracks: list[Track], *, axes: bool) -> Iterator[str]:
     with np.errstate(all="ignore"):
         ways = [np.linalg.norm(np.diff(track.place, axis=0), axis=1) for track in tracks]
     steps = np.concatenate([np.diff(track.time) for track in tracks])
-    step = float(np.median(steps)) if steps.size else 0.0
     fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
-    slow = step >= 1.0 and 0.0 < fastest < _SLOW * (10.0 if step >= 10.0 else 1.0)
-    slow &= max(map(np.sum, ways)) > _SLOW and not table.units["time"][1]
-    whole = (place == np.round(place)).all() and np.abs(place).max() > _WIDE
-    fast = (fastest > _FAST or (whole and fastest < _CALM)) and not table.units["length"][1]
-    if slow or fast:
-        note += f", so that speeds reach {fastest:.3g} m/s. Name columns such as time_ms and x_mm, or say --units"
-        note = Doubt(f"{note} ms or s, mm or m")
+    moves = max(map(np.sum, ways)) > _SLOW and float(np.median(steps)) >= _LONG
+    if moves and fastest < _SLOW and not table.units["time"][1]:
+        note += f", so that speeds reach {fastest:.3g} m/s"
+        note = Doubt(
+            f"{note}. Name columns such as time_ms and x_mm, or say --units ms or s, mm or m"
+        )
     yield note
