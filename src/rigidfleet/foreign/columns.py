@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from datetime import datetime
+from datetime import UTC, datetime
 from decimal import Decimal
 from typing import Any, NamedTuple
 
@@ -19,7 +19,6 @@ from rigidfleet.typing import Floats, Ints
 _TUM = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 #: Seconds since 1970 of stamps that are dates: 2001 to 2096; and units in which they are counted without saying so.
 _DATES, _TICKS = (10**9, 4 * 10**9), ("s", "ms", "us", "ns")
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:[.,](\d+))?\s*(Z|[-+]\d\d:?\d\d)?")
 #: Greatest speed of a flight that is doubted, if steps are so long [m/s, s].
 _SLOW, _LONG = 0.1, 1.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
@@ -157,16 +156,15 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
 
 def _tick(field: str) -> Decimal | None:
     """A number, or a date as seconds since 1970."""
-    if date := _ISO.fullmatch(field):
-        try:
-            moment = datetime.fromisoformat(
-                f"{date[1]}T{date[2]}{(date[4] or 'Z').replace('Z', '+00:00')}"
-            )
-        except ValueError:
-            return None
-        return Decimal(int(moment.timestamp())) + Decimal(f"0.{date[3] or 0}")
-    plain = field.replace(",", ".")
-    return Decimal(plain) if is_number(field) and Decimal(plain).is_finite() else None
+    if is_number(field):
+        plain = Decimal(field.replace(",", "."))
+        return plain if plain.is_finite() else None
+    try:
+        moment = datetime.fromisoformat(field)
+    except ValueError:
+        return None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return Decimal(round(1e6 * moment.timestamp())).scaleb(-6)
 
 
 def read_tracks(

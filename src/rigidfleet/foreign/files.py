@@ -268,17 +268,14 @@ def _order(path: Path) -> list[tuple[int, str]]:
 
 def _of_sequence(group: list[Path], interpolation: Interpolation, units: Units) -> Trajectories:
     """What is in the file of a vehicle, or in several that it flies one after the other."""
-    first, *others = (_of_file(path, interpolation, units) for path in group)
+    first, *others = parts = [_of_file(path, interpolation, units) for path in group]
     if not others:
         return first
-    if first.assumed != texts.POLYNOMIALS:
+    if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
         raise TrajectoryError(
             f"{group[0]}: only tables of polynomials follow each other. Give a folder with one table a vehicle."
         )
-    curve, *more = (part.curves[0] for part in (first, *others))
-    for path, part in zip(group[1:], others, strict=True):
-        if part.assumed != first.assumed:
-            raise TrajectoryError(f"{path}: is of another kind than {group[0]}.")
+    curve, *more = (part.curves[0] for part in parts)
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
         curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
