@@ -135,7 +135,7 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
     ticks, _ = [], table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
         if (tick := _tick(field)) is None:
-            why = f"{table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
+            why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
             raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
         ticks.append(tick)
     unit, source = table.units["time"]
