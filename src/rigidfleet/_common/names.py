@@ -172,12 +172,13 @@ def of_columns(names: Sequence[str]) -> list[Quantity]:
         for cut in re.finditer("x", name):
             ends = name[: cut.start()], name[cut.end() :]
             own = [place.get(axis.join(ends), -1) for axis in "xyz"]
+            if -1 in own:
+                continue
             words = re.findall(r"[^\W_]+", re.sub(r"[\[(].*|_m$", "", " ".join(ends)))
             letters = [word for word in words if re.fullmatch(r"[a-z]\d*", word)]
-            if -1 not in own:
-                unit = quantity_of(re.sub(_LETTER, "", "X".join(ends), count=1)).unit
-                same = alike.setdefault(re.sub(r"[^\W_]+", "a", " ".join(ends)), {})
-                same[letters[0] if len(letters) == 1 else "".join(words)] = own, unit
+            unit = quantity_of(re.sub(_LETTER, "", "X".join(ends), count=1)).unit
+            same = alike.setdefault(re.sub(r"[^\W_]+", "a", " ".join(ends)), {})
+            same[letters[0] if len(letters) == 1 else "".join(words)] = own, unit
     for shape, same in alike.items():
         whose = {kinds[own[0]].who for own, _ in same.values() if kinds[own[0]].kind == "x"}
         letters = {word[:1] for word in same}
