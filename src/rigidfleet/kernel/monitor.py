@@ -28,6 +28,7 @@ from rigidfleet.kernel.bernstein import (
     point_at,
     shortest,
     shortest_above,
+    span_of,
     square,
     weights,
 )
@@ -248,11 +249,7 @@ def bound_moves(points, p, monitor):
 @compiled
 def put(curve, ball):
     """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
-    far = 0.0
-    for k in range(5):
-        x, y, z = curve[k, 0] - curve[2, 0], curve[k, 1] - curve[2, 1], curve[k, 2] - curve[2, 2]
-        far = max(far, x * x + y * y + z * z)
-    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], math.sqrt(far)
+    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
 
 
 @compiled

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.problem import SHAPE, Motion, Reference
-from rigidfleet.math import pid, rigid_body
+from rigidfleet.math import rigid_body
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import seconds
@@ -239,16 +239,7 @@ def ending(mission: Mission, phase: Phase, begin: float) -> float:
     elif phase.duration is not None:
         t = begin + seconds(phase.duration)
     elif phase.settle is not None:
-        least = phase.least_time + _settling(mission) + phase.settle.dwell
+        settling = mission.constraint.settling_time or 0.0
+        least = phase.least_time + settling + phase.settle.dwell
         t = begin + min(phase.settle.timeout, least)
     return max(t, begin + 1e-6)
-
-
-def _settling(mission: Mission) -> float:
-    c = mission.constraint
-    if c.stabilisation == "none":
-        return 0.0
-    try:
-        return pid.settling_time(c.alpha, c.beta, c.gamma)
-    except ValueError:
-        return 0.0
