@@ -121,25 +121,13 @@ def planned_phase(found: Leg, most: int, radius: Floats) -> PlannedPhase:
     begin, end, reference = found.begin, found.end, found.reference
     count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
     time = np.linspace(begin, end, count)
-    position, velocity, acceleration = slot_derivatives(reference, found.motion, time, 3).swapaxes(
-        0, 1
-    )
+    states = slot_derivatives(reference, found.motion, time, 3).swapaxes(0, 1)
     shaping = found.phase.shaping
     straight = shaping is not None and not len(reference.knots)
     ways = (reference.p0, reference.p0 + reference.dp) if straight else None
     shapes = found.before.formation, found.after.formation
-    return PlannedPhase(
-        found.phase.name,
-        time,
-        position,
-        velocity,
-        acceleration,
-        found.exact,
-        found,
-        radius,
-        ways,
-        shapes,
-    )
+    name, exact = found.phase.name, found.exact
+    return PlannedPhase(name, time, *states, exact, found, radius, ways, shapes)
 
 
 def at_start(mission: Mission) -> PhaseState:

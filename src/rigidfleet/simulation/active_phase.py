@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
+from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without
@@ -421,10 +422,17 @@ class ActivePhase:
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        integral, led = samples[:, 6 * n : 6 * n + m], self._led(times)
+        self.keep(times, given, samples[:, 6 * n : 6 * n + m], frame)
+
+    def keep(self, times: Floats, given: Record | Unevaluated, *more: Any) -> None:
+        """Store a piece of the phase, of which ``more`` are integrals, frames and further fields of `Piece`."""
+        plan, (integral, frame, *rest) = self.plan, more
         self.pieces.append(
-            Piece(self.index, times, given, integral, frame, plan.edges, plan.attached, led)
-        )
+            Piece(
+                self.index, times, given, integral, frame, plan.edges, plan.attached,
+                self._led(times), *rest,
+            )
+        )  # fmt: skip
 
     def _led(self, times: Floats) -> Led:
         """What the slots follow at the samples, if they are tracked."""
