@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.simulation.recording import Led, Piece, Unevaluated
+from rigidfleet.simulation.recording import LayerSamples, Led, Piece, Unevaluated, VehicleSamples
 from rigidfleet.simulation.solver_setup import (
     equip,
     first_step,
@@ -424,15 +424,21 @@ class ActivePhase:
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
         self.keep(times, given, samples[:, 6 * n : 6 * n + m], frame)
 
-    def keep(self, times: Floats, given: Record | Unevaluated, *more: Any) -> None:
-        """Store a piece of the phase, of which ``more`` are integrals, frames and further fields of `Piece`."""
-        plan, (integral, frame, *rest) = self.plan, more
+    def keep(
+        self,
+        times: Floats,
+        given: Record | Unevaluated,
+        integral: Floats,
+        frame: Floats,
+        vehicles: VehicleSamples | None = None,
+        layers: LayerSamples | None = None,
+    ) -> None:
+        """Store a piece of the phase."""
+        edges, attached = self.plan.edges, self.plan.attached
+        led = self._led(times)
         self.pieces.append(
-            Piece(
-                self.index, times, given, integral, frame, plan.edges, plan.attached,
-                self._led(times), *rest,
-            )
-        )  # fmt: skip
+            Piece(self.index, times, given, integral, frame, edges, attached, led, vehicles, layers)
+        )
 
     def _led(self, times: Floats) -> Led:
         """What the slots follow at the samples, if they are tracked."""
