@@ -331,19 +331,22 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
 def _separation(measured: Measurements, e: Extreme) -> CheckResult:
     limit = measured.mission.limits.separation_always or 0.0
     passed = e.value > 0 and e.value >= limit - SLACK
-    words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
-    words += f" (limit {limit:g} m)"
+    words = f"{_near(e)} (limit {limit:g} m)"
     if (first := measured.first_contact("separation", e)) is not None:
         words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
         words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
     return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
 
 
+def _near(e: Extreme) -> str:
+    return f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+
+
 def _flying(measured: Measurements, limit: float, altitude: float) -> CheckResult:
     """Check the separation of agents of which one is at the altitude from which on it holds."""
     e, words = measured.worst("separation_flying", None, lambda x: -x), "no two agents come as near"
     if e is not None:
-        words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+        words = _near(e)
     words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
     passed = e is None or e.value >= limit - SLACK
     return bounded("separation_flying", e, "m", limit, words, passed=passed, at_least=True)
@@ -370,7 +373,7 @@ def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[
     for off, record, phase in _beyond_or_greatest(every, allowed):
         e, planned = phase.worst["separation"], (record.planned or {})["separation"]
         words = (
-            f"in phase '{phase.name}' {e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s;"
+            f"in phase '{phase.name}' {_near(e)};"
             f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
         )
         e = replace(e, value=off)
@@ -410,8 +413,7 @@ def _lost(measured: Measurements) -> CheckResult:
     e = measured.fallen_on()
     if e is None:
         return bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
-    words = f"lost: {told}; after that, {e.who} come within {value(e.value, 'm')} of each other"
-    words += f" at {e.when:.2f} s"
+    words = f"lost: {told}; after that, {_near(e)}"
     if (first := measured.first_contact("lost", e)) is not None:
         words = f"lost: {told}; after that, {first.who} collide, first at {first.when:.2f} s"
     return bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first)

@@ -222,6 +222,16 @@ class Measurements:
             return between
         return between if sense(between.value) > sense(sampled.value) else sampled
 
+    def among(
+        self,
+        name: str,
+        values: Floats,
+        who: Callable[..., str] = agent,
+        sense: Callable[..., Any] = np.positive,
+    ) -> Extreme | None:
+        """The worst value of a flight, at its samples, ``values`` (K, ...), or between them."""
+        return self.worst(name, self.extreme(values, who, sense), sense)
+
     @cached_property
     def worst_of(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
@@ -242,7 +252,7 @@ class Measurements:
         """Greatest speed or acceleration in a direction, named as in `DIRECTIONS`; None if unknown."""
         way, what = name.split("_")
         x = getattr(self.result, what.replace("speed", "velocity"))
-        return self.worst(name, self.extreme(self.of_left(SIZES[way](x)), agent))
+        return self.among(name, self.of_left(SIZES[way](x)))
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -260,28 +270,23 @@ class Measurements:
         least, pair = proximity.headroom(
             self.result.position, self.mission.agents.radius, self.left
         )
-        sampled = self.extreme(least, lambda k: agent_names(pair[k]), lambda x: -x)
-        return self.worst("separation_below", sampled, lambda x: -x)
+        return self.among("separation_below", least, lambda k: agent_names(pair[k]), np.negative)
 
     def outside(self, low: Floats, high: Floats) -> Extreme | None:
         """Greatest distance [m] of an agent's centre outside a box with these corners; negative inside."""
         r = self.result.position
         beyond = self.of_left(np.maximum(low - r, r - high).max(axis=2))
-        return self.worst("geofence", self.extreme(beyond, agent))
+        return self.among("geofence", beyond)
 
     def height(self, *, lowest: bool) -> Extreme | None:
         """Least or greatest altitude [m] of an agent's centre."""
-        z, sense = (
-            self.of_left(self.result.position[..., 2]),
-            np.negative if lowest else np.positive,
-        )
-        name = "lowest" if lowest else "highest"
-        return self.worst(name, self.extreme(z, agent, sense), sense)
+        name, sense = ("lowest", np.negative) if lowest else ("highest", np.positive)
+        return self.among(name, self.of_left(self.result.position[..., 2]), agent, sense)
 
     def nearest_to_limit(self) -> Extreme | None:
         """Thrust minus limit [N] of the agent nearest to its own limit, or furthest beyond it."""
         most = self.mission.fleet.thrust_limit
-        return self.worst("thrust_margin", self.extreme(self.thrust - most, agent))
+        return self.among("thrust_margin", self.thrust - most)
 
     def clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
@@ -308,14 +313,14 @@ class Measurements:
             "clearance_flight": (k >= first) & (k <= last) | beside,
             "clearance_end": (k >= first) & (k > last) & ~beside,
         }
-        found = {}
-        for name, part in parts.items():
-            values = np.where(part, clearance, np.nan)
-            sampled = self.extreme(
-                values, lambda k, i: self.beside(i, int(nearest[k, i])), lambda x: -x
-            )
-            found[name] = self.worst(name, sampled, lambda x: -x)
-        return found
+
+        def who(k: int, i: int) -> str:
+            return self.beside(i, int(nearest[k, i]))
+
+        return {
+            name: self.among(name, np.where(part, clearance, np.nan), who, np.negative)
+            for name, part in parts.items()
+        }
 
     def standing(self, k: Ints, i: Ints) -> Bools:
         """On which obstacles (B, M) agents i (M,) stand, or may stand if they stay, at samples k (M,)."""
@@ -341,8 +346,7 @@ class Measurements:
             closer &= np.isfinite(separation)
             least[closer] = separation[closer]
             who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
-        sampled = self.extreme(least, lambda k: agent_names(who[k]), lambda x: -x)
-        return self.worst("lost", sampled, lambda x: -x)
+        return self.among("lost", least, lambda k: agent_names(who[k]), np.negative)
 
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from rigidfleet._common.text import percent
-from rigidfleet.assessment.measure import Measurements, agent
+from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import SLACK, CheckResult, Extreme, bounded, value
 from rigidfleet.math import attitude as att
 from rigidfleet.result import LABELS
@@ -39,7 +39,7 @@ def tracking_check(measured: Measurements) -> Iterator[CheckResult]:
     limit = measured.mission.limits.tracking_error
     error = None
     if measured.result.interpolation is None:  # the curves of others are their own slots
-        error = measured.worst("tracking_error", measured.extreme(measured.off_slot, agent))
+        error = measured.among("tracking_error", measured.off_slot)
     if error is not None or limit is not None:
         yield bounded("tracking_error", error, "m", limit, "" if error else "no slots are tracked")
 
@@ -86,5 +86,5 @@ def _tilt(measured: Measurements) -> Extreme | None:
     assert result.vehicle_attitude is not None
     up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
     angle = measured.of_left(np.arccos(np.clip(up, -1.0, 1.0)))
-    e = measured.worst("tilt", measured.extreme(angle, agent))
+    e = measured.among("tilt", angle)
     return None if e is None else replace(e, value=math.degrees(e.value))

@@ -158,17 +158,13 @@ def _scene(file: Path, word: str, agents: int, spacing: float) -> Any:
 
     if word in SHAPES:
         return show_draft.scene(word, agents, spacing)
-    folder, there, own = file.parent.resolve(), Path(word).resolve(), _file_points(word)
-    count = agents if own is None else min(agents, len(own.slots))
-    whole = (
-        own is not None
-        and not own.notes
-        and count == len(own.slots)
-        and there.is_relative_to(folder)
-    )
-    if own and whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
-        source = there.relative_to(folder).as_posix()
-        return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
+    folder, there, count = file.parent.resolve(), Path(word).resolve(), agents
+    if (own := _file_points(word)) is not None:
+        whole = not own.notes and len(own.slots) <= agents and there.is_relative_to(folder)
+        if whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
+            source = there.relative_to(folder).as_posix()
+            return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
+        count = min(agents, len(own.slots))
     try:
         name, points = points_of(word, count, spacing=spacing)
     except ValueError as error:
@@ -182,11 +178,8 @@ def _file_points(word: str) -> Any:
     """The `Points` of a file; None for a drawing, words, or what is no file."""
     from rigidfleet.formation.point_files import read_points
 
-    return (
-        read_points(word, repeated=True)
-        if Path(word).suffix.lower() != ".svg" and Path(word).is_file()
-        else None
-    )
+    holds = Path(word).suffix.lower() != ".svg" and Path(word).is_file()
+    return read_points(word, repeated=True) if holds else None
 
 
 #: Number of agents of a show without any file of points.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.math.proximity import nearest
+from rigidfleet.math.proximity import all_pairs, nearest
 from rigidfleet.typing import Floats, Ints
 
 #: Reach of neighbours, in spacings: up to second neighbours on a shell or in a lattice.
@@ -25,12 +24,7 @@ CUBE_EDGES: Ints = np.array(
 
 def complete_graph(n: int) -> Ints:
     """All n (n - 1) / 2 edges (i, j), i < j, in lexical order, shape (m, 2)."""
-    return _complete_graph(n).copy()
-
-
-@lru_cache(8)
-def _complete_graph(n: int) -> Ints:
-    return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
+    return np.ascontiguousarray(all_pairs(n).T)
 
 
 def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:

@@ -118,6 +118,16 @@ def length_at(points, x):
 
 
 @compiled
+def span_of(curve):
+    """Radius [m] of the ball about the middle one of control points (5, 3) that holds all."""
+    far = 0.0
+    for k in range(5):
+        x, y, z = curve[k, 0] - curve[2, 0], curve[k, 1] - curve[2, 1], curve[k, 2] - curve[2, 2]
+        far = max(far, x * x + y * y + z * z)
+    return math.sqrt(far)
+
+
+@compiled
 def point_at(curve, x):
     """Point of a curve with control points (5, 3) at x."""
     y = 1.0 - x
@@ -231,17 +241,23 @@ def refine(bound, best, at, close, count, top, pieces):
 
 
 @compiled
-def nearest_box(curve, box, floor, pieces, normal):
-    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and its place; else -1."""
-    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
+def put_whole(curve, pieces):
+    """Put a curve with control points (5, 3) on an empty stack; returns the accuracy that its rounding allows [m]."""
+    close = CLOSE
     for k in range(5):
         for q in range(3):
             pieces[0, 3 * k + q] = curve[k, q]
+            close = max(close, _ROUNDING * abs(curve[k, q]))
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    return close
+
+
+@compiled
+def nearest_box(curve, box, floor, pieces, normal):
+    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and its place; else -1."""
+    best, at, top, count, close = floor, -1.0, 0, 0, put_whole(curve, pieces)
     if not beyond_plane(pieces[0], box, normal) < floor:
         return best, at
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
-    for k in range(15):
-        close = max(close, _ROUNDING * abs(pieces[0, k]))
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
@@ -256,12 +272,7 @@ def nearest_box(curve, box, floor, pieces, normal):
 @compiled
 def lowest_overlap(points, reach, floor, pieces):
     """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
-    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = points[k, q]
-            close = max(close, _ROUNDING * abs(points[k, q]))
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    best, at, top, count, close = floor, -1.0, 0, 0, put_whole(points, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
@@ -289,14 +300,9 @@ def lowest_overlap(points, reach, floor, pieces):
 @compiled
 def shortest_above(curve, own, other, altitude, floor, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
-    best, at, top, count, close, rate = floor, -1.0, 0, 0, CLOSE, 0.0
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = curve[k, q]
-            close = max(close, _ROUNDING * abs(curve[k, q]))
-        if k > 0:
-            rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    best, at, top, count, close, rate = floor, -1.0, 0, 0, put_whole(curve, pieces), 0.0
+    for k in range(1, 5):
+        rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
     while top >= 0:
         piece, count = pieces[top], count + 1
         a, b, c = piece[6], piece[7], piece[8]

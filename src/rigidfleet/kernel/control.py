@@ -4,7 +4,7 @@ import math
 
 from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.problem import BODY, SHAPE, TRACKING
-from rigidfleet.kernel.references import blend_slots
+from rigidfleet.kernel.references import blend_slots, piece_at
 from rigidfleet.kernel.rigid_body import (
     allocate,
     damp_deformation,
@@ -91,20 +91,6 @@ def rotate_after(E, T, out):
     for i in range(3):
         for j in range(3):
             out[i, j] = E[i, 0] * T[0, j] + E[i, 1] * T[1, j] + E[i, 2] * T[2, j]
-
-
-@inlined
-def piece_at(t, knots):
-    """Piece between knots (n + 1,) [s] at t, the time since it began, and the time since the last knot, or zero."""
-    low, high = 0, knots.shape[0] - 1
-    inside = min(t, knots[high])
-    while high - low > 1:
-        middle = (low + high) // 2
-        if knots[middle] <= t:
-            low = middle
-        else:
-            high = middle
-    return low, inside - knots[low], t - inside
 
 
 @inlined
@@ -197,23 +183,16 @@ def local_law(t, p, w):
 def body_gains(t, feedback, out):
     """Gains (4,) at t, from cubics through the table over the time to go; after arrival, the holding gains."""
     remaining = feedback.arrival - t
-    n = feedback.to_go.shape[0]
-    if remaining < 0.0 or n == 0:
+    if remaining < 0.0 or feedback.to_go.shape[0] == 0:
         for q in range(4):
             out[q] = feedback.hold[q]
         return
-    low, high = 0, n - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        if feedback.to_go[middle] <= remaining:
-            low = middle
-        else:
-            high = middle
-    h = feedback.to_go[high] - feedback.to_go[low]
-    s = min(1.0, (remaining - feedback.to_go[low]) / h)
+    low, since, _ = piece_at(remaining, feedback.to_go)
+    h = feedback.to_go[low + 1] - feedback.to_go[low]
+    s = since / h
     for q in range(4):
-        x0, x1 = feedback.gain[low, q], feedback.gain[high, q]
-        v0, v1 = h * feedback.slope[low, q], h * feedback.slope[high, q]
+        x0, x1 = feedback.gain[low, q], feedback.gain[low + 1, q]
+        v0, v1 = h * feedback.slope[low, q], h * feedback.slope[low + 1, q]
         rise = x1 - x0
         out[q] = x0 + s * (v0 + s * (3.0 * rise - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * rise)))
 

@@ -28,6 +28,7 @@ from rigidfleet.kernel.bernstein import (
     point_at,
     shortest,
     shortest_above,
+    span_of,
     square,
     weights,
 )
@@ -248,11 +249,7 @@ def bound_moves(points, p, monitor):
 @compiled
 def put(curve, ball):
     """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
-    far = 0.0
-    for k in range(5):
-        x, y, z = curve[k, 0] - curve[2, 0], curve[k, 1] - curve[2, 1], curve[k, 2] - curve[2, 2]
-        far = max(far, x * x + y * y + z * z)
-    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], math.sqrt(far)
+    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
 
 
 @compiled
@@ -283,56 +280,34 @@ def apart(i, j, axes, reach, monitor):
 
 @compiled
 def watch_pairs(kind, pairs, points, t, h, monitor):
-    """Least distance between the surfaces of pairs of agents (P, 2) over a step with control points (5, n)."""
+    """Least distance, or height, between the surfaces of pairs of agents (P, 2) over a step.
+
+    Distances, which no axes change, are those of the step's control points (5, n); heights, and distances while one
+    of the two is at the altitude that counts, are those of curves in world axes.
+    """
+    below, flying = kind == SEPARATION_BELOW, kind == SEPARATION_FLYING
+    axes, curve = 2 if below else 3, monitor.curve
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
         radii = monitor.radius[i] + monitor.radius[j]
         floor = monitor.worst[kind] + radii
-        if apart(i, j, 3, floor, monitor):
-            continue
-        for s in range(5):
-            for q in range(3):
-                monitor.curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
-        value, at = shortest(monitor.curve, floor, monitor.work, monitor.pieces)
-        if at >= 0.0:
-            take(kind, value - radii, t + at * h, i, j, monitor)
-
-
-@compiled
-def watch_stacks(t, h, monitor):
-    """Least height between the surfaces of two agents, one below the other, over a step."""
-    for k in range(monitor.columns.shape[0]):
-        i, j = monitor.columns[k, 0], monitor.columns[k, 1]
-        radii = monitor.radius[i] + monitor.radius[j]
-        if apart(i, j, 2, radii, monitor):
-            continue
-        for s in range(5):
-            for q in range(3):
-                monitor.curve[s, q] = monitor.places[i, s, q] - monitor.places[j, s, q]
-        floor = monitor.worst[SEPARATION_BELOW] + radii
-        value, at = lowest_overlap(monitor.curve, radii, floor, monitor.pieces)
-        if at >= 0.0:
-            take(SEPARATION_BELOW, value - radii, t + at * h, i, j, monitor)
-
-
-@compiled
-def watch_flying(t, h, monitor):
-    """Least distance between the surfaces of two agents over a step, while one is at the altitude that counts."""
-    for k in range(monitor.pairs.shape[0]):
-        i, j = monitor.pairs[k, 0], monitor.pairs[k, 1]
-        radii = monitor.radius[i] + monitor.radius[j]
-        floor = monitor.worst[SEPARATION_FLYING] + radii
-        if apart(i, j, 3, floor, monitor):
+        if apart(i, j, axes, radii if below else floor, monitor):
             continue
         own, other = monitor.places[i], monitor.places[j]
         for s in range(5):
             for q in range(3):
-                monitor.curve[s, q] = own[s, q] - other[s, q]
-        value, at = shortest_above(
-            monitor.curve, own, other, monitor.altitude, floor, monitor.pieces
-        )
+                if below or flying:
+                    curve[s, q] = own[s, q] - other[s, q]
+                else:
+                    curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
+        if below:
+            value, at = lowest_overlap(curve, radii, floor, monitor.pieces)
+        elif flying:
+            value, at = shortest_above(curve, own, other, monitor.altitude, floor, monitor.pieces)
+        else:
+            value, at = shortest(curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
-            take(SEPARATION_FLYING, value - radii, t + at * h, i, j, monitor)
+            take(kind, value - radii, t + at * h, i, j, monitor)
 
 
 @compiled
@@ -509,10 +484,9 @@ def watch_distances(row, p, state, monitor):
                     watch_coordinate(GEOFENCE, curve, q, -1.0, -high, start, h, i, monitor)
             if monitor.boxes.shape[0] > 0:
                 watch_obstacles(i, curve, start, h, part == parts - 1, monitor)
-        if monitor.columns.shape[0] > 0:
-            watch_stacks(start, h, monitor)
+        watch_pairs(SEPARATION_BELOW, monitor.columns, points, start, h, monitor)
         if monitor.altitude < math.inf:
-            watch_flying(start, h, monitor)
+            watch_pairs(SEPARATION_FLYING, monitor.pairs, points, start, h, monitor)
 
 
 # -- forces ------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.bernstein import CLOSE, point_at, refine
+from rigidfleet.kernel.bernstein import point_at, put_whole, refine, span_of
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.monitor import (
@@ -41,8 +41,6 @@ from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 #: Length of the shortest piece of a step.
 _SHORTEST = 2.0**-32
-#: Rounding error, as a share of a number's size.
-_ROUNDING = 4e-15
 #: Greatest rotation of one piece of a step in the body formulation [rad].
 _TURN = 0.1
 
@@ -116,12 +114,7 @@ def bound_of(piece, b, triangle, s):
 @compiled
 def nearest_along(curve, b, triangle, floor, pieces, s):
     """Least distance of a curve with control points (5, 3) if below ``floor``, and its place; otherwise -1."""
-    best, at, top, count, close = floor, -1.0, 0, 0, CLOSE
-    for k in range(5):
-        for q in range(3):
-            pieces[0, 3 * k + q] = curve[k, q]
-            close = max(close, _ROUNDING * abs(curve[k, q]))
-    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    best, at, top, count, close = floor, -1.0, 0, 0, put_whole(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         bound = bound_of(piece, b, triangle, s)
@@ -142,11 +135,7 @@ def nearest_along(curve, b, triangle, floor, pieces, s):
 def nearest_heights(curve, b, floor, pieces, s):
     """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
     best, at = floor, -1.0
-    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], 0.0
-    for k in range(5):
-        p, q, r = curve[k, 0] - x, curve[k, 1] - y, curve[k, 2] - z
-        span = max(span, p * p + q * q + r * r)
-    span = math.sqrt(span)
+    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
     node, last = s.first[b, 0], s.last[b, 0]
     while node < last:
         if from_box(x, y, z, s.nodes[node]) - span >= best:
@@ -220,12 +209,9 @@ def watch_solid(i, b, curve, t, h, s, monitor):
             into_axes(part, t + start * h, (end - start) * h, b, s, own)
         else:
             into_axes(curve, t, h, b, s, own)
-        x, y, z, span = own[2, 0], own[2, 1], own[2, 2], 0.0
-        for k in range(5):
-            p, q, r = own[k, 0] - x, own[k, 1] - y, own[k, 2] - z
-            span = max(span, p * p + q * q + r * r)
+        x, y, z = own[2, 0], own[2, 1], own[2, 2]
         floor = clearance_of_interest(i, monitor) + radius
-        if not (floor < math.inf and far_from(x, y, z, b, s) - math.sqrt(span) >= floor):
+        if not (floor < math.inf and far_from(x, y, z, b, s) - span_of(own) >= floor):
             if s.kind[b] == HEIGHTS:
                 value, at = nearest_heights(own, b, floor, monitor.pieces, s)
             else:

@@ -24,22 +24,28 @@ def septic(t, t0, T_b):
     return blend(x), rate / T_b, second / T_b**2
 
 
-@compiled
-def follow_ways(t, knots, ways, p, p_dot, p_ddot):
-    """Slots p (N, 3) [m] on their ways at t, and their derivatives; at rest before the first knot and after the last.
-
-    Pieces are polynomials of any degree between knots (K + 1,) [s], ``ways`` (K, N, 3, P).
-    """
+@inlined
+def piece_at(t, knots):
+    """Piece between knots (n + 1,) [s] at t, the time since it began, and the time since the last knot, or zero."""
     low, high = 0, knots.shape[0] - 1
-    inside = min(max(t, knots[0]), knots[high])
-    moves = 1.0 if inside == t else 0.0
+    inside = min(t, knots[high])
     while high - low > 1:
         middle = (low + high) // 2
         if knots[middle] <= t:
             low = middle
         else:
             high = middle
-    x = inside - knots[low]
+    return low, inside - knots[low], t - inside
+
+
+@compiled
+def follow_ways(t, knots, ways, p, p_dot, p_ddot):
+    """Slots p (N, 3) [m] on their ways at t, and their derivatives; at rest before the first knot and after the last.
+
+    Pieces are polynomials of any degree between knots (K + 1,) [s], ``ways`` (K, N, 3, P).
+    """
+    low, x, beyond = piece_at(max(t, knots[0]), knots)
+    moves = 1.0 if t >= knots[0] and beyond == 0.0 else 0.0
     for i in range(p.shape[0]):
         for q in range(3):
             c = ways[low, i, q]

@@ -484,11 +484,6 @@ class Cruising(AnyPhase):
     goal_moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    @property
-    def meets(self) -> tuple[str, ...]:
-        """Position and velocity at the end of the course, and the attitude if it turns."""
-        return ("position", "velocity", *(("attitude", "rates") if self.turns_away else ()))
-
 
 class Follow(Cruising):
     """Follow trajectories that another program made: the virtual body, or each vehicle its own."""

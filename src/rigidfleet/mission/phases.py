@@ -136,20 +136,15 @@ def _phases(collector: FindingCollector) -> list[AnyPhase | None]:
     body = collector.data.get("architecture") == "body"
     found: list[AnyPhase | None] = []
     for k, data in enumerate(tables(collector, "phases")):
-        model = kind(collector, data, ("phases", k), KINDS)
-        if model is None:
+        if (model := kind(collector, data, ("phases", k), KINDS)) is None:
             found.append(None)
             continue
         control = model.body_control if body else "tracking"
         defaults = {"name": f"{data['kind']} {k + 1}", "control": control}
         found.append(collector.validate(model, data, ("phases", k), defaults))
     if not found and collector.right((), "phases"):
-        collector.add(
-            ("phases",),
-            "there is no phase",
-            "add [[phases]], one for each step of the flight",
-            None,
-        )
+        remedy = "add [[phases]], one for each step of the flight"
+        collector.add(("phases",), "there is no phase", remedy, None)
     return found
 
 

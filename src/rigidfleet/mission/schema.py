@@ -17,7 +17,7 @@ from pydantic import (
 
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.math import rigid_body
+from rigidfleet.math import pid, rigid_body
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
     ACCELERATION,
@@ -343,6 +343,16 @@ class Constraint(Part):
     deformation_damping: Annotated[float, Strict(), from_zero(GAIN)] = Field(
         1.0, description="damping of deformation velocities while no slots are tracked [1/s], >= 0"
     )
+
+    @property
+    def settling_time(self) -> float | None:
+        """Time [s] in which an error of a distance falls to 2 %; None if it never does, or oscillates too long."""
+        if self.stabilisation == "none":
+            return None
+        try:
+            return pid.settling_time(self.alpha, self.beta, self.gamma)
+        except ValueError:
+            return None
 
 
 class Regulator(Part):

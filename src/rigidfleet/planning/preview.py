@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.problem import SHAPE, Motion, Reference
-from rigidfleet.math import pid, rigid_body
+from rigidfleet.math import rigid_body
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import seconds
@@ -121,25 +121,13 @@ def planned_phase(found: Leg, most: int, radius: Floats) -> PlannedPhase:
     begin, end, reference = found.begin, found.end, found.reference
     count = min(max(_SAMPLES, int((end - begin) / _STEP) + 1), _MOST, most)
     time = np.linspace(begin, end, count)
-    position, velocity, acceleration = slot_derivatives(reference, found.motion, time, 3).swapaxes(
-        0, 1
-    )
+    states = slot_derivatives(reference, found.motion, time, 3).swapaxes(0, 1)
     shaping = found.phase.shaping
     straight = shaping is not None and not len(reference.knots)
     ways = (reference.p0, reference.p0 + reference.dp) if straight else None
     shapes = found.before.formation, found.after.formation
-    return PlannedPhase(
-        found.phase.name,
-        time,
-        position,
-        velocity,
-        acceleration,
-        found.exact,
-        found,
-        radius,
-        ways,
-        shapes,
-    )
+    name, exact = found.phase.name, found.exact
+    return PlannedPhase(name, time, *states, exact, found, radius, ways, shapes)
 
 
 def at_start(mission: Mission) -> PhaseState:
@@ -239,16 +227,7 @@ def ending(mission: Mission, phase: Phase, begin: float) -> float:
     elif phase.duration is not None:
         t = begin + seconds(phase.duration)
     elif phase.settle is not None:
-        least = phase.least_time + _settling(mission) + phase.settle.dwell
+        settling = mission.constraint.settling_time or 0.0
+        least = phase.least_time + settling + phase.settle.dwell
         t = begin + min(phase.settle.timeout, least)
     return max(t, begin + 1e-6)
-
-
-def _settling(mission: Mission) -> float:
-    c = mission.constraint
-    if c.stabilisation == "none":
-        return 0.0
-    try:
-        return pid.settling_time(c.alpha, c.beta, c.gamma)
-    except ValueError:
-        return 0.0

@@ -302,16 +302,8 @@ def _phases(
     parts = []
     for name, blend in zip(names, blends, strict=False):
         kept = {key: x for key, x in table.items() if key not in ("until", "settle", "position")}
-        parts.append(
-            kept
-            | {
-                "name": name,
-                "formation": name,
-                "blend": blend,
-                "duration": blend,
-                "alignment": "none",
-            }
-        )
+        own = {"name": name, "formation": name, "blend": blend, "duration": blend}
+        parts.append(kept | own | {"alignment": "none"})
     last = table | {"name": f"{phase.name}: {_PARTS[2]}", "blend": blends[2], "alignment": "none"}
     if isinstance(phase.duration, float) and phase.blend != AUTO:
         last["duration"] = round(phase.duration - blends[0] - blends[1], 6)

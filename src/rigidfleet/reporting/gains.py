@@ -39,17 +39,6 @@ def response(mission: Mission, t: list[float]) -> list[float] | None:
     return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
 
 
-def settling(mission: Mission) -> float | None:
-    """Time [s] in which a distance error falls to 2 %; None if it never does."""
-    c = mission.constraint
-    if c.stabilisation == "none":
-        return None
-    try:
-        return pid.settling_time(c.alpha, c.beta, c.gamma)
-    except ValueError:
-        return None
-
-
 def _constraint(mission: Mission) -> list[Line]:
     c = mission.constraint
     found = []
@@ -66,8 +55,7 @@ def _constraint(mission: Mission) -> list[Line]:
             margin = 2 * c.alpha * c.beta**2 / c.gamma
             meaning = f"errors decay until γ reaches {margin:.3g} times its value (2αβ² > γ)"
             found.append(Line("stability margin", f"{margin:.3g}", meaning))
-        settled = settling(mission)
-        if settled is not None:
+        if (settled := c.settling_time) is not None:
             beyond = 100 * pid.overshoot(c.alpha, c.beta, c.gamma)
             why = "the integral must return to zero" if c.gamma > 0 else "there is no integral term"
             found += [

@@ -86,7 +86,7 @@ def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None
     """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
     from matplotlib.figure import Figure
 
-    times = [s for m in missions if (s := gains.settling(m)) is not None]
+    times = [s for m in missions if (s := m.constraint.settling_time) is not None]
     if not times:
         return None
     t = np.linspace(0.0, 1.6 * max(times), 400)

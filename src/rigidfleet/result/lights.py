@@ -111,10 +111,5 @@ def seen_from(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tup
 
 def _principal(points: Floats) -> tuple[Floats, Floats]:
     """Extents (3,) of points (n, 3) along their principal directions, the greatest first, and these (3, 3) as rows."""
-    about = (
-        np.concatenate([points - points.mean(axis=0), np.zeros((3, 3))])
-        if len(points)
-        else np.zeros((3, 3))
-    )
-    _, extents, axes = np.linalg.svd(about, full_matrices=False)
-    return extents, axes
+    about = np.concatenate([points - points.mean(axis=0), np.zeros((3, 3))])
+    return np.linalg.svd(about, full_matrices=False)[1:]

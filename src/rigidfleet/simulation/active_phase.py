@@ -13,6 +13,7 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
+from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without
@@ -30,7 +31,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import Place, diagnose
 from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.simulation.recording import Led, Piece, Unevaluated
+from rigidfleet.simulation.recording import LayerSamples, Led, Piece, Unevaluated, VehicleSamples
 from rigidfleet.simulation.solver_setup import (
     equip,
     first_step,
@@ -421,9 +422,22 @@ class ActivePhase:
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        integral, led = samples[:, 6 * n : 6 * n + m], self._led(times)
+        self.keep(times, given, samples[:, 6 * n : 6 * n + m], frame)
+
+    def keep(
+        self,
+        times: Floats,
+        given: Record | Unevaluated,
+        integral: Floats,
+        frame: Floats,
+        vehicles: VehicleSamples | None = None,
+        layers: LayerSamples | None = None,
+    ) -> None:
+        """Store a piece of the phase."""
+        edges, attached = self.plan.edges, self.plan.attached
+        led = self._led(times)
         self.pieces.append(
-            Piece(self.index, times, given, integral, frame, plan.edges, plan.attached, led)
+            Piece(self.index, times, given, integral, frame, edges, attached, led, vehicles, layers)
         )
 
     def _led(self, times: Floats) -> Led:

@@ -87,13 +87,6 @@ Command = AttitudeCommand | RotorCommand
 Controller = Callable[[Observation], "ArrayLike | Command"]
 
 
-def asked(
-    who: str, t: float, n: int, function: Callable[..., ArrayLike], *arguments: object
-) -> Floats:
-    """Forces (N, 3) [N] that a user's function returns; an error says what it returned instead."""
-    return checked_force(called(who, t, function, *arguments), n, who, t)
-
-
 def called(who: str, t: float, function: Callable[..., Any], *arguments: object) -> Any:
     """What a user's function returns; its exceptions are told as those of a flight."""
     try:
@@ -179,7 +172,8 @@ class ExternalForce:
             x = places(r).copy(), places(v).copy()
             try:
                 if self.error is None:
-                    places(f)[:] = asked("the force", t, n, force, t, *x)
+                    found = called("the force", t, force, t, *x)
+                    places(f)[:] = checked_force(found, n, "the force", t)
                     return
             except BaseException as error:
                 self.error = error

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -310,8 +310,8 @@ class CurveWatch:
         """List all pairs of a small fleet; none of a large one yet."""
         self.moved[:] = np.inf
         if self.n <= _FEW:
-            pairs = _all_pairs(self.n)
-            self.pairs = self.columns = pairs[self.left[pairs].all(axis=1)]
+            pairs = proximity.all_pairs(self.n).T
+            self.pairs = self.columns = np.ascontiguousarray(pairs[self.left[pairs].all(axis=1)])
 
     def _step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
@@ -630,12 +630,6 @@ class Extremes(CurveWatch):
         found = super().phase()
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
         return found
-
-
-@cache
-def _all_pairs(n: int) -> Ints:
-    """All pairs (P, 2) of n agents."""
-    return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:

@@ -21,7 +21,8 @@ from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import PhaseState, Pose
+from rigidfleet.planning.preview import at_start
+from rigidfleet.planning.reference import PhaseState, Pose, changed
 from rigidfleet.planning.timing import with_times
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
@@ -225,13 +226,8 @@ class Flight:
         asked_for = None if times is None else times_asked(times, mission.latest_end)
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
-        frame = None
-        if mission.body_frame is not None:
-            b = mission.body_frame
-            frame = att.dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
-        self._begins = self._reached = PhaseState(
-            0.0, mission.fleet.position.copy(), mission.fleet.velocity.copy(), frame=frame
-        )
+        r, v = mission.fleet.position.copy(), mission.fleet.velocity.copy()
+        self._begins = self._reached = changed(at_start(mission), r=r, v=v)
         self._vehicles = Vehicles(mission, self._push.max_step) if mission.vehicle_models else None
         # Vehicles meet their disturbances in their own equations of motion.
         self._disturbance = self._prepared.disturbance if self._vehicles is None else None

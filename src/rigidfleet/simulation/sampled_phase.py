@@ -31,7 +31,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
-from rigidfleet.simulation.recording import LayerSamples, Led, Piece, VehicleSamples
+from rigidfleet.simulation.recording import LayerSamples, Led, VehicleSamples
 from rigidfleet.simulation.solver_setup import equip
 from rigidfleet.typing import Floats
 
@@ -241,7 +241,7 @@ class SampledPhase(ActivePhase):
         plan, sampled = self.plan, self.sampled
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
-        times = self.sampler(plan, self.t, t_end, first=not self.begun, stop=self.stop)
+        times = self.times(t_end)
         self.begun, given = True, self.vehicles.avoidance
         call = fleet.segment(n, m, t_end, times, _STEPS)
         sampled.count[fleet.SAMPLES] = 0
@@ -340,20 +340,7 @@ class SampledPhase(ActivePhase):
             parts.append(frame)
         planned = native.record(plan.problem, self.workspace, times, np.concatenate(parts, axis=1))
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
-        self.pieces.append(
-            Piece(
-                self.index,
-                times,
-                out,
-                call.integral[:done],
-                frame,
-                plan.edges,
-                plan.attached,
-                self._led(times),
-                kept,
-                self._layers(call, done),
-            )
-        )
+        self.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
     def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
         """Samples of what avoidance did."""

@@ -104,12 +104,9 @@ def outcome(table: Table) -> Figure | None:
     """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
-    from rigidfleet.plotting.figure import Figure
-
     reasons = failures(table)
-    fig = Figure(figsize=(st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6)), layout="constrained")
+    fig = _figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
-    _head(fig, table, "Outcome")
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
     passed = np.cumsum(table.passed)[n - 1]
     low, high = interval(passed, n)
@@ -205,8 +202,6 @@ def correlations(table: Table) -> Figure | None:
     found = drivers(table)
     if not found:
         return None
-    from rigidfleet.plotting.figure import Figure
-
     rows = list(dict.fromkeys(d.varied for d in found))[:_ROWS]
     rows = [name for name in varied(table) if name in rows]
     columns = [name for name in outcomes(table) if any(d.outcome == name for d in found)]
@@ -214,9 +209,9 @@ def correlations(table: Table) -> Figure | None:
     for d in found:
         if d.varied in rows:
             values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
-    fig = Figure(figsize=(st.WIDTH, 2.2 + 0.27 * len(rows)), layout="constrained")
+    title = "What drives success and the metrics"
+    fig = _figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
     ax = fig.subplots()
-    _head(fig, table, "What drives success and the metrics")
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
     ax.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns])
     ax.tick_params(axis="x", labelrotation=38, length=0)
@@ -262,8 +257,6 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
         raise RigidfleetError(
             f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
         )
-    from rigidfleet.plotting.figure import Figure
-
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
     (x, at_x), (y, at_y) = (_cells(numbers[p], _spacing(table, p)) for p in over)
     cells = np.full((len(y) - 1, len(x) - 1), np.nan)
@@ -272,10 +265,9 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
         inside = inside[np.isfinite(inside)]
         if len(inside):
             cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
-    fig = Figure(figsize=(0.75 * st.WIDTH, 0.58 * st.WIDTH), layout="constrained")
-    ax = fig.subplots()
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
-    _head(fig, table, title)
+    fig = _figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
+    ax = fig.subplots()
     wide = metric != "success" and _scale(cells[np.isfinite(cells)]) == "log"
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
     look |= {"norm": "log"} if wide else {}
@@ -299,21 +291,23 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
 # -- parts -------------------------------------------------------------------------------------------
 
 
-def _head(fig: Figure, table: Table, title: str) -> None:
+def _figure(table: Table, title: str, wide: float, high: float) -> Figure:
+    """A figure of a size [in], with its title and what the sweep is."""
+    from rigidfleet.plotting.figure import Figure
+
+    fig = Figure(figsize=(wide, high), layout="constrained")
     of = "" if table.complete else f" of {table.sweep.runs}"
     words = f"{table.sweep.name}: {len(table.run)}{of} runs"
     st.heading(fig, title, words, st.GREY if table.complete else st.ALERT)
+    return fig
 
 
 def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
     """Figure with small axes, one for each metric."""
-    from rigidfleet.plotting.figure import Figure
-
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = Figure(figsize=(st.WIDTH, 0.9 + 1.75 * rows), layout="constrained")
+    fig = _figure(table, title, st.WIDTH, 0.9 + 1.75 * rows)
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
-    _head(fig, table, title)
     for ax in axes[len(names) :]:
         ax.set_visible(False)
     return fig, axes[: len(names)]

@@ -83,36 +83,27 @@ def apart() -> list[bytes]:
     def watch_trail(p, w, state, found):
         return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
 
-    def measure_flight(m):
-        measurement.measure(measured(m))
-        return 0
+    def called(function, of):
+        def call(address):
+            function(of(address))
+            return 0
 
-    def singular_values(s):
-        measurement.spectrum(spectrum(s))
-        return 0
-
-    def find_nearest(s):
-        nearest.nearest_boxes(boxes(s))
-        return 0
-
-    def follow(s):
-        recursion.follow(recursing(s))
-        return 0
+        return call
 
     def gather(of, count, asked, words):
         return gathering.gather(of, count, asked, words)
 
     functions = (
         (watch_trail, 4),
-        (measure_flight, 1),
-        (singular_values, 1),
-        (find_nearest, 1),
-        (follow, 1),
+        (called(measurement.measure, measured), 1),
+        (called(measurement.spectrum, spectrum), 1),
+        (called(nearest.nearest_boxes, boxes), 1),
+        (called(recursion.follow, recursing), 1),
         (gather, 4),
     )
     entries = zip(functions, objects.ENTRIES[2:-1], strict=True)
     return [
-        _object(*_module(function, name, words), loops=function is find_nearest)
+        _object(*_module(function, name, words), loops=name == "rigidfleet_nearest")
         for (function, words), name in entries
     ]
 

@@ -21,7 +21,6 @@ from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected, unpack
-from rigidfleet.kernel.control import piece_at
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_bounds, lane_steps
 from rigidfleet.kernel.engine.lane_bounds import Search
@@ -38,7 +37,7 @@ from rigidfleet.kernel.engine.tracer import (
     structure,
 )
 from rigidfleet.kernel.problem import Disturbance, Problem
-from rigidfleet.kernel.references import septic
+from rigidfleet.kernel.references import piece_at, septic
 from rigidfleet.typing import Floats, Ints
 
 

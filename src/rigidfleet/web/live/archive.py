@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from rigidfleet.result import Result
-from rigidfleet.simulation.recording import LayerSamples, Piece, VehicleSamples
+from rigidfleet.simulation.recording import Piece
 from rigidfleet.typing import Bools, Floats
 
 #: Greatest number of values kept, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond it,
@@ -117,14 +118,7 @@ def _numbers(piece: Piece) -> float:
 
 def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
-    record = type(piece.record)(*(x[which] for x in piece.record))
-    flown, acting = piece.vehicles, piece.layers
-    vehicles = None if flown is None else VehicleSamples._make(x[which] for x in flown)
-    layers = None if acting is None else LayerSamples._make(x[which] for x in acting)
-    return Piece(
-        piece.phase, piece.time[which], record, piece.integral[which], piece.frame[which], piece.edges,
-        piece.attached, piece.led, vehicles, layers,
-    )  # fmt: skip
+    return _made([piece], lambda x: x[0][which])
 
 
 def _joined(pieces: list[Piece]) -> list[Piece]:
@@ -133,26 +127,28 @@ def _joined(pieces: list[Piece]) -> list[Piece]:
 
 def _join(pieces: list[Piece]) -> Piece:
     """Pieces of one phase as one."""
-    first, record = pieces[0], type(pieces[0].record)
-    fields = (np.concatenate(each) for each in zip(*(p.record for p in pieces), strict=True))
-    flown = [p.vehicles for p in pieces if p.vehicles is not None]
-    vehicles = (
-        VehicleSamples._make(map(np.concatenate, zip(*flown, strict=True))) if flown else None
+    return _made(pieces, np.concatenate)
+
+
+def _made(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Piece:
+    """A piece of which each ``array`` is made of those of pieces of one phase."""
+
+    def made(each: Sequence[Any]) -> Any:
+        if each[0] is None:
+            return None
+        return type(each[0])(*map(array, zip(*each, strict=True)))
+
+    first = pieces[0]
+    time, integral, frame = (
+        array([getattr(p, name) for p in pieces]) for name in ("time", "integral", "frame")
     )
-    acting = [p.layers for p in pieces if p.layers is not None]
-    layers = LayerSamples._make(map(np.concatenate, zip(*acting, strict=True))) if acting else None
+    record, vehicles, layers = (
+        made([getattr(p, name) for p in pieces]) for name in ("record", "vehicles", "layers")
+    )
+    led = tuple(led for p in pieces for led in p.led)
     return Piece(
-        first.phase,
-        np.concatenate([p.time for p in pieces]),
-        record(*fields),
-        np.concatenate([p.integral for p in pieces]),
-        np.concatenate([p.frame for p in pieces]),
-        first.edges,
-        first.attached,
-        tuple(led for p in pieces for led in p.led),
-        vehicles,
-        layers,
-    )
+        first.phase, time, record, integral, frame, first.edges, first.attached, led, vehicles, layers
+    )  # fmt: skip
 
 
 def _sorted(piece: Piece) -> Piece:
