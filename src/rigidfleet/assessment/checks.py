@@ -152,12 +152,12 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
         for what, t in moments.items():
             if t is None:
                 continue
-            away, nearest = math.inf, "the phase has no sample"
+            away, due = math.inf, min(t, p.t_end)
             if i in measured.flown:
-                due = min(t, p.t_end)
-                away = abs(float(result.time[measured.nearest(due, i)]) - due)
-                nearest = f"the nearest sample is {away:.2g} s away"
+                away = abs(result.time.item(measured.nearest(due, i)) - due)
             if away > _UNSEEN:
+                nearest = f"the nearest sample is {away:.2g} s away"
+                nearest = nearest if i in measured.flown else "the phase has no sample"
                 words = f"the {what} of phase '{p.name}' ({t:.2f} s) is not judged: {nearest}. Record this time"
                 yield CheckResult("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
 

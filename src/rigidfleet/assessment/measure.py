@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 #: Extremes of pairs of agents, and of edges.
-_OF_PAIRS = frozenset(("separation", "separation_below", "separation_flying", "lost"))
+_OF_PAIRS = frozenset(
+    ("separation", "separation_first", "separation_below", "separation_flying", "lost")
+)
 _OF_EDGES = frozenset(("tension", "constraint"))
 
 
@@ -100,8 +102,9 @@ class Measurements:
         #: Phases that have samples.
         self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
         #: Quantities of which the record tells what happens between samples.
-        self.told = {name for p in result.phases for name in p.extremes}
+        self.told = set[str]().union(*(p.extremes for p in result.phases))
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
+        self._nearest: dict[tuple[float, int], int] = {}
         #: Distances to each other and to obstacles at samples.
         self.close = proximity.closeness(
             result.position,
@@ -196,7 +199,7 @@ class Measurements:
 
     def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
-        if name.removesuffix("_first") in _OF_PAIRS:
+        if name in _OF_PAIRS:
             who = agent_names(sorted((x.who, x.other)))
         elif name in _OF_EDGES:
             who = f"edge {x.who + 1}-{x.other + 1}"
@@ -217,7 +220,8 @@ class Measurements:
         }
         between = self.between(name, max(every, key=every.__getitem__)) if every else None
         if between is None:
-            return None if sampled is None else replace(sampled, at_samples=True)
+            e = sampled
+            return e and Extreme(e.value, e.when, e.who, e.phase, at_samples=True)
         if sampled is None:
             return between
         return between if sense(between.value) > sense(sampled.value) else sampled
@@ -227,7 +231,7 @@ class Measurements:
         name: str,
         values: Floats,
         who: Callable[..., str] = agent,
-        sense: Callable[..., Any] = np.positive,
+        sense: Callable[..., Any] = lambda x: x,
     ) -> Extreme | None:
         """The worst value of a flight, at its samples, ``values`` (K, ...), or between them."""
         return self.worst(name, self.extreme(values, who, sense), sense)
@@ -384,7 +388,8 @@ class Measurements:
                     "lowest": True,
                     "highest": True,
                     "thrust": self.rank["thrust"][index] > -math.inf,
-                    "separation": np.count_nonzero(self.left[samples.start]) > 1,
+                    "separation": result.n_agents > 1
+                    and (self.whole or np.count_nonzero(self.left[samples.start]) > 1),
                     "clearance": _meets(there, phase),
                     "geofence": fenced,
                 }
@@ -545,10 +550,13 @@ class Measurements:
 
     def nearest(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
-        time, samples = self.result.time, self.samples[index]
-        after = bisect_left(time, t, samples.start, samples.stop - 1)
-        before = max(after - 1, samples.start)
-        return after if abs(time[after] - t) < abs(time[before] - t) else before
+        known, time, samples = self._nearest.get((t, index)), self.result.time, self.samples[index]
+        if known is None:
+            after = bisect_left(time, t, samples.start, samples.stop - 1)
+            before = max(after - 1, samples.start)
+            known = after if abs(time[after] - t) < abs(time[before] - t) else before
+            self._nearest[t, index] = known
+        return known
 
     @cached_property
     def misses(self) -> dict[tuple[str, int], Waypoint]:
