@@ -29,7 +29,9 @@ if TYPE_CHECKING:
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 #: Extremes of pairs of agents, and of edges.
 _OF_PAIRS = frozenset(
-    ("separation", "separation_first", "separation_below", "separation_flying", "lost")
+    f"{name}{part}"
+    for name in ("separation", "separation_below", "separation_flying", "lost")
+    for part in ("", "_first")
 )
 _OF_EDGES = frozenset(("tension", "constraint"))
 
