@@ -294,7 +294,7 @@ def test_long_pieces_of_any_degree_are_watched_exactly(powers):
 @pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells the peak of a process alone")
 def test_a_thousand_vehicles_are_judged_in_little_memory():
-    """480 samples each: the process needs less than 0.5 GB, curves and packages included."""
+    """480 samples each: the process needs less than 0.7 GB, curves, packages and threads included (measured: 0.47)."""
     code = """
 from pathlib import Path
 import numpy as np
@@ -313,7 +313,7 @@ print(next(x.split()[1] for x in Path("/proc/self/status").read_text().splitline
     process = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert int(process.stdout) * 1024 < 0.5e9
+    assert int(process.stdout) * 1024 < 0.7e9
 
 
 def test_yaw_has_its_rate():
