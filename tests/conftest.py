@@ -1,5 +1,9 @@
+import importlib
 import os
+import sys
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -7,3 +11,12 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Compiling takes longer than any deadline; a red test is to be red for everybody.
 settings.register_profile("rigidfleet", deadline=None, derandomize=True, database=None)
 settings.load_profile("rigidfleet")
+
+
+@pytest.fixture(scope="session")
+def benchmark_named():
+    """A module of the benchmarks by its name; it imports those beside it."""
+    folder = str(Path(__file__).parents[1] / "benchmarks")
+    sys.path.insert(0, folder)
+    yield importlib.import_module
+    sys.path.remove(folder)

@@ -3,10 +3,7 @@
 The oracle of distances is a cubic spline through the record; of hulls, a quadratic programme solved by SciPy.
 """
 
-import importlib
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +16,9 @@ MODELS = ("paper", "px4-sih", "hummingbird", "crazyflie", "x500")
 
 
 @pytest.fixture(scope="module")
-def encounters():
+def encounters(benchmark_named):
     """The benchmark of encounters."""
-    folder = str(Path(__file__).parents[1] / "benchmarks")
-    sys.path.insert(0, folder)
-    yield importlib.import_module("encounters")
-    sys.path.remove(folder)
+    return benchmark_named("encounters")
 
 
 def swap(starts, goals, *, blend=10.0, model="paper", **tables):

@@ -1,20 +1,13 @@
 """The criterion by which scenes of moving obstacles count as feasible: `benchmarks/moving.py`."""
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 
 @pytest.fixture(scope="module")
-def moving():
-    """The benchmark as a module; it imports the one beside it."""
-    folder = str(Path(__file__).parents[1] / "benchmarks")
-    sys.path.insert(0, folder)
-    yield importlib.import_module("moving")
-    sys.path.remove(folder)
+def moving(benchmark_named):
+    """The benchmark of things that move."""
+    return benchmark_named("moving")
 
 
 @pytest.mark.parametrize("n", [1, 8])

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sample_missions import three_points
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
@@ -29,20 +30,7 @@ G = 9.81
 
 def a_mission(*phases: Data, **more: Any) -> Mission:
     """Three agents that form a triangle about (2, 1, 5) m and then fly these phases, smoothly unless told."""
-    data: Data = {
-        "schema_version": 1,
-        "name": "field",
-        "smoothness": "jerk",
-        "agents": {"mass": 1.0, "position": [[0, 0, 5], [4, 0, 5], [2, 3, 5]]},
-        "formations": {
-            "triangle": {"shape": "triangle", "size": 4.0},
-            "wide": {"shape": "triangle", "size": 6.0},
-        },
-        "phases": [
-            {"kind": "establish", "formation": "triangle", "duration": 5.0},
-            *phases,
-        ],
-    }
+    data = three_points({"duration": 5.0}, *phases)
     return Mission.from_dict(data | more)
 
 

@@ -1,7 +1,10 @@
 """Ground is whatever is below: a ground, terrain or a roof, level or sloped, turned or not."""
 
+from typing import Any
+
 import numpy as np
 import pytest
+from sample_missions import three_quadrotors
 
 import rigidfleet as rf
 from rigidfleet._common.toml import to_toml
@@ -26,19 +29,8 @@ SLOPED = {"kind": "heights", "corner": [-40, -40], "spacing": 8.0,
 
 def mission(*obstacles, **tables):
     """Three quadrotors, or points, that form a triangle above something."""
-    data = {
-        "schema_version": 1, "name": "short", "smoothness": "jerk",
-        "vehicles": {"drone": {"model": "paper"}},
-        "agents": {"vehicle": "drone", "position": [[1, 6, 3], [5, 4, 3], [4, 7, 3]]},
-        "tracking": {"drag_feedforward": True},
-        "formations": {"triangle": {"shape": "triangle", "size": 4.0}},
-        "phases": [
-            {"kind": "establish", "formation": "triangle", "blend": 2.5, "until": 3.0},
-            {"kind": "hold", "until": 5.0},
-        ],
-        "obstacles": list(obstacles),
-    }  # fmt: skip
-    data |= tables
+    hold = {"kind": "hold", "until": 5.0}
+    data: dict[str, Any] = three_quadrotors(hold) | {"obstacles": list(obstacles)} | tables
     if data["vehicles"] is None:
         del data["vehicles"], data["tracking"]
         data["agents"] = {"mass": 1.0, "radius": 0.2, "position": data["agents"]["position"]}

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sample_missions import three_points
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
@@ -153,20 +154,7 @@ def test_yaw_along_turns_into_the_way_keeps_still_at_rest_and_turns_back():
 
 def a_mission(*phases: dict, **more) -> Mission:
     """Three vehicles that form a triangle, and then fly these phases smoothly."""
-    data = {
-        "schema_version": 1,
-        "name": "smooth",
-        "smoothness": "jerk",
-        "agents": {"mass": 1.0, "position": [[0, 0, 5], [4, 0, 5], [2, 3, 5]]},
-        "formations": {
-            "triangle": {"shape": "triangle", "size": 4.0},
-            "wide": {"shape": "triangle", "size": 6.0},
-        },
-        "phases": [
-            {"kind": "establish", "formation": "triangle", "blend": 7.5, "duration": 8.0},
-            *phases,
-        ],
-    }
+    data = three_points({"blend": 7.5, "duration": 8.0}, *phases)
     return Mission.from_dict(data | more)
 
 

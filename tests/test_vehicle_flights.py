@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sample_missions import three_quadrotors
 
 import rigidfleet as rf
 from rigidfleet._common.text import percent
@@ -163,18 +164,8 @@ def test_sampled_points_fly_as_continuous_ones():
 
 def short(**tables):
     """Six seconds of three quadrotors that establish a triangle and fly."""
-    data = {
-        "schema_version": 1, "name": "short", "smoothness": "jerk",
-        "vehicles": {"drone": {"model": "paper"}},
-        "agents": {"vehicle": "drone", "position": [[1, 6, 3], [5, 4, 3], [4, 7, 3]]},
-        "tracking": {"drag_feedforward": True},
-        "formations": {"triangle": {"shape": "triangle", "size": 4.0}},
-        "phases": [
-            {"kind": "establish", "formation": "triangle", "blend": 2.5, "until": 3.0},
-            {"kind": "fly", "position": [6.0, 5.0, 4.0], "until": 6.0},
-        ],
-    }  # fmt: skip
-    return rf.Mission.from_dict(data | tables)
+    fly = {"kind": "fly", "position": [6.0, 5.0, 4.0], "until": 6.0}
+    return rf.Mission.from_dict(three_quadrotors(fly) | tables)
 
 
 NOISY = {

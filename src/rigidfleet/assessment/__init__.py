@@ -85,9 +85,9 @@ def assess(result: Result | str | Path) -> Verdict:
         vehicles = "the only vehicle" if n == 1 else f"{n:,} vehicles"
         covers = f" It covers {vehicles} from {result.time[0]:.6g} to {result.time[-1]:.6g} s."
     verdict = Verdict(
-        measured.mission.name, measured.mission.title, [], phases, [], uncalled, covers
-    )
-    verdict.read.extend(result.statistics.get("read", []))
+        measured.mission.name, measured.mission.title, [], phases, [], uncalled, covers,
+        read=[*result.statistics.get("read", [])],
+    )  # fmt: skip
     verdict.checks.extend(all_checks(measured, verdict))
     verdict.notes.extend(notes(measured, phases))
     return verdict

@@ -220,11 +220,10 @@ class Measurements:
             if name in p.extremes
         }
         between = self.between(name, max(every, key=every.__getitem__)) if every else None
-        if between is None:
-            e = sampled
-            return e and Extreme(e.value, e.when, e.who, e.phase, at_samples=True)
         if sampled is None:
             return between
+        if between is None:
+            return Extreme(sampled.value, sampled.when, sampled.who, sampled.phase, at_samples=True)
         return between if sense(between.value) > sense(sampled.value) else sampled
 
     def among(

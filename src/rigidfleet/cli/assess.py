@@ -97,8 +97,8 @@ def assess(
         from rigidfleet.result import Result
 
         if chosen:
-            told = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
-            raise RigidfleetError(told)
+            words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
+            raise RigidfleetError(words)
         result = Result.load(files[0])
     else:
         from rigidfleet.foreign.files import read_trajectories
@@ -106,8 +106,8 @@ def assess(
 
         own = [key for key in _OWN if key in chosen]
         if mission is not None and own:
-            told = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
-            raise RigidfleetError(told)
+            words = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
+            raise RigidfleetError(words)
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
         read = read_trajectories(files, **{key: given[key] for key in _READ if key in chosen})
         result = of_curves(
@@ -157,8 +157,8 @@ def _limits(limits: list[str]) -> dict[str, float]:
         One cannot be read.
     """
     found: dict[str, float] = {}
-    for told in limits:
-        for part in told.split(","):
+    for option in limits:
+        for part in option.split(","):
             key, equals, value = part.partition("=")
             try:
                 found[key.strip()] = float(value)

@@ -323,8 +323,8 @@ def _vehicles(
             why = f"rows lie apart as if {turns[0]} vehicles took turns"
             raise fault(why, "Name vehicles in a column agent")
     if unclear and any((both != next(iter(apart.values()))).any() for both in apart.values()):
-        told = ", ".join(names[k] for k in apart)
-        raise fault(f"the columns {told} may name vehicles", "Name one of them agent")
+        several = ", ".join(names[k] for k in apart)
+        raise fault(f"the columns {several} may name vehicles", "Name one of them agent")
     for k in [*apart][:1]:
         chosen, part = [*chosen, k], apart[k]
         notes.append(f"the column {names[k]!r} is taken for names of vehicles: its rows lie apart")

@@ -314,8 +314,8 @@ def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajecto
             line, _, problem, remedy = error.faults[0]
             place = f"line {line}: " if line else ""
             ends = "" if remedy.endswith("?") else "."
-            told = f"{name}: {place}{problem}. {remedy}{ends}".replace("?. ", "? ")
-            raise TrajectoryError(told) from None
+            words = f"{name}: {place}{problem}. {remedy}{ends}".replace("?. ", "? ")
+            raise TrajectoryError(words) from None
     read = Trajectories(tuple(names), tuple(curves), assumed, tuple(notes), (record,))
     if (units.words or units.axes) and "units" not in record:
         raise TrajectoryError(f"{name}: says its units and axes itself. Remove --units and --axes.")

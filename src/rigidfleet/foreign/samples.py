@@ -43,8 +43,8 @@ def sampled(
         raise TrajectoryError(
             f"{name}: {place(k)}: the time {time[k]:.9g} s {how} {time[k - 1]:.9g} s. Give increasing times."
         )
-    told = None if yaw is None else np.unwrap(yaw)[None]
-    lines = through(time, position[None], told)
+    turned = None if yaw is None else np.unwrap(yaw)[None]
+    lines = through(time, position[None], turned)
     if kind == "linear" or len(time) < 3:
         return lines
     return Piecewise.cubic_spline(time, position).beside(Piecewise(time, lines.pieces[:, 3:]))
