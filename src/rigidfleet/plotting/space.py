@@ -136,8 +136,8 @@ def _shots(result: Result, rows: Any) -> list[int]:
 
     def keep(candidates: list[int], gap: float) -> None:
         for k in candidates:
-            apart = [np.sqrt(np.mean(np.sum((r[k] - r[j]) ** 2, axis=1))) for j in kept]
-            if k in usable and min(apart) > gap:
+            apart = np.sqrt(np.mean(np.sum((r[k] - r[kept]) ** 2, axis=2), axis=1))
+            if k in usable and apart.min() > gap:
                 kept.append(k)
 
     keep([int(rows[-1])], 1e-3 * size)

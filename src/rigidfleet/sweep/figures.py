@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,8 +42,6 @@ _VALUES = 20
 _ROWS = 14
 #: Ratio of the largest to the smallest value beyond which an axis is logarithmic.
 _LOGARITHMIC = 100.0
-#: Names of the figures, from the one that takes longest to draw.
-NAMES = ("histograms", "envelopes", "outcome", "drivers", "map")
 
 
 def plot(
@@ -71,43 +69,28 @@ def plot(
     ResultError
         A file cannot be written.
     """
-    files = []
-    for name in NAMES:
-        drawn = rendered(table, name, formats, over=over, metric=metric, titles=titles)
-        files += write_files(Path(folder, name), drawn)
-    return files
-
-
-def rendered(
-    table: Table,
-    name: str,
-    formats: Iterable[str],
-    *,
-    over: Sequence[str] = (),
-    metric: str = "",
-    titles: bool = True,
-) -> dict[str, bytes]:
-    """Contents of a figure's files by format, none if it would be empty; parameters are those of `plot`."""
-    draw = {
-        "outcome": outcome,
+    draw: dict[str, Callable[[Table], Figure | None]] = {
         "histograms": histograms,
         "envelopes": envelopes,
+        "outcome": outcome,
         "drivers": correlations,
         "map": partial(over_two, over=over, metric=metric),
     }
-    with st.settings(), st.shape(titles=titles):
-        figure = draw[name](table)
-    return {} if figure is None else contents(figure, formats, close=not titles)
+    files = []
+    for name, drawn in draw.items():
+        with st.settings(), st.shape(titles=titles):
+            figure = drawn(table)
+        made = {} if figure is None else contents(figure, formats, close=not titles)
+        files += write_files(Path(folder, name), made)
+    return files
 
 
 def outcome(table: Table) -> Figure | None:
     """Success rate over the number of runs, with its confidence interval, and the failures of each check."""
     if not len(table.run):
         return None
-    from rigidfleet.plotting.figure import Figure
-
     reasons = failures(table)
-    fig = Figure(figsize=(st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6)), layout="constrained")
+    fig = st.blank(st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6), "constrained")
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     _head(fig, table, "Outcome")
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
@@ -205,8 +188,6 @@ def correlations(table: Table) -> Figure | None:
     found = drivers(table)
     if not found:
         return None
-    from rigidfleet.plotting.figure import Figure
-
     rows = list(dict.fromkeys(d.varied for d in found))[:_ROWS]
     rows = [name for name in varied(table) if name in rows]
     columns = [name for name in outcomes(table) if any(d.outcome == name for d in found)]
@@ -214,7 +195,7 @@ def correlations(table: Table) -> Figure | None:
     for d in found:
         if d.varied in rows:
             values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
-    fig = Figure(figsize=(st.WIDTH, 2.2 + 0.27 * len(rows)), layout="constrained")
+    fig = st.blank(st.WIDTH, 2.2 + 0.27 * len(rows), "constrained")
     ax = fig.subplots()
     _head(fig, table, "What drives success and the metrics")
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
@@ -262,8 +243,6 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
         raise RigidfleetError(
             f"map: '{word}' cannot be drawn{why}. Choose from: {', '.join(words)}."
         )
-    from rigidfleet.plotting.figure import Figure
-
     values = 100.0 * table.passed if metric == "success" else table.metrics[metric]
     (x, at_x), (y, at_y) = (_cells(numbers[p], _spacing(table, p)) for p in over)
     cells = np.full((len(y) - 1, len(x) - 1), np.nan)
@@ -272,7 +251,7 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
         inside = inside[np.isfinite(inside)]
         if len(inside):
             cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
-    fig = Figure(figsize=(0.75 * st.WIDTH, 0.58 * st.WIDTH), layout="constrained")
+    fig = st.blank(0.75 * st.WIDTH, 0.58 * st.WIDTH, "constrained")
     ax = fig.subplots()
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
     _head(fig, table, title)
@@ -307,11 +286,9 @@ def _head(fig: Figure, table: Table, title: str) -> None:
 
 def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
     """Figure with small axes, one for each metric."""
-    from rigidfleet.plotting.figure import Figure
-
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = Figure(figsize=(st.WIDTH, 0.9 + 1.75 * rows), layout="constrained")
+    fig = st.blank(st.WIDTH, 0.9 + 1.75 * rows, "constrained")
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     _head(fig, table, title)
     for ax in axes[len(names) :]:
