@@ -52,6 +52,16 @@ def show() -> None:
             _save_with_few_colours(path, name)
 
 
+def words() -> None:
+    """A word in single strokes, as the page of shows writes it."""
+    letters = outlines.on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)
+    scenes = [show_draft.points_scene("FLY", Points(letters, None), "strokes:FLY")]
+    result = rf.simulate(Mission.from_toml(show_draft.show("fly", scenes, agents=60, spacing=2.0)))
+    with TemporaryDirectory() as folder:
+        (path,) = rf.plot(result, folder, formats=["png"], names=["formations"])
+        _save_with_few_colours(path, "fly")
+
+
 def others() -> None:
     """The picture of a flight that others made, judged as its page says."""
     files = IMAGES.parents[1] / "tests" / "data" / "sequence_trajectories"
@@ -122,5 +132,6 @@ if __name__ == "__main__":
     flight()
     study()
     show()
+    words()
     others()
     drawings()

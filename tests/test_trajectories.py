@@ -326,3 +326,11 @@ def test_yaw_has_its_rate():
     assert made.yaw_rate is not None
     np.testing.assert_allclose(made.yaw_rate, 1.3, atol=1e-9)
     np.testing.assert_allclose(np.cos(made.yaw[:, 0] - 1.3 * made.time), 1.0)
+
+
+def test_a_day_is_judged():
+    """A span far beyond that of missions is judged as a short one: no key of a flight limits it."""
+    place = np.array([[[0.0, 0, 2], [3, 0, 2]], [[5, 0, 1], [6, 0, 1]]])
+    verdict = rf.assess(rf.trajectories([0.0, 86_400.0], place, separation=0.5))
+    assert verdict.passed
+    assert check_of(verdict, "separation").worst == pytest.approx(1.0)

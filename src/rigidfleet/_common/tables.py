@@ -6,7 +6,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import islice
 from typing import NamedTuple
 
@@ -140,8 +140,8 @@ class Table:
         codes = [known.setdefault(x, len(known)) for x in self.columns[column].tolist()]
         return np.array(codes, dtype=np.int64), [*known]
 
-    def numbers(self, which: Sequence[int]) -> Floats:
-        """Numbers (K, M) of some columns, all finite, in s, m and rad.
+    def numbers(self, which: Sequence[int], blank: Collection[int] = ()) -> Floats:
+        """Numbers (K, M) of some columns, all finite, in s, m and rad; of ``blank`` ones, empty fields and nan are NaN.
 
         A comma is a decimal mark if no number has a point, and not all are such that it may separate thousands.
 
@@ -165,6 +165,9 @@ class Table:
                 plain = field.replace(self.decimal, ".")
                 if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
                     values[row, i] = float(plain)
+                    continue
+                if which[i] in blank and field.strip().lower() in ("", "nan"):
+                    values[row, i] = np.nan
                     continue
                 line, name = int(self.lines[row]), self.names[which[i]]
                 why = f"{name} is {field[:40] or 'empty'}, not a finite number"

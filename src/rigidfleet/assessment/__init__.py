@@ -80,7 +80,13 @@ def assess(result: Result | str | Path) -> Verdict:
     phases = [measured.phase(i, record) for i, record in enumerate(result.phases)]
     names = ", ".join(f"'{p.name}'" for p in result.phases if p.controller is False)
     uncalled = names and f"the controller was not called in {names}, as no slots are tracked there"
-    verdict = Verdict(measured.mission.name, measured.mission.title, [], phases, [], uncalled)
+    covers, n = "", result.n_agents
+    if result.interpolation is not None:
+        vehicles = "the only vehicle" if n == 1 else f"{n:,} vehicles"
+        covers = f" It covers {vehicles} from {result.time[0]:.6g} to {result.time[-1]:.6g} s."
+    verdict = Verdict(
+        measured.mission.name, measured.mission.title, [], phases, [], uncalled, covers
+    )
     verdict.read.extend(result.statistics.get("read", []))
     verdict.checks.extend(all_checks(measured, verdict))
     verdict.notes.extend(notes(measured, phases))

@@ -54,16 +54,19 @@ def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult
         *_touch_downs(measured, verdict.phases),
     ]
     yield from _failures_or_worst(candidates)
-    worst = verdict.worst
+    worst, limits = verdict.worst, measured.mission.limits
     if "separation" in worst:
         yield _separation(measured, worst["separation"])
+        if limits.separation is not None and limits.separation_altitude is not None:
+            yield _flying(measured, limits.separation, limits.separation_altitude)
         yield from _failures_or_worst(_as_planned(measured, verdict.phases))
+    elif limits.separation is not None and measured.result.interpolation is not None:
+        yield _alone(limits.separation, measured.result.n_agents)
     if "clearance" in worst:
         yield from _clearances(measured)
-    if not measured.left.all():
+    if not measured.left.all() and measured.mission.first_loss < math.inf:
         yield _lost(measured)
     yield from abandoned(measured)
-    limits = measured.mission.limits
     if limits.separation_below is not None:
         yield _downwash(measured, limits.separation_below)
     if limits.geofence is not None:
@@ -313,6 +316,7 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
         return  # of straight lines, accelerations are not judged at all
     first = np.flatnonzero(np.nextafter(result.time[:-1], np.inf) >= result.time[1:])
     by = np.linalg.norm(result.velocity[first + 1] - result.velocity[first], axis=2)
+    by *= result.left[first] & result.left[first + 1]
     if not by.size or by.max() <= _CORNER:
         return
     k, i = np.unravel_index(int(by.argmax()), by.shape)
@@ -325,7 +329,7 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
 
 
 def _separation(measured: Measurements, e: Extreme) -> CheckResult:
-    limit = measured.mission.limits.separation or 0.0
+    limit = measured.mission.limits.separation_always or 0.0
     passed = e.value > 0 and e.value >= limit - SLACK
     words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
     words += f" (limit {limit:g} m)"
@@ -333,6 +337,26 @@ def _separation(measured: Measurements, e: Extreme) -> CheckResult:
         words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
         words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
     return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
+
+
+def _flying(measured: Measurements, limit: float, altitude: float) -> CheckResult:
+    """Check the separation of agents of which one is at the altitude from which on it holds."""
+    e, words = measured.worst("separation_flying", None, lambda x: -x), "no two agents come as near"
+    if e is not None:
+        words = f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
+    words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
+    passed = e is None or e.value >= limit - SLACK
+    return bounded("separation_flying", e, "m", limit, words, passed=passed, at_least=True)
+
+
+def _alone(limit: float, n: int) -> CheckResult:
+    """Fail a separation that was asked for where there is no second vehicle."""
+    words = "is one vehicle alone" if n == 1 else "are never two vehicles at one time"
+    words = (
+        f"separation cannot be judged (limit {limit:g} m): there {words}. Give the other vehicles, name the column that"
+        " tells which vehicle a row is of, or ask for no separation"
+    )
+    return CheckResult("separation", False, words, None, limit, "m")
 
 
 def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:

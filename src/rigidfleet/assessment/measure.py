@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 #: Extremes of pairs of agents, and of edges.
-_OF_PAIRS = frozenset(("separation", "separation_below", "lost"))
+_OF_PAIRS = frozenset(("separation", "separation_below", "separation_flying", "lost"))
 _OF_EDGES = frozenset(("tension", "constraint"))
 
 

@@ -50,6 +50,10 @@ def _of_others(measured: Measurements) -> Iterator[str]:
         f"others made this flight: what is judged is its curve, {how}, also between samples; forces, thrust and "
         "attitudes are not known"
     )
+    if zero := result.statistics.get("clock"):
+        yield f"times count from {zero:.9g} s, the first of the file"
+    if any(thing.solid.moves for thing in measured.mission.obstacles):
+        yield f"obstacles that move are where they are at the times of the file, from {result.time[0]:.6g} s on"
     radius, e = measured.mission.fleet.radius, measured.worst("separation", None, lambda x: -x)
     if e is not None and np.ptp(radius) == 0.0:
         far = value(e.value + 2.0 * float(radius[0]), "m")
@@ -95,13 +99,11 @@ def _sampled(measured: Measurements) -> Iterator[str]:
 
 def _fallen(measured: Measurements) -> Iterator[str]:
     """Note where each lost vehicle falls."""
-    grounds = [o.height for o in measured.mission.obstacles if o.kind == "ground"]
     radius = measured.mission.agents.radius
-    for i in np.flatnonzero(~measured.left[-1]):
+    for i in np.flatnonzero(~measured.left[-1] & (measured.mission.lost_at < np.inf)):
         r = measured.result.position[:, i]
         words = f"agent {i + 1}, lost at {measured.mission.lost_at[i]:.2f} s,"
-        down = r[:, 2] <= max(grounds) + radius[i] if grounds else np.zeros(len(r), dtype=np.bool_)
-        down &= ~measured.left[:, i]
+        down = ~measured.left[:, i] & (r[:, 2] <= measured.mission.height_at(*r.T) + radius[i])
         if down.any():
             x, y, _ = r[-1]
             yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:z.1f}, {y:z.1f}) m"
@@ -112,7 +114,9 @@ def _fallen(measured: Measurements) -> Iterator[str]:
 def _dips(measured: Measurements) -> Iterator[str]:
     """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
     mission = measured.mission
-    if mission.limits.geofence is not None or any(o.kind == "ground" for o in mission.obstacles):
+    if mission.limits.geofence is not None or any(
+        o.kind in ("ground", "heights") for o in mission.obstacles
+    ):
         return
     e = measured.height(lowest=True)
     if e is not None and e.value < -DIP:

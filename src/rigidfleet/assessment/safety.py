@@ -64,6 +64,10 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             "proximity", "least distance between two vehicles' surfaces",
             found.get("separation"), "m", at_least=True,
         ),
+        *(
+            _row("proximity in flight", "the same, one at limits.separation_altitude or above", f, "m", at_least=True)
+            for f in verdict.checks if f.check == "separation_flying"
+        ),
         _row(
             "downwash", "least height between surfaces of two vehicles, one below the other",
             found.get("separation_below"), "m", at_least=True, worst=measured.below(),

@@ -25,6 +25,7 @@ _PRAISE = {
     "shape": "shapes are within {worst}",
     "waypoint_position": "waypoints are met within {worst}",
     "separation": "agents stay {worst} apart",
+    "separation_flying": "{worst} in flight",
     "clearance": "obstacles stay {worst} away in flight",
     "clearance_start": "agents start {worst} above an obstacle",
     "clearance_end": "agents land {worst} above an obstacle",
@@ -48,6 +49,7 @@ class Verdict:
     phases : the numbers of each phase, in order of flight
     notes : what else to know of the flight
     uncalled : in which phases a user's controller was not called, so that the verdict is on another law; "" if in none
+    covers : of a flight that others made, whom and what time "passed" covers; "" for a flight of our own
     read : of a flight that others made, what was read: vehicles, span, columns used and ignored, units and axes
 
     >>> import rigidfleet as rf
@@ -63,6 +65,7 @@ class Verdict:
     phases: list[PhaseVerdict]
     notes: list[str]
     uncalled: str = ""
+    covers: str = ""
     read: list[dict[str, Any]] = field(default_factory=list)
 
     @property
@@ -102,7 +105,7 @@ class Verdict:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
         told = [found[name].fill(words) for name, words in praise.items() if name in found]
         head = f"Passed: {all_hold(len(judged))}"
-        return f"{head}; {', '.join(told)}." if told else f"{head}."
+        return (f"{head}; {', '.join(told)}." if told else f"{head}.") + self.covers
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""

@@ -11,15 +11,21 @@ from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.outputs import Files, keep_existing
 from rigidfleet.errors import RigidfleetError
 
+#: Options that a mission replaces.
+_OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
+
 
 def assess(
     *files: Path,
     mission: str | None = None,
     separation: float | None = None,
+    separation_altitude: float | None = None,
     limits: list[str] | None = None,
     radius: float | None = None,
     ground: float | None = None,
     interpolation: Literal["cubic", "linear"] | None = None,
+    spans: Literal["refuse", "stand", "away"] | None = None,
+    gaps: Literal["refuse", "bridge"] | None = None,
     units: str | None = None,
     axes: str | None = None,
     explain: bool = False,
@@ -40,6 +46,9 @@ def assess(
         Judge trajectories by this mission's radii, limits and obstacles.
     separation : float
         Least distance [m] between two vehicles, less their radii.
+    separation_altitude : float
+        Altitude z [m] from which on separation holds: vehicles that are both below it, as on their pads, may be nearer
+        to each other. Default: it always holds.
     limits : list
         Further limits, KEY=VALUE, may be repeated: speed, acceleration, horizontal_speed, vertical_speed,
         horizontal_acceleration, vertical_acceleration, separation_below.
@@ -49,6 +58,12 @@ def assess(
         Height of the ground [m]. Default: there is none.
     interpolation : str
         Between samples: cubic (a spline through the positions) or linear. Default: cubic.
+    spans : str
+        Vehicles that begin later than others or end earlier, by more than their usual step: refuse, stand (at their
+        first and last place), or away (not judged then). Default: refuse; shows and polynomials stand.
+    gaps : str
+        Times without samples, longer than ten usual steps of a vehicle: refuse, or bridge (by the curve). Default:
+        refuse.
     units : str
         Units of a table's columns that do not name theirs: of time, length and angle, such as ms,mm,deg. Default:
         s,m,rad.
@@ -72,29 +87,38 @@ def assess(
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
     given = {
-        "mission": mission, "separation": separation, "limits": limits, "radius": radius, "ground": ground,
-        "interpolation": interpolation, "units": units, "axes": axes,
+        "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
+        "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
+        "units": units, "axes": axes,
     }  # fmt: skip
     chosen = [key for key, value in given.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
         from rigidfleet.result import Result
 
         if chosen:
-            told = f"--{chosen[0]}: no effect on a result, which has its own mission; remove it"
+            told = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(told)
         result = Result.load(files[0])
     else:
         from rigidfleet.foreign.files import read_trajectories
         from rigidfleet.simulation.trajectories import of_curves
 
-        own = [key for key in ("separation", "radius", "ground", "limits") if key in chosen]
+        own = [key for key in _OWN if key in chosen]
         if mission is not None and own:
-            told = f"--{own[0]}: no effect with --mission, which has its own; remove one"
+            told = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
             raise RigidfleetError(told)
-        read = read_trajectories(files, interpolation or "cubic", units=units, axes=axes)
+        higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
+        read = read_trajectories(
+            files,
+            interpolation or "cubic",
+            spans=spans or "refuse",
+            gaps=gaps or "refuse",
+            units=units,
+            axes=axes,
+        )
         result = of_curves(
-            read.curves, read.assumed, names=read.names, mission=mission, separation=separation,
-            limits=_limits(limits or []), radius=radius or 0.0, ground=ground, name=_name(files[0]),
+            read.curves, read.assumed, names=read.names, away=read.away, mission=mission, separation=separation,
+            limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground, name=_name(files[0]),
         )  # fmt: skip
         result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     verdict = judge(result)

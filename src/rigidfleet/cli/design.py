@@ -48,7 +48,8 @@ def design(
     ----------
     shape : str
         A named shape; a file of points (CSV, NPY or PLY) with x, y, z of one agent per line; a drawing (SVG); or
-        text:WORDS. Drawings and words stand upright, x to the east and z up.
+        text:WORDS, in outlines, or strokes:WORDS, in single strokes. Drawings and words stand upright, x to the east
+        and z up.
     agents : int
         Number of agents. Default: as many as the shape needs, or the file has.
     size : float
@@ -56,7 +57,7 @@ def design(
     spacing : float
         Distance of the nearest two agents of a file or of words [m], which are scaled to it.
     font : str
-        Font of text:WORDS. Default: DejaVu Sans.
+        Font of text:WORDS (default: DejaVu Sans) or of strokes:WORDS (default: futural).
     extra : str
         Number of additional, redundant edges, or "complete" for all pairs.
     sensing_range : float
@@ -99,7 +100,8 @@ def design(
             if len(slots) <= _COMPARED:
                 kinds["all pairs"] = complete_graph(len(slots))
         chosen = [] if edges == "none" else edges or kinds["designed"]
-        text = designs.mission_fragment(name, slots, chosen, reach)
+        text = "".join(f"# {note}\n" for note in notes)
+        text += designs.mission_fragment(name, slots, chosen, reach)
         if colours is not None:
             text += f"colour = {dumps(colours)}\n"
         judged = {what: compare_graph(slots, graph) for what, graph in kinds.items()}
@@ -191,19 +193,26 @@ def points_of(
 ) -> tuple[str, Any]:
     """Name and `formation.point_files.Points` of a named shape, of a file of points or a drawing, or of words.
 
+    Their notes say what of a drawing is left out, and by how much, and why, points are scaled.
+
     Raises
     ------
     ValueError
         The shape does not suit the number of agents or sizes, or an option is missing or has no effect.
     """
+    import numpy as np
+
     from rigidfleet.formation import outlines
     from rigidfleet.formation.point_files import Points, read_points
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.math.rigid_body import centred
+    from rigidfleet.mission.findings import near_shape
 
-    words = shape.removeprefix("text:") if shape.startswith("text:") else None
-    if font is not None and words is None:
-        raise ValueError("--font has no effect without text:WORDS; remove it")
+    kind, _, words = shape.partition(":")
+    letters = {"text": outlines.text_outlines, "strokes": outlines.stroke_outlines}.get(kind)
+    notes: list[str] = []
+    if font is not None and letters is None:
+        raise ValueError("--font has no effect without text:WORDS or strokes:WORDS; remove it")
     if shape in SHAPES:
         form = SHAPES[shape]
         count = form.agents.start if agents is None else agents
@@ -212,23 +221,29 @@ def points_of(
         if agents is None and len(form.agents) > 1:
             raise ValueError(f"takes {agents_taken(shape)}; give --agents")
         return shape, Points(slots(shape, size or [4.0] * form.sizes, count), None)
-    if words is None and not Path(shape).exists():
-        raise ValueError(f"is neither a shape nor a file; shapes: {', '.join(SHAPES)}")
+    if letters is None and not Path(shape).exists():
+        if Path(shape).suffix or len(Path(shape).parts) > 1:
+            raise ValueError("no such file")
+        raise ValueError(f"is neither a shape nor a file: {near_shape(shape)}")
     if size is not None:
         raise ValueError("--size has no effect on a file or on words; use --spacing")
-    if words is not None or Path(shape).suffix.lower() == ".svg":
+    if letters is not None or Path(shape).suffix.lower() == ".svg":
         if agents is None or spacing is None:
             raise ValueError("an outline needs --agents and --spacing")
-        drawn = (
-            outlines.svg_outlines(shape)
-            if words is None
-            else outlines.text_outlines(words, font or "DejaVu Sans")
-        )
-        return words or Path(shape).stem, Points(outlines.on_outlines(drawn, agents, spacing), None)
-    points, colours, notes = read_points(shape, repeated=True)
+        own = [] if font is None else [font]
+        drawn = letters(words, *own) if letters else outlines.svg_outlines(shape, notes)
+        points = outlines.on_outlines(drawn, agents, spacing)
+        wide, _, high = np.ptp(points, axis=0)
+        notes += [
+            f"{wide:,.4g} m wide, {high:,.4g} m high: the nearest two are {spacing:g} m apart"
+        ]
+        return words if letters else Path(shape).stem, Points(points, None, tuple(notes))
+    points, colours, doubts = read_points(shape, repeated=True)
     if agents is not None and agents != len(points):
         kept = outlines.spread(points, agents)
-        points = points[kept]
-        colours = colours and tuple(colours[k] for k in kept.tolist())
-    points = centred(points) if spacing is None else outlines.scaled(points, spacing)
-    return Path(shape).stem, Points(points, colours, notes)
+        points, colours = points[kept], colours and tuple(colours[k] for k in kept.tolist())
+    if spacing is None:
+        return Path(shape).stem, Points(centred(points), colours, doubts)
+    scaled = outlines.scaled(points, spacing)
+    notes += [*doubts, *outlines.scale_in_words(points, scaled)]
+    return Path(shape).stem, Points(scaled, colours, tuple(notes))

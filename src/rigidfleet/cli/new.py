@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -43,6 +44,7 @@ def new(
     name : str
         Name of the mission, written to NAME.toml, or the path of the file.
     shape : str
+        A file of points (CSV, NPY or PLY), a drawing (SVG), text:WORDS or strokes:WORDS, or one of
         line, triangle, square, polygon, hexagon, pyramid, cube, cuboid, v, grid, sphere, shells,
         helix, tetrahedron, octahedron, icosahedron or dodecahedron.
     agents : int
@@ -58,10 +60,11 @@ def new(
     show : bool
         Write a show: take off from a grid, go through formations, return and land.
     formations : str
-        Formations of a show, separated by commas: shapes, files of points, drawings (SVG) or text:WORDS.
+        Formations of a show, separated by commas: shapes, files of points, drawings (SVG), text:WORDS
+        or strokes:WORDS (letters of single strokes).
         Default: sphere,helix.
     spacing : float
-        Distance of neighbours in a show [m]. Default: 2.
+        Distance of the nearest two vehicles [m] in a show (default: 2) or in points, which are scaled to it.
     force : bool
         Overwrite an existing file.
     quiet : bool
@@ -70,6 +73,7 @@ def new(
         Print a description of the mission as JSON. Ask no questions.
     """
     from rigidfleet._common.files import write_file
+    from rigidfleet.formation.shapes import SHAPES
     from rigidfleet.mission import Mission, draft
     from rigidfleet.mission.files import completed
     from rigidfleet.preflight.check import check as preflight
@@ -86,11 +90,12 @@ def new(
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     keep_existing(file, force=force, other="give another name")
+    if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
+        show, formations = True, formations or asked.pop("shape")
     try:
         if show:
-            text = _show(
-                file, asked, formations or "sphere,helix", 2.0 if spacing is None else spacing
-            )
+            spacing = 2.0 if spacing is None else spacing
+            text = _show(file, asked, formations or "sphere,helix", spacing)
         elif formations is not None or spacing is not None:
             raise ValueError("--formations and --spacing are for a show: add --show")
         else:
@@ -120,46 +125,72 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
     ValueError
         An option has no effect on a show, or a formation cannot be made.
     """
-    from rigidfleet.cli.design import points_of
-    from rigidfleet.formation.shapes import SHAPES
-    from rigidfleet.math import proximity
     from rigidfleet.mission import show_draft
 
     options = {"shape": "--shape", "size": "--size", "waypoints": "--to"}
     if unused := " and ".join(option for key, option in options.items() if key in asked):
         raise ValueError(f"{unused}: no effect on a show; use --formations and --spacing")
-    agents, scenes = asked.pop("agents", None), []
+    agents = asked.pop("agents", None)
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
-        files = [w for w in words if Path(w).suffix.lower() in _POINTS and Path(w).exists()]
-        agents = len(points_of(files[0], None)[1].slots) if files else _SHOWN
-    for word in words:
-        path = Path(word)
-        if word in SHAPES or not (word.startswith("text:") or path.exists()):
-            scenes.append(show_draft.scene(word, agents, spacing))
-            continue
-        try:
-            own = points_of(word, None)[1] if path.suffix.lower() in _POINTS else None
-            count = agents if own is None else min(agents, len(own.slots))
-            name, points = points_of(word, count, spacing=spacing)
-        except ValueError as error:
-            raise ValueError(f"{word}: {error}") from None
-        folder, there = file.parent.resolve(), path.resolve()
-        own = None if own is not None and own.notes else own  # with fewer points than the file
-        source, by_name = word, False
-        whole = own is not None and len(own.slots) == count and there.is_relative_to(folder)
-        for note in points.notes:
-            console.err().print(f"Note: {word}: {note}.")
-        if own is not None and whole and proximity.nearest(own.slots).min() >= spacing:
-            source, points, by_name = there.relative_to(folder).as_posix(), own, True
-        scenes.append(show_draft.points_scene(name, points, source, by_name=by_name))
+        counts = (len(points.slots) for word in words if (points := _file_points(word)))
+        agents = next(counts, _SHOWN)
+    scenes = [_scene(file, word, agents, spacing) for word in words]
     return show_draft.show(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
     )
 
 
-#: Files of points, and the number of agents of a show without any.
-_POINTS, _SHOWN = (".csv", ".npy", ".ply", ".txt"), 100
+def _scene(file: Path, word: str, agents: int, spacing: float) -> Any:
+    """A formation of a show of a shape, a file or words.
+
+    Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
+
+    Raises
+    ------
+    ValueError
+        It cannot be made.
+    """
+    from rigidfleet.cli.design import points_of
+    from rigidfleet.formation.shapes import SHAPES
+    from rigidfleet.math import proximity
+    from rigidfleet.mission import show_draft
+
+    if word in SHAPES:
+        return show_draft.scene(word, agents, spacing)
+    folder, there, own = file.parent.resolve(), Path(word).resolve(), _file_points(word)
+    count = agents if own is None else min(agents, len(own.slots))
+    whole = (
+        own is not None
+        and not own.notes
+        and count == len(own.slots)
+        and there.is_relative_to(folder)
+    )
+    if own and whole and spacing <= proximity.nearest(own.slots).min() < math.inf:
+        source = there.relative_to(folder).as_posix()
+        return show_draft.points_scene(Path(word).stem, own, source, by_name=True)
+    try:
+        name, points = points_of(word, count, spacing=spacing)
+    except ValueError as error:
+        raise ValueError(f"{word}: {error}") from None
+    for note in points.notes:
+        console.err().print(f"Note: {word}: {note}.", markup=False)
+    return show_draft.points_scene(name, points, word)
+
+
+def _file_points(word: str) -> Any:
+    """The `Points` of a file; None for a drawing, words, or what is no file."""
+    from rigidfleet.formation.point_files import read_points
+
+    return (
+        read_points(word, repeated=True)
+        if Path(word).suffix.lower() != ".svg" and Path(word).is_file()
+        else None
+    )
+
+
+#: Number of agents of a show without any file of points.
+_SHOWN = 100
 
 
 def _ask(name: str) -> tuple[str, dict[str, Any]]:

@@ -196,21 +196,33 @@ def read_tracks(
     sets = _sets(table, axes, notes)
     time, since = _times(table, notes)
     columns = [k for own in sets.values() for part in own[1:] for k in part]
-    values = dict(zip(columns, table.numbers(columns).T, strict=True))
+    blank = {k for own in sets.values() for k in own.place}
+    values = dict(zip(columns, table.numbers(columns, blank).T, strict=True))
     if not len(time):
         raise fault("has names of columns, but no rows", "Is the file cut off?")
     stack = lambda part, rows: np.column_stack([values[k][rows] for k in part])  # noqa: E731
     groups, identity = dict.fromkeys(sets, np.arange(len(time))), []
     main = next(iter(sets.values()))
     if len(sets) == 1:
+        known, every = np.isfinite([values[k] for k in main.place]).all(axis=0), table.columns
+        if not known.all():
+            notes.append(f"{np.count_nonzero(~known):,} rows without a position are left out")
+            table.lines, table.columns = table.lines[known], [x[known] for x in every]
+            time, values = time[known], {k: x[known] for k, x in values.items()}
         place = stack(main.place, slice(None))
         groups, identity = _vehicles(table, time, place, columns, stem, notes)
+        lost = [x for k in identity for x in {*every[k].tolist()} - {*table.columns[k].tolist()}]
+        if lost or not groups:
+            raise fault(f"{min(lost, default=stem)!r} has no position", "Leave it out")
     elif any(q.kind == "agent" and len(table.codes(k)[1]) > 1 for k, q in enumerate(table.kinds)):
         why = "has places of several vehicles in a row, and names of vehicles, too"
         raise fault(why, "Keep one of them")
     tracks = []
-    for who, rows in groups.items():
+    for who, every in groups.items():
         own = sets.get(who, main)
+        rows = every[np.isfinite(stack(own.place, every)).all(axis=1)]
+        if not len(rows):
+            raise fault(f"{who!r} has no position", "Leave it out")
         velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
         if own.yaw:
             yaw = _yaw(table, values[own.yaw[0]][rows], rows, notes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -22,14 +23,25 @@ from rigidfleet.foreign.columns import Units, units_of
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.math.piecewise import Piecewise
 
-__all__ = ["Interpolation", "Trajectories", "read_trajectories"]
+__all__ = ["Gaps", "Interpolation", "Spans", "Trajectories", "read_trajectories"]
 
 Interpolation = Literal["linear", "cubic"]
+#: What a vehicle does before its first sample and after its last one, while others have samples.
+Spans = Literal["refuse", "stand", "away"]
+#: What a long gap between two samples of a vehicle is: an error, or time in which the curve is believed.
+Gaps = Literal["refuse", "bridge"]
 #: Greatest size of a file [bytes], number of files, and coordinate [m] or time [s] of a trajectory.
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
 _ZIP, _MCAP, _HDF = b"PK", b"\x89MCAP0\r\n", b"\x89HDF"
+#: Suffixes of files of trajectories in a folder.
+_SUFFIXES = {".csv", ".skyc", ".mcap"}
+#: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
+#: positions that are noted.
+_NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
+#: Share of a number that is rounding, and the greatest number of things that a note lists.
+_ROUNDING, _LISTED = 1e-6, 5
 
 
 class Trajectories(NamedTuple):
@@ -38,11 +50,11 @@ class Trajectories(NamedTuple):
     Attributes
     ----------
     names : of the vehicles, in order
-    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown.
-        A vehicle stays where its curve begins or ends before and after it
+    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown
     assumed : the curve that was assumed between the points of the file, in words
     notes : what a reader of the verdict should know, in sentences without a full stop
     read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
+    away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
     """
 
     names: tuple[str, ...]
@@ -50,12 +62,15 @@ class Trajectories(NamedTuple):
     assumed: str
     notes: tuple[str, ...] = ()
     read: tuple[dict[str, Any], ...] = ()
+    away: bool = False
 
 
 def read_trajectories(
     files: str | Path | Sequence[str | Path],
     interpolation: Interpolation = "cubic",
     *,
+    spans: Spans = "refuse",
+    gaps: Gaps = "refuse",
     units: str | None = None,
     axes: str | None = None,
 ) -> Trajectories:
@@ -68,24 +83,30 @@ def read_trajectories(
         it is a vehicle, and each folder in it a vehicle whose CSVs, in the order of their numbers, follow each other
     interpolation : between samples, ``cubic`` (the cubic spline through the positions, with continuous acceleration) or
         ``linear``; formats of polynomials say themselves what is between
+    spans : what a vehicle does that has samples later than others, or no longer, by more than its usual step: it
+        stands at its first or last place, or is ``away``. Within a step it is not judged where it has no samples.
+        Curves of shows and polynomials stand unless they are to be ``away``
+    gaps : whether a time between two samples of more than ten usual steps is an error, or is bridged by the curve
     units : of columns of a table that do not say theirs, of time, length and angle in any order: ``"ms,mm,deg"``
     axes : where x, y and z of a table point: three of e, n, u, w, s and d, such as ``"ned"``
 
     Raises
     ------
     TrajectoryError
-        A file cannot be read; the message names the file and the line or entry.
+        A file cannot be read, or a part of it is not there; the message names the file and the line or entry.
     ValueError
-        The interpolation is unknown.
+        A word is unknown.
     """
-    if interpolation not in get_args(Interpolation):
-        raise ValueError(f"there is no interpolation {interpolation!r}; use linear or cubic")
+    for word, known in ((interpolation, Interpolation), (spans, Spans), (gaps, Gaps)):
+        if word not in get_args(known):
+            raise ValueError(f"there is no {word!r}; use {' or '.join(get_args(known))}")
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
-    listed = [found for path in paths for found in files_of(path)]
+    listed = [group for path in paths for group in files_of(path)]
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
+    left_out = [note for path in paths if path.is_dir() for note in _left_out(path, listed)]
     words = units_of(units, axes)
     parts = _on_one_clock([_of_sequence(group, interpolation, words) for group in listed], listed)
     kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
@@ -95,22 +116,22 @@ def read_trajectories(
             f"{second}: is of another kind than {first}. Give files of one kind for one flight."
         )
     names = [name for part in parts for name in part.names]
+    sources = [group[0] for part, group in zip(parts, listed, strict=True) for _ in part.names]
     if len(set(names)) < len(names):
         names = [f"{group[0].stem}" if len(part.names) == 1 else f"{group[0].stem}/{name}"
                  for part, group in zip(parts, listed, strict=True) for name in part.names]  # fmt: skip
     if len(set(names)) < len(names):
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
-    curves = [curve for part in parts for curve in part.curves]
-    notes = [note for part in parts for note in part.notes]
-    exact = parts[0].assumed in (texts.POLYNOMIALS, shows.BEZIER)
-    notes += _spans(names, curves, listed, exact=exact)
-    if not exact:
-        curves = _common_part(curves)
-    notes = [*dict.fromkeys(notes)]
+    curves = tuple(curve for part in parts for curve in part.curves)
+    notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
     if len(notes) > _NOTES:
         notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
-    return Trajectories(tuple(names), tuple(curves), parts[0].assumed, tuple(notes), _alike(parts))
+    sampled = parts[0].assumed in ASSUMED.values()
+    away = spans == "away" or (sampled and spans == "refuse")
+    read = Trajectories(tuple(names), curves, parts[0].assumed, (), _alike(parts), away)
+    notes += _doubts(read, sources, spans, gaps) if sampled else []
+    return read._replace(notes=(*left_out, *notes, *_spans(read)))
 
 
 def _on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[Trajectories]:
@@ -155,24 +176,72 @@ def _alike(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
 
 
 def files_of(path: Path) -> list[list[Path]]:
-    """The files of a path, those of one vehicle that follow each other together."""
+    """The files of a path, those of one vehicle that follow each other together.
+
+    Raises
+    ------
+    TrajectoryError
+        A folder has files of several kinds or none, or a piece of a sequence is missing.
+    """
     if not path.is_dir():
         return [[path]]
-    inside = sorted((p for p in path.iterdir() if not p.name.startswith(".")), key=_order)
-    recordings = [p for p in inside if p.suffix == ".mcap"]
-    if recordings:
-        return [[p] for p in recordings]
-    tables = [p for p in inside if p.suffix.lower() == ".csv"]
-    if tables:
-        return [[p] for p in tables]
+    inside = sorted(path.iterdir(), key=_order)
+    kinds = {p.suffix.lower() for p in inside if p.is_file()} & _SUFFIXES
+    if len(kinds) > 1:
+        raise TrajectoryError(
+            f"{path}: the folder has files {' and '.join(sorted(kinds))}. Give files of one kind for one flight."
+        )
+    if kinds:
+        return [[p] for p in inside if p.suffix.lower() in kinds and p.is_file()]
     folders = [p for p in inside if p.is_dir()]
-    groups = [sorted(folder.glob("*.csv"), key=_order) for folder in folders]
+    groups = [
+        [p for p in sorted(folder.iterdir(), key=_order) if p.suffix.lower() == ".csv"]
+        for folder in folders
+    ]
     if not groups or not all(groups):
         bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
         raise TrajectoryError(
-            f"{bare}: the folder has no .csv and no .mcap. Give a folder with one table a vehicle."
+            f"{bare}: the folder has no .csv, .skyc or .mcap. Give a folder with one table a vehicle."
         )
+    for group in groups:
+        numbers = zip(*(re.findall(r"\d+", p.stem) for p in group), strict=False)
+        counts = [[int(x) for x in column] for column in numbers if len({*column}) > 1]
+        whole = [[*range(first, first + len(group))] for first in (0, 1)]
+        if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
+            raise TrajectoryError(
+                f"{group[0].parent}: {_some([p.name for p in group])} are no sequence. Number the tables that a "
+                "vehicle flies one after the other from 0 or 1 on, and leave none out."
+            )
     return groups
+
+
+def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
+    """A note on the files in a folder that are not read.
+
+    Raises
+    ------
+    TrajectoryError
+        One of them may be a further vehicle.
+    """
+    read = {p for group in listed for p in group}
+    rest = [p for p in sorted(path.rglob("*"), key=_order) if p.is_file() and p not in read]
+    for p in rest:
+        hidden = p.suffix.lower() in _SUFFIXES
+        with suppress(TrajectoryError):
+            hidden = hidden or bool(_of_file(p, "linear", units_of(None, None)))
+        if hidden:
+            raise TrajectoryError(
+                f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
+                "move it out of the folder."
+            )
+    names = _some([p.relative_to(path) for p in rest])
+    return [f"of '{path.name}', {names} is not read"] if rest else []
+
+
+def _some(things: Sequence[object]) -> str:
+    """The first of some things, and how many more there are."""
+    more = f" and {len(things) - _LISTED:,} more" if len(things) > _LISTED else ""
+    return ", ".join(map(str, things[:_LISTED])) + more
 
 
 def _order(path: Path) -> list[tuple[int, str]]:
@@ -268,40 +337,80 @@ def _check_size(name: str, who: str, curve: Piecewise) -> None:
         )
 
 
-def _spans(
-    names: Sequence[str], curves: Sequence[Piecewise], listed: list[list[Path]], *, exact: bool
-) -> list[str]:
-    """A note if vehicles begin or end at different times.
+def _doubts(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -> list[str]:
+    """Notes on where samples leave open what a vehicle does: gaps, and a standstill that may be one.
 
     Raises
     ------
     TrajectoryError
-        Samples begin or end at times that differ by more than a sample.
+        A vehicle begins or ends by more than its usual step after or before others, or has a long gap, and ``spans``
+        or ``gaps`` do not say what that is.
     """
-    starts = np.array([curve.time[0] for curve in curves])
-    ends = np.array([curve.time[-1] for curve in curves])
-    if exact:
-        if np.ptp(ends) <= 1e-6 and np.ptp(starts) <= 1e-6:
-            return []
-        return [
-            f"vehicles begin between {starts.min():g} and {starts.max():g} s and end between {ends.min():g} and "
-            f"{ends.max():g} s; each stays at its first and last place outside of its time"
-        ]
-    step = max(float(np.diff(curve.time).max()) for curve in curves)
-    for what, t, late in (("begins", starts, starts.max()), ("ends", ends, ends.min())):
-        far = np.abs(t - late)
-        if far.max() > step:
-            i, j = int(far.argmax()), int(far.argmin())
+    names, curves = read.names, read.curves
+    begin, end = min(c.time[0] for c in curves), max(c.time[-1] for c in curves)
+    holes: list[tuple[float, int, int]] = []
+    frozen: list[str] = []
+    for i, (name, curve, source) in enumerate(zip(names, curves, sources, strict=True)):
+        steps, (first, last) = np.diff(curve.time), curve.time[[0, -1]]
+        shares = steps / (np.median(steps) * (1.0 + _ROUNDING))
+        if spans == "refuse" and max(first - begin, end - last) * shares[0] > steps[0]:
             raise TrajectoryError(
-                f"{listed[min(i, len(listed) - 1)][0]}: {names[i]!r} {what} at {t[i]:g} s, and {names[j]!r} at "
-                f"{t[j]:g} s. Give all vehicles the same span of time."
+                f"{source}: {name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s. "
+                "Give all vehicles the same span of time, or say what it does before and after: `assess --spans stand` "
+                "or `--spans away`."
             )
-    return []
+        k = int(shares.argmax())
+        if gaps == "refuse" and shares[k] > _LONGEST:
+            raise TrajectoryError(
+                f"{source}: {name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, "
+                f"{shares[k]:.0f} times its usual step. Give its samples, or let the curve bridge the gap: `assess "
+                "--gaps bridge`."
+            )
+        holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
+        moves = np.linalg.norm(np.diff(curve.pieces[:, :3, 0], axis=0), axis=1)
+        moving = np.flatnonzero(moves > 1e-9)
+        fast = moves[moving] > 0.5 * np.median(moves[moving]) if len(moving) else moving > 0
+        for k in np.flatnonzero((np.diff(moving) > _REPEATED) & fast[:-1] & fast[1:]).tolist():
+            start, stop = curve.time[[moving[k] + 1, moving[k + 1]]]
+            frozen.append(f"{name!r} from {start:g} to {stop:g} s")
+    notes = []
+    for share, i, k in sorted(holes, reverse=True)[:_LISTED]:
+        t = np.linspace(*curves[i].time[k : k + 2], 101)
+        place, nearest = curves[i].at(t)[:, :3], (np.inf, 0.0, "")
+        for name, other in zip(names, curves, strict=True):
+            if other is not curves[i]:
+                inside = np.clip(t, *other.time[[0, -1]])
+                far = np.linalg.norm(other.at(inside)[:, :3] - place, axis=1)
+                far[(inside != t) & read.away] = np.inf
+                nearest = min(nearest, (float(far.min()), float(t[far.argmin()]), name))
+        words = f"{names[i]!r} has no sample between {t[0]:g} and {t[-1]:g} s, {share:.3g} times its usual step: its"
+        words += " curve is assumed there"
+        if nearest[0] < np.inf:
+            words += (
+                f", {nearest[0]:.3g} m from {nearest[2]!r} at {nearest[1]:.3g} s, centre to centre"
+            )
+        notes.append(words)
+    if len(holes) > _LISTED:
+        notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
+    if frozen:
+        words = f"positions repeat to the last digit between moves, {_some(frozen)}"
+        notes.append(f"{words}: a hold, or a tracker that lost sight of it")
+    return notes
 
 
-def _common_part(curves: list[Piecewise]) -> list[Piecewise]:
-    """The part of all curves in which every vehicle has samples."""
-    start, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
-    return [
-        c if c.time[0] == start and c.time[-1] == end else c.between(start, end) for c in curves
+def _spans(read: Trajectories) -> list[str]:
+    """A note if vehicles begin or end at different times."""
+    starts, ends = np.array([curve.time[[0, -1]] for curve in read.curves]).T
+    begin, end = starts.min(), ends.max()
+    part = [
+        f"{name!r} from {a:.9g} to {b:.9g} s"
+        for name, a, b in zip(read.names, starts, ends, strict=True)
+        if max(a - begin, end - b) > 1e-6
     ]
+    if not part:
+        return []
+    if not read.away:
+        return [f"{_some(part)}: each stays at its first and last place outside of its time"]
+    apart = len(starts) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
+    never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
+    return [f"vehicles are judged only where they have data: {_some(part)}{never}"]

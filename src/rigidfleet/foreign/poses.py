@@ -19,6 +19,8 @@ from rigidfleet.math.piecewise import Piecewise
 
 _POSE = "geometry_msgs/msg/PoseStamped"
 _BILLION = 1_000_000_000
+#: Greatest size of what a recording, and a chunk of it, unpack to [bytes].
+_BYTES, _CHUNK = 512 << 20, 32 << 20
 
 
 def read_poses(
@@ -50,9 +52,10 @@ def read_poses(
         time = (
             np.array([row[0] - first for row in rows]) / _BILLION
         )  # whole numbers keep nanoseconds
-        if not np.isfinite(table).all():
-            k = int(np.argmin(np.isfinite(table).all(axis=1)))
-            raise TrajectoryError(f"{name}: {topic}: message {k + 1}: the pose is not finite.")
+        known = np.isfinite(table).all(axis=1)  # the others are gaps
+        if not known.any():
+            raise TrajectoryError(f"{name}: {topic}: no pose is finite. Leave it out.")
+        table, time = table[known], time[known]
         where = lambda k, topic=topic: f"{topic}: message {k + 1}"  # noqa: E731
         offset = 0.0 if dated else first / _BILLION
         curves.append(
@@ -65,9 +68,17 @@ def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
     """Stamp [ns], position and quaternion (scalar last) of each pose, by topic."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
 
     found: dict[str, list[tuple[float, ...]]] = {}
     try:
+        records = StreamReader(io.BytesIO(data), emit_chunks=True).records
+        sizes = [x.uncompressed_size for x in records if isinstance(x, Chunk)]
+        if sum(sizes) > _BYTES or max(sizes, default=0) > _CHUNK:
+            raise TrajectoryError(
+                f"{name}: a chunk of it unpacks to {max(sizes) >> 20} MiB, all to {sum(sizes) >> 20}. Record poses."
+            )
         for schema, channel, message in make_reader(io.BytesIO(data)).iter_messages():
             if schema is None or schema.name not in (_POSE, "geometry_msgs/PoseStamped"):
                 continue

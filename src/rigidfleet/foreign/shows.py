@@ -24,8 +24,13 @@ from rigidfleet.math.piecewise import Piecewise
 
 #: What is between the points of a show.
 BEZIER = "the Bezier curves of the show"
-#: Greatest size of an archive's content [bytes], and greatest number of points between the ends of a segment.
-_BYTES, _INNER = 512 << 20, 6
+#: Greatest size of an archive's content and of one entry [bytes], and greatest number of points between the ends of a
+#: segment.
+_BYTES, _ENTRY, _INNER = 512 << 20, 64 << 20, 6
+#: Memory [bytes] of the objects of CPython for which a character of JSON may stand (a list, a dictionary, a key, a
+#: number, half a text), and the greatest sum for an entry; the greatest number of coefficients of all curves.
+_BECOMES, _MEMORY = {b"[": 88, b"{": 64, b":": 120, b",": 32, b'"': 33}, 320 << 20
+_COEFFICIENTS = 1 << 25
 
 
 def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
@@ -61,6 +66,7 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
         raise TrajectoryError(f"{name}: show.json: has no drones.")
     names: list[str] = []
     curves: list[Piecewise] = []
+    room = _COEFFICIENTS
     for k, drone in enumerate(drones, 1):
         where = f"{name}: show.json: drone {k}"
         settings = _get(drone, "settings", dict, where)
@@ -72,6 +78,9 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
         yaw = settings.get("yawControl")
         turned = None if yaw is None else _resolved(archive, yaw, name, f"{where}: yawControl")
         curves.append(_curve(trajectory, turned, f"{name}: {names[-1]}"))
+        room -= curves[-1].pieces.size
+        if room < 0:
+            raise TrajectoryError(f"{where}: is too much beside those before. Give fewer points.")
     if len(set(names)) < len(names):
         names = [f"{who} ({k})" for k, who in enumerate(names, 1)]
     return tuple(names), tuple(curves)
@@ -79,7 +88,13 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
 
 def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
     try:
-        return json.loads(archive.read(entry), parse_constant=_no_constant)
+        size = archive.getinfo(entry).file_size
+        data = archive.read(entry) if size <= _ENTRY else b""
+        if size > _ENTRY or sum(data.count(x) * each for x, each in _BECOMES.items()) > _MEMORY:
+            raise TrajectoryError(
+                f"{name}: {entry}: has {size >> 20:,} MiB, more than a show needs. Give each drone an entry of its own."
+            )
+        return json.loads(data, parse_constant=_no_constant)
     except KeyError:
         raise TrajectoryError(f"{name}: has no {entry}. Is it a show of Skybrush?") from None
     except (ValueError, zlib.error) as error:

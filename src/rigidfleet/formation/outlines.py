@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 
@@ -18,44 +17,42 @@ from rigidfleet.typing import Floats, Ints
 
 #: Points of an outline among which is chosen, as a multiple of those asked for, and rounds of improvement.
 _DENSE, _ROUNDS = 20, 30
-#: Steps in which a curve is measured.
-_STEPS = 200
+#: Typical distance of neighbours beyond which two points are too near to scale all by them, as a multiple of theirs.
+_UNEVEN = 10.0
 #: Greatest number of points of an outline.
 _MOST = 5000
 
 
-def svg_outlines(path: str | Path) -> list[Floats]:
+def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Floats]:
     """Outlines (K, 2) of the shapes of an SVG drawing as polygons, y up; a closed one ends where it begins.
+
+    Shapes are those that a browser draws. Strokes are drawn by their middle lines, fills by their edges; ``notes``
+    takes what is not drawn.
 
     Raises
     ------
     ValueError
         The file is no SVG drawing, or has no outline.
     RigidfleetError
-        svgpathtools is not installed, or (MissionError) the file cannot be read.
+        svgelements is not installed, or (MissionError) the file cannot be read.
     """
     try:
-        import svgpathtools
+        from rigidfleet.formation.drawings import Drawing
     except ImportError:
         raise RigidfleetError(
-            "Drawings need svgpathtools. Install it: pip install svgpathtools."
+            "Drawings need svgelements. Install it: pip install svgelements."
         ) from None
-    text = read_bytes(path)
+    data = read_bytes(path)
     try:
-        paths = svgpathtools.Document(io.StringIO(text.decode("utf-8-sig"))).paths()
-        parts = [part for found in paths for part in found.continuous_subpaths()]
+        drawing = Drawing(data)
     except Exception as error:  # its parsers raise errors of many kinds
         raise ValueError(f"is no SVG drawing: {' '.join(str(error).split())}") from None
-    found = []
-    for part in parts:
-        ends = [np.array([segment.point(x) for x in _steps(segment)]) for segment in part]
-        z = np.concatenate([[part[0].start], *(end[1:] for end in ends)])
-        found.append(np.column_stack([z.real, -z.imag]))
-    return _drawn(found)
-
-
-def _steps(segment: object) -> Floats:
-    return np.linspace(0.0, 1.0, 2 if type(segment).__name__ == "Line" else _STEPS)
+    said = [f"{what} ({n}x)" if n > 1 else what for what, n in drawing.notes.items()]
+    if not drawing.outlines:
+        raise ValueError("; ".join(["has no outline", *said]))
+    if notes is not None:
+        notes += said
+    return _drawn([x * (1.0, -1.0) for x in drawing.outlines])
 
 
 def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
@@ -77,6 +74,32 @@ def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
         raise ValueError("has no outline")
     path = TextPath((0.0, 0.0), words, size=1.0, prop=FontProperties(family=font))
     return _drawn([np.array(x) for x in path.to_polygons(closed_only=False)])
+
+
+def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
+    """Lines (K, 2) of words in a font of single strokes (Hershey, 1967), of height about 1, as polygons.
+
+    Raises
+    ------
+    ValueError
+        There is no such font, a letter is not in it, or the words have no outline.
+    RigidfleetError
+        Hershey-Fonts is not installed.
+    """
+    try:
+        from HersheyFonts import HersheyFonts
+    except ImportError:
+        raise RigidfleetError(
+            "Words of strokes need Hershey-Fonts. Install it: pip install Hershey-Fonts."
+        ) from None
+    letters = HersheyFonts()
+    letters.load_default_font(font)
+    letters.normalize_rendering(1.0)
+    if missing := "".join(x for x in words if x not in letters.all_glyphs):
+        raise ValueError(f"has letters that {font!r} lacks: {missing}")
+    return _drawn(
+        [np.array(x, dtype=np.float64) for x in map(list, letters.strokes_for_text(words))]
+    )
 
 
 def _drawn(outlines: list[Floats]) -> list[Floats]:
@@ -114,7 +137,36 @@ def scaled(points: ArrayLike, spacing: float) -> Floats:
         raise ValueError(f"a spacing must be a positive length [m], not {spacing:g}")
     if len(p) < 2:
         raise ValueError("a single point has no spacing")
-    return (p - p.mean(axis=0)) * (spacing / float(proximity.nearest(p).min()))
+    if not (least := float(proximity.nearest(p).min())) > 0.0:
+        raise ValueError("two points are the same: nothing scales them apart")
+    return (p - p.mean(axis=0)) * (spacing / least)
+
+
+def scale_in_words(points: Floats, scaled: Floats) -> list[str]:
+    """By how much points (N, 3) [m] are scaled, and why; none if by 1.
+
+    Raises
+    ------
+    ValueError
+        They become larger than points with such a spacing would have to be: a few of them lie too near to each other.
+    """
+    nearest, whom = (x[:, 1] for x in KDTree(points).query(points, 2))
+    one, typical = int(nearest.argmin()), float(np.median(nearest))
+    least, before, after = nearest[one], np.ptp(points, axis=0).max(), np.ptp(scaled, axis=0).max()
+    if abs(after - before) <= 1e-9 * before:
+        return []
+    spacing = least * after / before
+    pair = " and ".join(f"({', '.join(f'{x:.6g}' for x in points[k])})" for k in (one, whom[one]))
+    words = (
+        f"scaled by {after / before:.3g}, from {before:,.4g} m to {after:,.4g} m across: the points {pair} are"
+        f" {least:.3g} m apart, to become {spacing:.3g} m"
+    )
+    if typical > _UNEVEN * least or after > 2.0 * len(points) * spacing:
+        raise ValueError(
+            f"would be {words}, while points typically stand {typical:.3g} m apart; remove one of the two, or ask for"
+            " fewer agents, for which the points that spread most evenly are kept"
+        )
+    return [words]
 
 
 def spread(points: Floats, count: int) -> Ints:

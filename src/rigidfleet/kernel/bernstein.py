@@ -287,6 +287,38 @@ def lowest_overlap(points, reach, floor, pieces):
 
 
 @compiled
+def shortest_above(curve, own, other, altitude, floor, pieces):
+    """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
+    best, at, top, count, close, rate = floor, -1.0, 0, 0, CLOSE, 0.0
+    for k in range(5):
+        for q in range(3):
+            pieces[0, 3 * k + q] = curve[k, q]
+            close = max(close, _ROUNDING * abs(curve[k, q]))
+        if k > 0:
+            rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
+    pieces[0, 15], pieces[0, 16] = 0.0, 1.0
+    while top >= 0:
+        piece, count = pieces[top], count + 1
+        a, b, c = piece[6], piece[7], piece[8]
+        middle, along, high = math.sqrt(a * a + b * b + c * c), math.inf, -math.inf
+        for k in range(5):
+            u, v, w = piece[3 * k], piece[3 * k + 1], piece[3 * k + 2]
+            along = min(along, a * u + b * v + c * w)
+            if k % 4 == 0:
+                x, far = piece[15] + 0.25 * k * piece[16], math.sqrt(u * u + v * v + w * w)
+                z = max(point_at(own, x)[2], point_at(other, x)[2])
+                high = max(high, z)
+                if z >= altitude and far < best:
+                    best, at = far, x
+        # Between its ends, a height rises above the higher one by at most half of its greatest change.
+        bound = max(along / middle, 0.0) if middle > 0.0 else 0.0
+        if high + 2.0 * rate * piece[16] < altitude:
+            bound = math.inf
+        best, at, top = refine(bound, best, at, close, count, top, pieces)
+    return best, at
+
+
+@compiled
 def weights(x, out):
     """Bernstein polynomials (5,) of fourth degree at x."""
     y = 1.0 - x

@@ -5,7 +5,9 @@ Before the laws, `sense` replaces the true state by the measured one. After them
 true state and adds the forces that no vehicle knows.
 """
 
+from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- compiles `height_below`
 from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.solids.distance import height_below
 
 # A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
 # this depth [m] on. It stops within a metre from 40 m/s, and needs no shorter steps than a flight.
@@ -95,7 +97,9 @@ def disturb(t, m, g, disturbance, w):
             w.f_E[i, q] += w.f_D[i, q]
         w.f_E[i, 2] -= (true - m[i]) * g
         if disturbance.lost[i]:
-            damping, lift = contact(true, g, disturbance.floor[i], w.r[i, 2])
+            over = height_below(w.r[i, 0], w.r[i, 1], w.r[i, 2], disturbance.roofs)
+            floor = max(disturbance.floor[i], over + disturbance.radius[i])
+            damping, lift = contact(true, g, floor, w.r[i, 2])
             for q in range(3):
                 w.f_u[i, q] = 0.0
                 w.f_E[i, q] -= damping * w.v[i, q]

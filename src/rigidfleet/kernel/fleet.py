@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
@@ -156,7 +157,9 @@ class Air(NamedTuple):
     ground_effect: bool  # see `aerodynamics.ground_effect`
     density: float  # [kg/m^3]
     ground: float  # height of the ground [m]
-    floor: Floats  # (N,) height at which a lost vehicle comes to rest [m]
+    floor: Floats  # (N,) height at which a lost vehicle comes to rest on it [m]
+    radius: Floats  # (N,) by which this is above the ground [m]
+    roofs: Solids  # boxes and height maps that are ground where they are below a vehicle
 
 
 class Sensing(NamedTuple):
@@ -365,7 +368,8 @@ def quadrotors(vehicles: Sequence[Vehicle], g: float = 9.81) -> Quadrotors:
 
 def still_air(n: int) -> Air:
     """Air at rest, without downwash and ground effect."""
-    return Air(np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, np.full(n, -np.inf))
+    nothing = np.full(n, -np.inf), np.zeros(n), joined([])
+    return Air(np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, *nothing)
 
 
 def exact_sensing(n: int) -> Sensing:

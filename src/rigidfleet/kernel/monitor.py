@@ -27,6 +27,7 @@ from rigidfleet.kernel.bernstein import (
     nearest_box,
     point_at,
     shortest,
+    shortest_above,
     square,
     weights,
 )
@@ -51,6 +52,7 @@ from rigidfleet.kernel.records import (
     LOWEST,
     SEPARATION,
     SEPARATION_BELOW,
+    SEPARATION_FLYING,
     SPEED,
     STANDING,
     TENSION,
@@ -314,6 +316,26 @@ def watch_stacks(t, h, monitor):
 
 
 @compiled
+def watch_flying(t, h, monitor):
+    """Least distance between the surfaces of two agents over a step, while one is at the altitude that counts."""
+    for k in range(monitor.pairs.shape[0]):
+        i, j = monitor.pairs[k, 0], monitor.pairs[k, 1]
+        radii = monitor.radius[i] + monitor.radius[j]
+        floor = monitor.worst[SEPARATION_FLYING] + radii
+        if apart(i, j, 3, floor, monitor):
+            continue
+        own, other = monitor.places[i], monitor.places[j]
+        for s in range(5):
+            for q in range(3):
+                monitor.curve[s, q] = own[s, q] - other[s, q]
+        value, at = shortest_above(
+            monitor.curve, own, other, monitor.altitude, floor, monitor.pieces
+        )
+        if at >= 0.0:
+            take(SEPARATION_FLYING, value - radii, t + at * h, i, j, monitor)
+
+
+@compiled
 def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     """Least of sign r[axis] - offset over a curve (5, 3)."""
     work, bound = monitor.work, math.inf
@@ -455,6 +477,7 @@ def watch_distances(row, p, state, monitor):
     h /= parts
     # Obstacles, pairs one below the other and fences need the curve of each agent.
     heights = monitor.boxes.shape[0] + monitor.columns.shape[0] + monitor.fence.shape[0] == 0
+    heights = heights and monitor.altitude == math.inf
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
@@ -488,6 +511,8 @@ def watch_distances(row, p, state, monitor):
                 watch_obstacles(i, curve, start, h, part == parts - 1, monitor)
         if monitor.columns.shape[0] > 0:
             watch_stacks(start, h, monitor)
+        if monitor.altitude < math.inf:
+            watch_flying(start, h, monitor)
 
 
 # -- forces ------------------------------------------------------------------------------------------

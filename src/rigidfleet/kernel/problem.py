@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet._common.kept import kept
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 
@@ -162,7 +163,9 @@ class Disturbance(NamedTuple):
     noise_r: PlacesInTime  # of the measured position [m]
     noise_v: PlacesInTime  # of the measured velocity [m/s]
     lost: Annotated[Bools, Extents(("N",))]  # without thrust
-    floor: PerAgent  # height at which a lost vehicle comes to rest [m]
+    floor: PerAgent  # height at which a lost vehicle comes to rest on the ground [m]
+    radius: PerAgent  # by which this is above the ground [m]
+    roofs: Solids  # boxes and height maps that are ground where they are below a vehicle
 
 
 class External(NamedTuple):
@@ -306,7 +309,7 @@ def no_disturbance(masses: Floats) -> Disturbance:
     none = zeros(0, n, 3)
     return Disturbance(
         False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
-        np.full(n, -np.inf),
+        np.full(n, -np.inf), np.zeros(n), joined([]),
     )  # fmt: skip
 
 

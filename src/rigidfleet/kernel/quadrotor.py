@@ -13,6 +13,7 @@ from rigidfleet.kernel.disturbances import contact
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
 from rigidfleet.kernel.vectors import in_vectors
+from rigidfleet.solids.distance import height_below
 
 #: Rows of `SampledWork.y`.
 _START, _TRIAL, _RATES, _END = 0, 1, 2, 6
@@ -47,7 +48,8 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
     m, inertia = vehicles.m[i], vehicles.inertia[i]
     damping, lift = 0.0, 0.0
     if vehicles.lost[i]:
-        damping, lift = contact(m, vehicles.g, around.floor[i], y[2])
+        over = height_below(y[0], y[1], y[2], around.roofs) + around.radius[i]
+        damping, lift = contact(m, vehicles.g, max(around.floor[i], over), y[2])
     if vehicles.point[i]:
         point_derivative(y, command, i, vehicles, air, push, dy)
     else:
@@ -69,7 +71,9 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
         M0 = M1 = M2 = momentum = turning = 0.0
         gain = 1.0
         if around.ground_effect:
-            gain = ground_effect(y[2] - around.ground, vehicles.radius[i], vehicles.span[i])
+            over = max(around.ground, height_below(y[0], y[1], y[2], around.roofs))
+            if over > -math.inf:
+                gain = ground_effect(y[2] - over, vehicles.radius[i], vehicles.span[i])
         k0, k1, k2 = (
             gain * vehicles.thrust[i, 0],
             gain * vehicles.thrust[i, 1],

@@ -29,10 +29,10 @@ LEAST_ERROR = math.log(1e-4)
 #: Quantities of a `Monitor`. A smaller value of `worst` is worse; greatest values are stored with the opposite sign.
 #: One whose value is -infinity is not searched for.
 (
-    SEPARATION, LOST, SEPARATION_BELOW, CLEARANCE, STANDING, FLYING, GEOFENCE, LOWEST, HIGHEST, SPEED, THRUST,
-    THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT, HORIZONTAL_SPEED, VERTICAL_SPEED,
+    SEPARATION, LOST, SEPARATION_BELOW, SEPARATION_FLYING, CLEARANCE, STANDING, FLYING, GEOFENCE, LOWEST, HIGHEST,
+    SPEED, THRUST, THRUST_MARGIN, ACCELERATION, CONSTRAINT_FORCE, TENSION, CONSTRAINT, HORIZONTAL_SPEED, VERTICAL_SPEED,
     HORIZONTAL_ACCELERATION, VERTICAL_ACCELERATION,
-) = range(20)  # fmt: skip
+) = range(21)  # fmt: skip
 QUANTITIES = VERTICAL_ACCELERATION + 1
 #: Place among a monitor's flags of the numbers of steps to search, and the number that stands for all of them.
 LISTED, ANY_STEP = 4, -1
@@ -82,9 +82,9 @@ NO_TRAIL = Trail(np.zeros((0, 2)), np.zeros((0, 5, 0)), np.zeros((0, 0)), np.zer
 class Monitor(NamedTuple):
     """Worst values of a phase in continuous time, with the data and work arrays of the search; see `kernel.monitor`."""
 
-    worst: Floats  # (20,) by quantity; infinity if there is none yet
-    when: Floats  # (20,) [s]
-    who: Ints  # (20, 2) agents; agent and obstacle; agents of an edge; -1: none
+    worst: Floats  # (21,) by quantity; infinity if there is none yet
+    when: Floats  # (21,) [s]
+    who: Ints  # (21, 2) agents; agent and obstacle; agents of an edge; -1: none
     sign: Floats  # (1,) of the greatest tension
     radius: PerAgent  # [m]
     left: Annotated[Bools, Extents(("N",))]  # whether an agent is monitored: not lost
@@ -92,6 +92,9 @@ class Monitor(NamedTuple):
     standing: Annotated[Ints, Extents(("N",))]
     low: Places  # clearance, time and obstacle of agents that may be landing; infinity: none
     pad: float  # clearance within which an agent may stand on an obstacle [m]
+    altitude: (
+        float  # z from which on `SEPARATION_FLYING` counts [m]; infinity: it is not searched for
+    )
     boxes: Corners  # of obstacles; of the ground infinite
     fence: Corners  # of the geofence, if there is one
     pairs: Pairs  # whose separation is monitored
@@ -133,7 +136,7 @@ def monitor(
         "worst": np.full(count, np.inf), "when": np.zeros(count), "sign": np.zeros(1),
         "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
         "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
-        "low": np.full((n, 3), np.inf), "pad": 0.0, "pairs": none, "struck": none, "columns": none,
+        "low": np.full((n, 3), np.inf), "pad": 0.0, "altitude": np.inf, "pairs": none, "struck": none, "columns": none,
         "flags": np.array([0, 0, 0, 0, ANY_STEP, ANY_STEP]),
         "listed": np.zeros((2, 0), dtype=np.int64), "moves": np.zeros(2),
         "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),

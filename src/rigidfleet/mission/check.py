@@ -73,7 +73,7 @@ def check(data: Mapping[str, Any], origin: str, shared: Shared | None = None) ->
     if collector.findings:  # the other checks would take long
         raise MissionError(collector.findings)
     parts = _tables(collector)
-    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _geofence, _yaw, _planned):
+    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _limits, _yaw, _planned):
         judge(collector, parts)
     n = _count(data)
     parts["obstacles"] = _obstacles(collector)
@@ -331,10 +331,13 @@ def _allocation(collector: FindingCollector, parts: dict[str, Any]) -> None:
         collector.add(("allocation", "torque_split"), problem, "remove it or use method = 'pinv'")
 
 
-def _geofence(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    fence = parts.get("limits", Limits()).geofence
-    if fence is not None:
-        _ordered(collector, fence, ("limits", "geofence"))
+def _limits(collector: FindingCollector, parts: dict[str, Any]) -> None:
+    limits = parts.get("limits", Limits())
+    if limits.geofence is not None:
+        _ordered(collector, limits.geofence, ("limits", "geofence"))
+    if limits.separation_altitude is not None and limits.separation is None:
+        where, problem = ("limits", "separation_altitude"), "has no effect without separation"
+        collector.add(where, problem, "remove it or add separation")
 
 
 def _yaw(collector: FindingCollector, parts: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ import io
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,6 +32,8 @@ from rigidfleet.mission.text import unread
 
 #: What stands before the digest of a file.
 _DIGEST = "SHA-256 "
+#: What stands before the notes on a file.
+_DOUBTS = ". Note: "
 #: What a text has that may name a file.
 _MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
 #: What is said where a file cannot be found, because a mission is not from a file itself.
@@ -53,10 +55,11 @@ class _Named(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What a file gives: rows of numbers (of trajectories: of each vehicle), and colours of points if it has them."""
+    """What a file gives: rows of numbers (of trajectories: of each vehicle), colours of points if any, and notes."""
 
     rows: list[Any]
     colours: tuple[str, ...] | None = None
+    notes: Sequence[str] = ()
 
 
 def completed(text: str, path: Path) -> str:
@@ -93,8 +96,10 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     for named in list(_named(data)):
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
-        rows, colours = named.read(content, str(path.parent / name))
+        rows, colours, notes = named.read(content, str(path.parent / name))
         told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
+        if notes:
+            told += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
         digests.append(f"# {named.where}: {told}\n")
         del named.table[named.key]
         if named.becomes == "trajectories":
@@ -117,8 +122,14 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
 
 def digests(text: str) -> str:
     """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
-    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}$", text, re.MULTILINE)
+    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?$", text, re.MULTILINE)
     return "".join(f"{line}\n" for line in dict.fromkeys(found))
+
+
+def doubts(text: str) -> list[str]:
+    """What is said of the files of a mission's text, each with what was read of it."""
+    lines = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$", text, re.MULTILINE)
+    return [f"{what}: {notes}" for what, notes in dict.fromkeys(lines)]
 
 
 def _names(path: Path, named: _Named) -> list[str]:
@@ -209,13 +220,36 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
             raise unread(
                 name, doubt, "say units or axes beside the file: units = 'ms', axes = 'ned'"
             )
-    curves = [curve.later(-curve.time[0]) for curve in read.curves]
+    curves, notes = [*read.curves], [*read.notes]
+    begin, end = max(c.time[0] for c in curves), min(c.time[-1] for c in curves)
     if read.assumed in ASSUMED.values():
-        curves = [least_jerk(curve) for curve in curves]
+        if any((c.time[[0, -1]] != (begin, end)).any() for c in curves):
+            notes.append(f"only the time of which all have data is flown, {begin:g} to {end:g} s")
+        curves = [least_jerk(c.between(begin, end)) for c in curves]
+    else:
+        begin = min(c.time[0] for c in curves)
+        curves = [c.on(np.union1d(begin, c.time), stays=True) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         why = next((note for note in read.notes if "yaw" in note), "has no yaw")
         raise unread(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
-    return Content([curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves])
+    rows = [curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves]
+    return Content(rows, notes=notes)
+
+
+#: A height that no terrain has [m], and one by which files mark cells without data besides such heights.
+_NOWHERE, _MARK = 9000.0, -999.0
+#: The remedy for these.
+FILL = "fill the cells, for example from their neighbours, or cut the map"
+
+
+def without_data(heights: Any) -> str:
+    """Where heights (I, J) [m] have cells without data, as elevation models mark them (NaN, -9999, -32768, ...)."""
+    z = np.asarray(heights, dtype=float)
+    cells = np.argwhere(~(np.abs(z) < _NOWHERE) | (z == _MARK))
+    if not len(cells):
+        return ""
+    i, j = cells[0]
+    return f"has {len(cells):,} cells without data, the first in row {i + 1}, column {j + 1}: {z[i, j]:g}"
 
 
 def _heights(data: bytes, name: str) -> Content:
@@ -230,9 +264,11 @@ def _heights(data: bytes, name: str) -> Content:
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
         raise unread(name, "is not a table of numbers", remedy) from None
-    if found.ndim != 2 or not found.size or not np.isfinite(found).all():
+    if found.ndim == 2 and (why := without_data(found)):
+        raise unread(name, why, FILL)
+    if found.ndim != 2 or not found.size:
         remedy = "give two or more rows of heights [m]"
-        raise unread(name, "is not a table of finite numbers", remedy)
+        raise unread(name, "is not a table of numbers", remedy)
     if found.size > bounds.HEIGHTS:
         problem = f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
         raise unread(name, problem, "use a coarser grid")

@@ -32,7 +32,7 @@ def check(
 ) -> None:
     """Find the errors of lost vehicles and links, of what follows, and of landings."""
     phases: Sequence[AnyPhase] = parts["phases"]
-    grounded = any(thing.kind == "ground" for thing in parts["obstacles"])
+    grounded = any(thing.kind in ("ground", "heights", "box") for thing in parts["obstacles"])
     no_ground = "needs a ground, and the mission has none"
     remedy = "add [[obstacles]] with kind = 'ground'"
     for k, p in enumerate(phases):

@@ -8,6 +8,7 @@ from functools import cache, cached_property, wraps
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
 from rigidfleet._common.kept import kept
@@ -30,6 +31,8 @@ from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
+from rigidfleet.solids.distance import height_below
+from rigidfleet.solids.records import Solids, joined
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Smallest and largest damping that "auto" uses. Below, rounding errors show; docs/robustness.md has the measurements.
@@ -466,6 +469,27 @@ class Mission(Contents):
         for values in fleet:
             values.flags.writeable = False
         return fleet
+
+    @cached_property
+    def ground(self) -> float:
+        """Height of the highest `ground` [m]; minus infinity if there is none."""
+        return max((o.height for o in self.obstacles if o.kind == "ground"), default=-np.inf)
+
+    @cached_property
+    def roofs(self) -> Solids:
+        """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
+        things = (o for o in self.obstacles if o.kind in ("box", "heights") and not o.zone)
+        return joined([o.solid for o in things if not o.solid.moves])
+
+    def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
+        """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.
+
+        It is that of the highest ground, terrain (`heights`) or roof (the upper side of a `box`, turned or not), of
+        those whose underside is not above z [m]. Zones, obstacles that move, appear or vanish, and other shapes do not
+        count, and neither does a box of whose upper side z is more than a metre below: it is beside.
+        """
+        x, y, z = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (x, y, z)))
+        return np.maximum(height_below(x, y, z, self.roofs), self.ground)
 
     @cached_property
     def tracking_gains(self) -> tuple[float, float]:

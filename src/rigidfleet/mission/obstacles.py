@@ -13,7 +13,7 @@ from pydantic import Field
 
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
-from rigidfleet.mission.files import NOT_A_FILE
+from rigidfleet.mission.files import FILL, NOT_A_FILE, without_data
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.values import (
     Angle,
@@ -316,6 +316,8 @@ def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> None:
         problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
         remedy = "give two rows or more, all of the same length, two or more"
         collector.add((*path, "heights"), problem, remedy, None)
+    elif why := without_data(thing.heights):
+        collector.add((*path, "heights"), why, FILL, None)
     elif count > bounds.HEIGHTS:
         problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"
         collector.add((*path, "heights"), problem, "use a coarser grid", None)

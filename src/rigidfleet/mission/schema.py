@@ -36,6 +36,7 @@ from rigidfleet.mission.values import (
     BodyDrag,
     Coefficient,
     Colour,
+    Coordinate,
     Cost,
     Damping,
     Delay,
@@ -558,6 +559,11 @@ class Limits(Part):
     separation: LengthOrZero | None = Field(
         None, description="minimum separation of agents [m]: centre distance minus radii"
     )
+    separation_altitude: Coordinate | None = Field(
+        None,
+        description="altitude z [m] from which on `separation` holds: two agents that are both below it, as on their "
+        "pads, may be nearer, but not touch; default: it always holds",
+    )
     separation_allowance: LengthOrZero = Field(
         0.1,
         description="how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
@@ -575,6 +581,11 @@ class Limits(Part):
     tracking_error: Length | None = Field(
         None, description="maximum distance of a vehicle from the slot that it tracks [m]"
     )
+
+    @property
+    def separation_always(self) -> float | None:
+        """Minimum separation at all altitudes [m]; None if there is none."""
+        return self.separation if self.separation_altitude is None else None
 
 
 class Gusts(Part):

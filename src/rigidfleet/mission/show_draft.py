@@ -77,13 +77,14 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
 
 
 def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
-    """A formation of points, written as numbers, or by the name of their file."""
-    slots, colours, _ = points
+    """A formation of points, written as numbers, with their notes as comments, or by the name of their file."""
+    slots, colours, notes = points
     if by_name:
         return Scene(name, slots, f"slots = {json.dumps(source)}\n")
     lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"
     rows = "".join(f"    {row},\n" for row in np.round(slots + 0.0, 6).tolist())
-    return Scene(name, slots, f"# points of {json.dumps(source)}\nslots = [\n{rows}]\n{lights}")
+    about = "".join(f"# {note}\n" for note in (f"points of {json.dumps(source)}", *notes))
+    return Scene(name, slots, f"{about}slots = [\n{rows}]\n{lights}")
 
 
 def _rested(one: Scene, agents: int) -> Scene:
@@ -124,7 +125,12 @@ def show(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = scene(ground, agents, spacing)._replace(name="pads")
-    scenes = [_rested(one, agents) for one in scenes]
+    tables, scenes = {"pads": pads}, [_rested(one, agents) for one in scenes]
+    for i, one in enumerate(scenes):
+        key, k = one.name, 2
+        while key == "pads" or tables.get(key, one).table != one.table:
+            key, k = f"{one.name} {k}", k + 1
+        scenes[i] = tables[key] = one._replace(name=key)
     for one in scenes:
         if len(one.slots) != agents:
             raise ValueError(f"'{one.name}' has {len(one.slots)} points for {agents} agents")
@@ -135,7 +141,6 @@ def show(
     height = max(_LOWEST, math.ceil(max(-one.slots[:, 2].min() for one in scenes) + _ALOFT))
     start = radius + _STANDS
     climb = blend_time(height - start)
-    tables = {one.name: one for one in (pads, *scenes)}
     places, lasts, phases, taken = pads.slots, 2.0 * climb, [], set[str]()
     for k, one in enumerate([*scenes, pads]):
         slots = one.slots - one.slots.mean(axis=0)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.kept import kept
+from rigidfleet.errors import Finding, MissionError
 from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS
 from rigidfleet.math import attitude as att
 from rigidfleet.math.piecewise import Piecewise
@@ -20,7 +21,6 @@ from rigidfleet.mission import Fly, Mission, Phase
 from rigidfleet.mission.kinds import (
     Brake,
     Follow,
-    Land,
     Orbit,
     Reshape,
     Steering,
@@ -268,19 +268,35 @@ def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     assert now.goal is not None
     assert now.slots is not None
     n = mission.n_agents
-    place = now.goal.r[2] + now.slots @ now.goal.T[:, 2]
-    over = phase.height if isinstance(phase, Takeoff) else ABOVE + mission.fleet.radius
-    up = _ground(mission) + over - place
-    if isinstance(phase, Land):
-        up = np.minimum(up, 0.0)
+    place, ground = now.goal.r[2] + now.slots @ now.goal.T[:, 2], _grounds(mission, now)
+    if isinstance(phase, Takeoff):
+        up = ground.max() + phase.height - place
+    else:
+        up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
     goes = np.ones(n, dtype=np.bool_) if not phase.agents else np.zeros(n, dtype=np.bool_)
     goes[np.array(phase.agents, dtype=np.int64) - 1] = True
     return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
 
 
-def _ground(mission: Mission) -> float:
-    """Height of the highest ground [m]."""
-    return max((o.height for o in mission.obstacles if o.kind == "ground"), default=-math.inf)
+def _grounds(mission: Mission, now: PhaseState) -> Floats:
+    """Height (N,) [m] of what is below each vehicle at the pose to hold; of a lost one, the least of the others'.
+
+    Raises
+    ------
+    MissionError
+        There is nothing below a vehicle.
+    """
+    assert now.goal is not None
+    assert now.slots is not None
+    r = now.goal.r + now.slots @ now.goal.T
+    heights = mission.height_at(*r.T)
+    flying = np.ones(len(r), dtype=np.bool_) if now.lost is None else ~now.lost
+    if len(off := np.flatnonzero(flying & ~np.isfinite(heights))):
+        x, y, _ = r[off[0]]
+        problem = f"needs a ground, and none is below agent {off[0] + 1} at ({x:.1f}, {y:.1f}) m"
+        remedy = "add [[obstacles]] with kind = 'ground', or more terrain"
+        raise MissionError([Finding(mission.origin, "phases", None, problem, remedy)])
+    return np.where(flying, heights, heights[flying].min())
 
 
 def height(mission: Mission, now: PhaseState) -> float:
@@ -289,7 +305,7 @@ def height(mission: Mission, now: PhaseState) -> float:
     assert now.slots is not None
     left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
     below = now.goal.r[2] + now.slots @ now.goal.T[:, 2] - mission.fleet.radius
-    return float(below[left].min()) - _ground(mission) - ABOVE
+    return float(below[left].min() - _grounds(mission, now).min()) - ABOVE
 
 
 def _led(

@@ -28,14 +28,15 @@ def disturbance(mission: Mission) -> Disturbance:
     if d is None:
         return none
     wind = np.array(d.wind)
-    grounds = [thing.height for thing in mission.obstacles if thing.kind == "ground"]
     out = none._replace(
         active=True,
         m=mission.true_mass,
         inverse=1.0 / mission.true_mass,
         drag=mission.drag,
         wind=wind,
-        floor=max(grounds, default=-math.inf) + mission.fleet.radius,
+        floor=mission.ground + mission.fleet.radius,
+        radius=mission.fleet.radius,
+        roofs=mission.roofs,
     )
     if d.gusts is not None:
         step = gust_step(d.gusts, float(np.linalg.norm(wind)))

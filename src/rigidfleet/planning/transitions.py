@@ -20,7 +20,6 @@ from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Go, Reshape, Vertical
-from rigidfleet.mission.obstacles import Ground
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.preview import at_start, leg
 from rigidfleet.planning.reference import PhaseState
@@ -143,8 +142,7 @@ def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
     if pose is None:
         return box
     radius, fence = float(mission.fleet.radius.max()), mission.limits.geofence
-    grounds = [o.height + radius for o in mission.obstacles if isinstance(o, Ground)]
-    lowest = np.array([-np.inf, -np.inf, max(grounds, default=-np.inf)])
+    lowest = np.array([-np.inf, -np.inf, mission.ground + radius])
     within = np.array([lowest, [np.inf] * 3])
     if fence is not None:
         within = np.array(

@@ -66,16 +66,17 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Flight
         np.full((n, 3), mission.tracking.integral),
     )
     around = disturbance(mission)
-    grounds = [thing.height for thing in mission.obstacles if thing.kind == "ground"]
     air = found.air._replace(
         wind=around.wind,
         gust_step=around.gust_step,
         gust=around.gust,
         downwash=d is not None and d.downwash,
-        ground_effect=d is not None and d.ground_effect and bool(grounds),
+        ground_effect=d is not None and d.ground_effect,
         density=DENSITY,
-        ground=max(grounds, default=0.0),
+        ground=mission.ground,
         floor=around.floor,
+        radius=around.radius,
+        roofs=around.roofs,
     )
     return found._replace(air=air, guidance=guidance, sensing=_sensing(mission))
 

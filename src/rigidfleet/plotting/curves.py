@@ -483,7 +483,7 @@ def _who(result: Result, name: str, first: int, second: int) -> str:
 def draw_separation(ax: Axes, result: Result) -> None:
     """Least distance between the surfaces of two agents, with its limit."""
     ax.set_ylabel("between agents [m]")
-    least = result.mission.limits.separation
+    least = result.mission.limits.separation_always
     words = "contact" if least is None else f"limit {least:g} m"
     none = "only one agent" if result.n_agents == 1 else "unknown"
     _draw_least(ax, result, "separation", none, least or 0.0, words)

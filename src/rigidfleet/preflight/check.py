@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
+from rigidfleet.mission.files import doubts
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import timed
 from rigidfleet.planning.vehicles import reserves, vehicle_lags
@@ -72,6 +73,7 @@ def check(
         found.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     found.remarks = [
+        *(Remark("note", "files", text) for text in doubts(mission.text)),
         *formation_remarks(mission, formations),
         *gain_remarks(mission, found),
         *margin_remarks(found),

@@ -40,8 +40,8 @@ class Remark:
     Attributes
     ----------
     level : "fails" or "note"
-    topic : formation, gains, margins, collision, avoidance, downwash, assignment, thrust, disturbances, obstacle,
-        geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (not checked, or
+    topic : files, formation, gains, margins, collision, avoidance, downwash, assignment, thrust, disturbances,
+        obstacle, geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (not checked, or
         estimated)
     text : the problem or note in words
     """

@@ -37,16 +37,19 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if mission.n_agents < 2:
         return
     radius, limit = mission.fleet.radius, mission.limits.separation or 0.0
+    lowest = mission.limits.separation_altitude
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
     for number, planned in enumerate(found.planned_phases):
         ends: list[tuple[float, float, tuple[int, ...]]] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
-        separations, pairs = proximity.separation(positions, radius)
+        # Where separation begins at an altitude, agents below it are left to the verdict.
+        flying = positions[..., 2] >= (-np.inf if lowest is None else lowest)
+        separations, pairs = proximity.separation_of_left(positions, radius, flying)
         for k in [int(separations.argmin())] if planned.path_ends is None else [0, -1]:
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
-        bent = planned.leg.reference.knots
-        if len(bent) and planned.path_ends is None and (proved := planned.certificate) is not None:
+        bent = len(planned.leg.reference.knots) and planned.path_ends is None and flying.all()
+        if bent and (proved := planned.certificate) is not None:
             ends = [(proved.separation, proved.time, proved.agents)]
         if planned.path_ends is not None:
             certificate = planned.certificate or straight(planned.leg.reference, radius)
@@ -54,7 +57,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             separation, who = certificate.separation, certificate.agents
             crossing = separation, certificate.time, who
             least = min(least, crossing)
-            beyond = separation <= 0 or separation < limit - SLACK
+            beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
             if beyond and separation < min(ends)[0] - SLACK:
                 yield _crossing(mission, planned, crossing, limit)
         for k, at in enumerate(ends):

@@ -107,7 +107,8 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "source": mission.source,
         "passed": verdict.passed,
         "head": _head(len(judged), len(failed)),
-        "words": [f.message for f in failed] or [verdict.summary.split("\n")[0].partition("; ")[2]],
+        "words": [f.message for f in failed]
+        or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "facts": _facts(result),
         "checks": [_check(check) for check in verdict.checks],

@@ -15,6 +15,7 @@ from rigidfleet.result.result import (
     VARIABLES,
     Result,
     as_result,
+    there,
 )
 
 __all__ = [
@@ -31,4 +32,5 @@ __all__ = [
     "Result",
     "Variable",
     "as_result",
+    "there",
 ]

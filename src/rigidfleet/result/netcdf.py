@@ -55,6 +55,7 @@ class Statistics(TypedDict, total=False):
     rtol: float
     atol: float
     solvers: dict[str, dict[str, float]]
+    spans: list[tuple[float, float]]
 
 
 #: Attributes of a file and their types. Types other than int and str are stored as JSON.

@@ -86,8 +86,9 @@ class PhaseRecord:
     abandoned : whether the loss of a vehicle or link ended it, before its own end
     planned : certificate of the planned paths, before the flight: {"separation" [m], "time" [s], "agents" from 0,
         "how"}. None if agents track no slots, there is a single agent, or a controller of the user's flew
-    extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below, lost
-        (distance of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
+    extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below,
+        separation_flying (with an agent at limits.separation_altitude or above), lost (distance
+        of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
         speed [m/s]; acceleration [m/s^2]; where there is a limit by direction, `DIRECTIONS`; thrust, thrust_margin
         (thrust minus its limit), constraint_force, tension [N]; constraint [m]; of vehicles also rotor_force [N] (of
         the rotor nearest to its limit), tilt [rad],

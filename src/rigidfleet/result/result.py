@@ -451,6 +451,8 @@ class Result:
             return f"the mission has {mission.n_agents} agents, the arrays have {self.n_agents}"
         if mission.vehicle_models is not None and self.rotor_force is None:
             return "it flies vehicles with rotors, of which the arrays have none"
+        if len(self.statistics.get("spans", ())) not in (0, self.n_agents):
+            return "the file has spans of other agents"
         if not np.array_equal(mission.edges, self.edges):
             return "the edges of its formations differ from those of the arrays"
         named = [
@@ -468,7 +470,9 @@ class Result:
 
     @cached_property
     def left(self) -> Bools:
-        """Mask (K, N) of the agents that are not lost at the time of each sample."""
+        """Mask (K, N) of the agents that are not lost at the time of each sample, or that a file has then."""
+        if spans := self.statistics.get("spans"):
+            return there(self.time, spans, self.n_agents)
         lost_at = self.mission.lost_at
         if self.time[-1] <= lost_at.min():
             return np.ones((len(self.time), len(lost_at)), dtype=np.bool_)
@@ -488,10 +492,8 @@ class Result:
         from rigidfleet.mission import KINDS  # takes long to load
 
         off = np.full(self.n_agents, np.inf)
-        ground = max(
-            (o.height for o in self.mission.obstacles if o.kind == "ground"), default=-np.inf
-        )
-        over = self.position[:, :, 2] - self.mission.fleet.radius - ground
+        over = self.position[:, :, 2] - self.mission.fleet.radius
+        over = over - self.mission.height_at(*np.moveaxis(self.position, 2, 0))
         down = self.left & (over <= PAD)
         for i, phase in enumerate(self.phases):
             k = self.samples(i).stop - 1
@@ -661,7 +663,18 @@ _CHECKED = {
 }
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 #: Quantities whose minimum is the worst value. The same holds for all clearances.
-_LEAST = frozenset(("separation", "separation_below", "lost", "lowest", "guarantee"))
+_LEAST = frozenset(
+    ("separation", "separation_below", "separation_flying", "lost", "lowest", "guarantee")
+)
+
+
+def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
+    """Mask (K, N) of n agents that are there at times (K,) [s], each after the begin of its span and up to its end [s].
+
+    An agent that is there at the first time counts then, too; without spans, all agents always do.
+    """
+    begin, end = np.reshape(spans or [(-np.inf, np.inf)] * n, (n, 2)).T
+    return ((time[:, None] > begin) | (begin <= time[0])) & (time[:, None] <= end)
 
 
 def as_result(given: Result | str | Path) -> Result:

@@ -52,6 +52,7 @@ _NAMES = {
     "separation": records.SEPARATION,
     "lost": records.LOST,
     "separation_below": records.SEPARATION_BELOW,
+    "separation_flying": records.SEPARATION_FLYING,
     "clearance": records.CLEARANCE,
     "geofence": records.GEOFENCE,
     "lowest": records.LOWEST,
@@ -120,11 +121,16 @@ class CurveWatch:
         self._take_obstacles(obstacles)
         fence = limits.geofence
         self.fence = np.array([] if fence is None else [*fence.min, *fence.max]).reshape(-1, 6)
+        lowest = limits.separation_altitude
+        self.altitude = math.inf if lowest is None else lowest
+        #: Of a large fleet, pairs that come as near as this [m] are listed: who is farther away in flight is not known.
+        self.reach = -math.inf if lowest is None or self.n <= _FEW else limits.separation or 0.0
         self.stacks = self.n <= _FEW or limits.separation_below is not None
         #: Whether there are limits by direction: only then is what they limit searched for.
         self.directed = any(getattr(limits, name) is not None for name in DIRECTIONS)
         count = records.QUANTITIES
         self.none = np.full(count, np.inf)
+        self.none[records.SEPARATION_FLYING] = abs(self.reach)
         self.none[records.HORIZONTAL_SPEED :] = np.inf if self.directed else -np.inf
         self.worst, self.when = self.none.copy(), np.zeros(count)
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
@@ -153,8 +159,8 @@ class CurveWatch:
             records.monitor(
                 self.radius, self.boxes, self.fence, states, gauge,
                 worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
-                standing=self.standing, low=self.low, pad=PAD, pairs=self.pairs, columns=self.columns,
-                struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
+                standing=self.standing, low=self.low, pad=PAD, altitude=self.altitude, pairs=self.pairs,
+                columns=self.columns, struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
             )
         )  # fmt: skip
 
@@ -172,6 +178,14 @@ class CurveWatch:
         self.take_path(
             problem, work, state._replace(trail=trail, count=np.array([0, 0, 0, 0, len(clock), 0]))
         )
+
+    def only(self, left: Bools) -> None:
+        """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
+        self.left[:] = left
+        self._list_all()
+        if "monitor" in vars(self):
+            self._watch_listed(0.0)
+        self.moved[:] = np.inf  # of a large fleet, no pairs are listed yet
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
@@ -245,11 +259,12 @@ class CurveWatch:
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
+        none = self.none.tolist()
         new = tuple.__new__  # an extremum by its own name takes twice as long
         found = {
             name: new(Extremum, (sign * worst[k], when[k], *who[k]))
             for name, k, sign in _STORED
-            if -math.inf < worst[k] < math.inf
+            if -math.inf < worst[k] < none[k]
         }
         if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
             found["tension"] = tension._replace(value=-tension.value)
@@ -355,6 +370,7 @@ class CurveWatch:
         size = float(np.linalg.norm(np.ptp(x, axis=0))) / math.sqrt(len(who))
         spare = max(_SPARE * float(np.median(near[:, 1])), _LEAST * size, 1.01 * moves, 1e-6)
         least = min(float(separations.min()), float(self.worst[records.SEPARATION]))
+        least = max(least, self.reach)
         pairs = who[tree.query_pairs(least + widest + spare, output_type="ndarray")]
         self.pairs = np.ascontiguousarray(np.sort(pairs, axis=1))
         if self.stacks:

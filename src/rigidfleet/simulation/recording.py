@@ -332,9 +332,13 @@ def distances(
     worst: Sequence[dict[str, Extremum]],
     places: Places,
     time: Floats,
+    left: Bools | None = None,
 ) -> dict[str, Any]:
-    """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme."""
-    left = _left(mission, time)
+    """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme.
+
+    Vehicles count that are not lost, or those ``left`` (K, N).
+    """
+    left = _left(mission, time) if left is None else left
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
     close = proximity.closeness(places.joined, mission.agents.radius, mission.obstacles, time, left)

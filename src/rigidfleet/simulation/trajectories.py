@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from rigidfleet.kernel import records
 from rigidfleet.math import series
 from rigidfleet.math.bernstein import SIZES, greatest
 from rigidfleet.math.piecewise import (
+    SAME,
     Piecewise,
     common_knots,
     join,
@@ -30,7 +32,7 @@ from rigidfleet.math.piecewise import (
     refine,
 )
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.result import Extremum, PhaseRecord, Result
+from rigidfleet.result import Extremum, PhaseRecord, Result, there
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
 from rigidfleet.simulation.extremes import CurveWatch
@@ -46,7 +48,7 @@ _MOST, _TOGETHER = 5e8, 400_000
 #: Time between samples [s], unless the trajectory itself has more; about so many in all, and steps of all vehicles
 #: beside obstacles.
 _STEP, _SAMPLES, _WATCHED = 0.05, 400_000, 2_000_000
-#: Where a start is moved to zero: a time of a clock, not of a flight [s].
+#: From where on a start, as one before zero, is moved to zero: a time of a clock, not of a flight [s].
 _CLOCK = 1e5
 NAMES = {
     1: ASSUMED["linear"],
@@ -204,7 +206,8 @@ def judged_as(
     ResultError
         The mission has another number of vehicles.
     """
-    phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": max(duration, 1e-3)}
+    lasting = max(duration, 1e-3)
+    phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": lasting}
     agents: dict[str, Any] = {"position": start.tolist()}
     if mission is not None:
         own = mission if isinstance(mission, Mission) else load_mission(mission)
@@ -227,12 +230,18 @@ def judged_as(
         if ground is not None:
             data["obstacles"] = [{"kind": "ground", "height": ground}]
         agents |= {"radius": radius, "mass": 1.0}
-    step = {"output_step": phase["duration"]} if duration < _STEP else {}
-    return Mission.from_plain(data | step | {"agents": agents, "phases": [phase]}, "the limits")
+    step = min(lasting, max(_STEP, 1e-5 * lasting))  # which nothing flies
+    more = {"output_step": step, "agents": agents, "phases": [phase]}
+    return Mission.from_plain(data | more, "the limits")
 
 
 def of_curve(
-    curve: Piecewise, interpolation: str, *, names: Sequence[str] = (), **judged: Any
+    curve: Piecewise,
+    interpolation: str,
+    *,
+    names: Sequence[str] = (),
+    spans: Sequence[Sequence[float]] = (),
+    **judged: Any,
 ) -> Result:
     """A result of a curve (K, N, 4, P) of x, y, z [m] and yaw [rad]; see `trajectories`. Yaw is NaN if it is not known.
 
@@ -240,6 +249,7 @@ def of_curve(
     ----------
     interpolation : what the curves are, in words
     names : of the vehicles, where they come from
+    spans : from when to when [s] each vehicle is there; empty: all always are
     judged : see `judged_as`
 
     Raises
@@ -249,8 +259,8 @@ def of_curve(
     MissionError
         A limit is invalid.
     """
-    if abs(curve.time[0]) > _CLOCK or curve.time[0] < 0.0:
-        curve = curve.later(-curve.time[0])
+    zero = 0.0 if 0.0 <= curve.time[0] <= _CLOCK else float(curve.time[0])
+    curve, spans = curve.later(-zero), np.subtract(spans, zero).tolist()
     _refuse_jumps(curve)
     time, n, powers = curve.time, curve.pieces.shape[1], curve.pieces.shape[-1]
     span = float(time[-1] - time[0])
@@ -260,6 +270,10 @@ def of_curve(
     _refuse_too_many(n, int(parts.sum()) + 1)
     start = curve.at(time[:1])[0, :, :3]
     mission = judged_as(start, span, **judged)
+    if zero and any(thing.solid.moves for thing in mission.obstacles):
+        raise ResultError(
+            f"the trajectories begin at {zero:.9g} s, and obstacles move from 0 s on. Let both count from one zero."
+        )
     watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, float(time[0]))
     # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
     near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
@@ -269,35 +283,40 @@ def of_curve(
     for k in range(0, len(parts), together):  # in blocks, to save memory
         block = curve.part(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
-        _watch(watch, way, grid)
+        _watch(watch, way, grid, spans)
         _accelerations(fastest, way, directed=watch.directed)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
+    watch.only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.phase())
     watch.flight([record])
     record.extremes.update(fastest)
     at, state, yaws = _samples(curve, parts)
     if powers < 3:  # lines turn at once at samples
         state[2:] = np.nan
-    return _result(mission, record, at, state, yaws, interpolation, names)
+    facts = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
+    return _result(mission, record, at, state, yaws, facts)
 
 
 def of_curves(
-    curves: Sequence[Piecewise], interpolation: str, *, names: Sequence[str] = (), **judged: Any
+    curves: Sequence[Piecewise], interpolation: str, *, away: bool = False, **judged: Any
 ) -> Result:
     """A result of curves with times of their own; before and after its own, a vehicle stays where it is.
 
     Parameters
     ----------
     interpolation, judged : see `of_curve`
-    names : of the vehicles, where they come from
+    away : a vehicle is not judged before and after its own times
 
     Raises
     ------
     ResultError, MissionError
         As for `of_curve`.
     """
-    _refuse_too_many(len(curves), len(common_knots(curves)))
-    return of_curve(join(curves), interpolation, names=names, **judged)
+    knots = common_knots(curves)
+    _refuse_too_many(len(curves), len(knots))
+    ends = knots[np.searchsorted(knots, [curve.time[[0, -1]] - 2.0 * SAME for curve in curves])]
+    spans = ends.tolist() if away and np.ptp(ends, axis=0).any() else ()
+    return of_curve(join(curves), interpolation, spans=spans, **judged)
 
 
 def _refuse_too_many(n: int, times: int) -> None:
@@ -374,15 +393,27 @@ def _split(time: Floats, parts: Ints) -> Floats:
     return np.append(time[k] + np.diff(time)[k] * share, time[-1])
 
 
-def _watch(watch: CurveWatch, way: Piecewise, grid: Floats) -> None:
-    """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree."""
+def _watch(
+    watch: CurveWatch, way: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
+) -> None:
+    """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree.
+
+    Vehicles are watched in their ``spans`` alone, if there are any.
+    """
     knots = refine(way.time, grid, 1e-6)
     k = piece_at(way.time, 0.5 * (knots[:-1] + knots[1:]))
     share = np.diff(knots) / np.diff(way.time)[k]
     knots = _split(knots, np.ceil(_parts(way)[k] * share - 1e-9).astype(np.int64))
     together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
-    for first in range(0, len(knots) - 1, together):
-        part = way.on(knots[first : first + together + 1])
+    here = there(0.5 * (knots[:-1] + knots[1:]), spans, way.pieces.shape[1] if spans else 1)
+    change = np.flatnonzero((here[1:] != here[:-1]).any(axis=1)) + 1
+    starts = np.union1d(np.arange(0, len(here), together), change)
+    for first, last in pairwise([*starts.tolist(), len(here)]):
+        if spans:
+            watch.only(here[first])
+        if not here[first].any():
+            continue
+        part = way.on(knots[first : last + 1])
         at = [x.within(records.KNOTS) for x in (part, part.rate())]
         points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
         clock = np.column_stack([part.time[:-1], np.diff(part.time)])
@@ -423,11 +454,11 @@ def _result(
     time: Floats,
     state: Floats,
     yaw: Floats,
-    interpolation: str,
-    names: Sequence[str],
+    statistics: dict[str, Any],
 ) -> Result:
     r, v, a, j = state
     k, n = r.shape[:2]
+    left = there(time, statistics["spans"], n)
     turned = np.nan_to_num(yaw, copy=False)
     sizes = {"time": k, "agent": n, "axis": 3, "quaternion": 4, "wrench": 6, "edge": 0}
     nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
@@ -445,9 +476,9 @@ def _result(
     }
     result = Result(
         **known, **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
-        statistics={"interpolation": interpolation, "names": list(names)},
+        statistics=statistics,
         later=[
-            (CLOSE, partial(distances, mission, [record.extremes], Places([r], n), time)),
+            (CLOSE, partial(distances, mission, [record.extremes], Places([r], n), time, left)),
             (("mission_text",), partial(text_of, mission)),
         ],
     )  # fmt: skip

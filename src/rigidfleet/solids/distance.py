@@ -328,6 +328,42 @@ def is_below(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     return (nearer >= STEEP * _LOWERED) & still
 
 
+#: How far below the top of a box a point still counts as on it, rather than beside it [m]: as far as what hits the top
+#: goes in.
+_DEEP = 1.0
+#: What makes a quotient by zero infinite, and changes no other; a place beyond all solids [m].
+_TINY, _FAR = 1e-200, 1e30
+
+
+def column(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
+    """Lowest and highest z [m] of solid b, a box or a height map at rest, over points (x, y) of the world.
+
+    Where there is nothing of it, the first is above the second.
+    """
+    o, T, size = s.origin[b], s.turn[b], s.size[b]
+    x, y = choose(np.isfinite(x), x, _FAR) - o[0], choose(np.isfinite(y), y, _FAR) - o[1]
+    if s.turned[b] == 0 or s.kind[b] == HEIGHTS:
+        over = (x >= size[0]) & (x <= size[3]) & (y >= size[1]) & (y <= size[4])
+        top = below(x, y, b, s)[2] if s.kind[b] == HEIGHTS else size[5]
+        return choose(over, size[2], math.inf), choose(over, top, -math.inf)
+    low, top = x * 0.0 - math.inf, x * 0.0 + math.inf
+    for k in range(3):
+        a, d = T[k, 0] * x + T[k, 1] * y - T[k, 2] * o[2], T[k, 2] + _TINY
+        u, v = (size[k] - a) / d, (size[k + 3] - a) / d
+        low, top = np.maximum(low, np.minimum(u, v)), np.minimum(top, np.maximum(u, v))
+    return low, top
+
+
+def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
+    """Height [m] of the highest of all solids, boxes and height maps at rest, below points; minus infinity: none."""
+    height = x * 0.0 - math.inf
+    for b in range(s.kind.shape[0]):
+        low, top = column(x, y, b, s)
+        on = (low <= top) & (z >= low) & ((z >= top - _DEEP) | (s.kind[b] == HEIGHTS))
+        height = choose(on, np.maximum(height, top), height)
+    return height
+
+
 # -- many boxes ----------------------------------------------------------------------------------------
 
 #: Least distances to boxes, and these boxes (N, K), of agents (K, N, 3) with radii (N,), to boxes (B, 6).
@@ -348,5 +384,5 @@ def nearest_boxes() -> Nearest | None:
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
     from_box, box_normal, from_cylinder, cylinder_normal, off_segment, side, off_triangle, below, off_surface, within,
-    signed_distance, outward_normal, displacement, is_there, own_axes, is_below,
+    signed_distance, outward_normal, displacement, is_there, own_axes, is_below, column, height_below,
 )  # fmt: skip

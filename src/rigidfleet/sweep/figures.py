@@ -329,7 +329,8 @@ def _limits(table: Table) -> dict[str, float]:
     found = {
         "speed": limits.speed,
         "acceleration": limits.acceleration,
-        "separation": limits.separation,
+        "separation": limits.separation_always,
+        "separation_flying": limits.separation,
         "separation_below": limits.separation_below,
         "thrust": min(agents.thrust_limit),
         "clearance": 0.0 if table.sweep.mission.obstacles else None,

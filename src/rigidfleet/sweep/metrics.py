@@ -56,6 +56,7 @@ METRICS: dict[str, Metric] = {
     "waypoint_rates": Metric("deg s-1", "largest error of body rates at a waypoint or stay"),
     "separation": Metric("m", "minimum separation of two agents: centre distance minus radii"),
     "separation_below": Metric("m", "minimum height above another agent minus radii"),
+    "separation_flying": Metric("m", "minimum separation from limits.separation_altitude on"),
     "clearance": Metric("m", "minimum clearance to an obstacle: distance minus radius"),
     "geofence": Metric("m", "maximum distance outside the geofence; negative inside"),
     "thrust": Metric("N", "thrust closest to or farthest beyond its limit; peak if there is none"),
@@ -79,6 +80,10 @@ METRICS: dict[str, Metric] = {
     "steps": Metric("1", "steps of the integrator"),
     "evaluations": Metric("1", "evaluations of the right-hand side"),
 }
+
+
+#: Metrics that are the worst values of checks.
+_OF_CHECKS = "separation_below", "separation_flying", "geofence", "thrust", "tilt", *DIRECTIONS
 
 
 def readable(unit: str) -> str:
@@ -110,7 +115,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     for f in verdict.checks:
         if f.worst is None:
             continue
-        if f.check in ("separation_below", "geofence", "thrust", "tilt", *DIRECTIONS):
+        if f.check in _OF_CHECKS:
             worst[f.check] = f.worst
         elif f.check == "rotor_force" and f.limit is not None:
             worst["rotor_share"] = f.worst / f.limit

@@ -282,10 +282,11 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
 
 
 def _landing(monitor: Monitor) -> bool:
-    """Whether an agent stands on an obstacle or may be landing, or there is a fence."""
+    """Whether an agent stands on an obstacle or may be landing, or there is a fence or an altitude of flight."""
     # Of few numbers, Python's own take less time than NumPy's.
     low = min(monitor.low[:, 0].tolist())
-    return low < math.inf or any(monitor.standing.tolist()) or len(monitor.fence) > 0
+    fenced = len(monitor.fence) > 0 or monitor.altitude < math.inf
+    return low < math.inf or any(monitor.standing.tolist()) or fenced
 
 
 @compiled

@@ -369,9 +369,7 @@ class Pilot:
         slots = self.flight.plan.slots
         assert slots is not None  # every formation flown has slots
         size = np.linalg.norm(slots, axis=1).max() + max(self.mission.agents.radius)
-        ground = max(
-            (o.height for o in self.mission.obstacles if o.kind == "ground"), default=-np.inf
-        )
+        ground = float(self.mission.height_at(*r))
         return np.array([r[0], r[1], max(r[2], ground + size + 0.5)])
 
     def _follow(self, h: float) -> None:

@@ -232,7 +232,7 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
         )
     if len(mission.edges):
         plots.append({"title": "Constraint error", "column": "error plot", "log": True})
-    least = {"worst": "least", "least": limits.separation}
+    least = {"worst": "least", "least": limits.separation_always}
     if n > 1:
         plots.append({"title": "Separation", "column": "separation plot", **least})
     if mission.obstacles:
