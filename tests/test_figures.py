@@ -924,6 +924,19 @@ def test_a_figure_fits_its_column(triangle, tmp_path, width):
         assert image.width / image.info["dpi"][0] * 25.4 == pytest.approx(width, abs=0.5)
 
 
+@pytest.mark.parametrize("n", [3, 8, 12, 13])
+@pytest.mark.parametrize("width", [80.0, 130.0, None])
+def test_the_legend_of_a_trajectory_covers_nothing(n, width):
+    """However many rows it has, the legend is below the axes and their names."""
+    result = a_flight(n=n, formation=None, samples=20)
+    (figure,) = plotting.plot(result, names=["trajectory"], width=width)
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    above = figure.axes[1].get_tightbbox()
+    assert above is not None
+    assert legend.get_window_extent().y1 <= above.y0
+
+
 @pytest.mark.parametrize("width", [80.0, 88.0, 130.0])
 def test_words_at_a_point_are_on_the_page(width):
     """Wherever the least clearance of a flight is, what is written beside it is in its axes."""
@@ -1067,6 +1080,7 @@ def test_the_summary_is_on_the_page(flight):
         figure = drawn("summary", simulate(load_mission(flight)))
     for ax in figure.axes[1:]:
         box = ax.get_tightbbox()
+        assert box is not None
         assert figure.bbox.x0 <= box.x0 < box.x1 <= figure.bbox.x1, ax.get_ylabel()
         assert figure.bbox.y0 <= box.y0 < box.y1 <= figure.bbox.y1, ax.get_ylabel()
 
