@@ -118,11 +118,12 @@ def _figures_page() -> str:
             continue
         for mission in row["missions"]:
             title = tomllib.loads(missions.mission_text(mission))["title"]
-            parts.append(f"*{title}.*\n\n```sh\nrigidfleet run {mission}\n```")
+            more = "" if {*row["figures"]} <= {"summary", "trajectory"} else " --figures all"
+            parts.append(f"*{title}.*\n\n```sh\nrigidfleet run {mission}{more}\n```")
             for name in row["figures"]:
                 parts.append(
                     f"![{name} of {mission}](figures/{mission}-{name}.svg)\n"
-                    f'<span class="caption">flights/{mission}/figures/{name}.svg</span>'
+                    f'<span class="caption">flights/{mission}/figures/{name}.png</span>'
                 )
     return "\n\n".join(parts)
 

@@ -431,10 +431,10 @@ def test_ten_thousand_drones(tmp_path):
 
 
 def test_assess_writes_what_a_flight_has(tmp_path, capsys):
-    """Verdict, result, report and replay; exit codes as for a flight."""
+    """Verdict, result, report, replay and figures, of which none outlives its flight; exit codes as for a flight."""
     out = tmp_path / "out"
     options = ["assess", str(SEVEN), "--limits", "speed=0.3,vertical_speed=0.19", "--out", str(out)]
-    assert main([*options, "--separation", "0.2"]) == PASSED
+    assert main([*options, "--separation", "0.2", "--figures", "all"]) == PASSED
     text = " ".join(capsys.readouterr().out.split())
     assert "centre to centre is 0.286 m" in text
     assert "the polynomials of the file" in text
@@ -449,6 +449,8 @@ def test_assess_writes_what_a_flight_has(tmp_path, capsys):
     assert "the polynomials of the file" in page
     assert "Gains" not in page
     assert main([*options, "--separation", "0.2"]) == BAD_INPUT
+    assert main([*options, "--separation", "0.2", "--force"]) == PASSED
+    assert [path.name for path in (out / "figures").iterdir()] == ["trajectory.png"]
     capsys.readouterr()
     assert main(["assess", str(SEVEN), "--separation", "0.3"]) == FAILED
     assert main(["assess", str(out / "sequence_trajectories.nc")]) == PASSED

@@ -10,7 +10,6 @@ import sys
 import time
 import tomllib
 from collections.abc import Sequence
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -19,14 +18,13 @@ import pytest
 from rich.console import Console
 
 from rigidfleet.cli import app as cli
-from rigidfleet.cli import codes, console, drawing
-from rigidfleet.cli.run import write_figures
-from rigidfleet.errors import FlightError, ResultError
+from rigidfleet.cli import codes, console
+from rigidfleet.errors import FlightError
 from rigidfleet.formation.graphs import neighbours
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.formation.shapes import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
-from rigidfleet.plotting import figure_names, rendered
+from rigidfleet.plotting import figure_names
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian, spectrum
 from rigidfleet.rigidity.design import design
@@ -679,15 +677,14 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
-@pytest.mark.parametrize(("at_once", "during"), [(1, "plotting.rendered"), (2, "plotting.write")])
-def test_interrupt_of_drawing(capsys, monkeypatch, at_once: int, during: str):
-    """Ctrl-C while figures are drawn, here or by processes, leaves the flight as it is, and says so."""
+@pytest.mark.parametrize("during", ["rendered", "write"])
+def test_interrupt_of_drawing(capsys, monkeypatch, during: str):
+    """Ctrl-C while figures are drawn or written leaves the flight as it is, and says so."""
 
     def draw(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: at_once)
-    monkeypatch.setattr(f"rigidfleet.{during}", draw)
+    monkeypatch.setattr(f"rigidfleet.plotting.{during}", draw)
     assert cli.main(["run", "short.toml"]) == codes.INTERRUPTED
     assert capsys.readouterr().err.startswith(
         "Interrupted: the complete flight is saved in flights"
@@ -724,17 +721,35 @@ def plot(monkeypatch):
         return dict.fromkeys(formats, b"drawn" if titles else b"bare")
 
     monkeypatch.setattr("rigidfleet.plotting.rendered", draw)
-    monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: 1)  # others would not know of it
 
 
-def test_run_draws(capsys, plot):
-    """Figures are drawn into a folder of their own, each as PNG."""
-    assert cli.main(["run", "short.toml"]) == codes.PASSED
+@pytest.mark.parametrize("options", [[], ["--figures", "few"], ["--figures", "all"]])
+def test_run_draws(capsys, plot, options):
+    """A summary and a trajectory, or all that has something to show, go into a folder of their own, each as PNG."""
+    assert cli.main(["run", "short.toml", *options]) == codes.PASSED
     found = {p.name for p in Path("flights/short/figures").iterdir()}
     known = figure_names(Result.load("flights/short/short.nc"))
-    assert found == {f"{name}.png" for name in known}
+    assert len(known) > 4
+    drawn = known if "all" in options else ["summary", "trajectory"]
+    assert found == {f"{name}.png" for name in drawn}
     where = os.path.join("flights", "short", "figures") + os.sep
     assert f"Figures  {where} ({len(found)} files)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_the_verdict_is_printed_before_figures_are_drawn(capsys, monkeypatch, options):
+    """When the first figure is begun, the verdict stands there already, in words or as JSON."""
+    before = []
+
+    def draw(result, name, formats, **_):
+        before.append(capsys.readouterr().out)
+        return dict.fromkeys(formats, b"drawn")
+
+    monkeypatch.setattr("rigidfleet.plotting.rendered", draw)
+    assert cli.main(["run", "short.toml", *options]) == codes.PASSED
+    assert len(before) == 2
+    verdict = Path("flights/short/verdict.json").read_text(encoding="utf-8")
+    assert before[0] == verdict if options else "Passed" in before[0]
 
 
 @pytest.mark.parametrize("command", [["run", "short.toml"], ["report", "flights/short/short.nc"]])
@@ -749,7 +764,7 @@ def test_width_of_figures(capsys, plot, command, width):
 def test_formats_and_titles_of_figures(capsys, plot):
     """--format, repeated, says which files are drawn, --no-titles how; what was drawn before is replaced or kept."""
     figures = Path("flights/short/figures")
-    options = ["--format", "pdf", "--format", "svg", "--no-titles"]
+    options = ["--format", "pdf", "--format", "svg", "--no-titles", "--figures", "all"]
     assert cli.main(["run", "short.toml", *options]) == codes.PASSED
     known = figure_names(Result.load("flights/short/short.nc"))
     assert {p.name for p in figures.iterdir()} == {
@@ -757,8 +772,9 @@ def test_formats_and_titles_of_figures(capsys, plot):
     }
     assert {p.read_text(encoding="utf-8") for p in figures.iterdir()} == {"bare"}
     assert f"({2 * len(known)} files)" in capsys.readouterr().out
+    png = ["--format", "png", "--figures", "all"]
     assert cli.main(["run", "short.toml"]) == codes.BAD_INPUT, "the PDFs are files of that flight"
-    assert cli.main(["report", "flights/short/short.nc", "--format", "png"]) == codes.PASSED
+    assert cli.main(["report", "flights/short/short.nc", *png]) == codes.PASSED
     assert (figures / "cm.png").read_text(encoding="utf-8") == "drawn"
     assert (figures / "cm.svg").read_text(encoding="utf-8") == "bare"
     assert cli.main(["run", "short.toml", "--force", "--format", "png"]) == codes.PASSED
@@ -768,62 +784,11 @@ def test_formats_and_titles_of_figures(capsys, plot):
     assert '"png", "svg", "pdf"' in capsys.readouterr().err
 
 
-def test_figures_are_the_same_from_processes_side_by_side(folder, monkeypatch):
-    """Processes side by side draw the files that this one draws, and say what they cannot write."""
-    assert cli.main(["run", "short.toml", "--no-figures"]) == codes.PASSED
-    result = Result.load("flights/short/short.nc")
-    drawn = {}
-    for count in (1, 2):
-        monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda count=count: count)
-        figures = {
-            folder / str(count) / name: ["png", "svg"] for name in ("cm", "inputs", "clearance")
-        }
-        drawing.prepare()
-        with drawing.Drawings(figures, partial(rendered, result)) as pictures:
-            written = write_figures(pictures)
-            assert {path.with_suffix("") for path in written} == set(figures)
-            assert len(pictures._processes) == (count if count > 1 else 0)
-        drawn[count] = {p.name: p.read_bytes() for p in (folder / str(count)).iterdir()}
-    assert len(drawn[1]) == 6
-    assert drawn[1] == drawn[2]
-    write(folder / "taken", "a file")
-    there = {folder / "taken" / name: ["png"] for name in ("cm", "inputs", "clearance")}
-    drawing.prepare()
-    with (
-        pytest.raises(ResultError, match="cannot be written"),
-        drawing.Drawings(there, partial(rendered, result)) as pictures,
-    ):
-        write_figures(pictures)
-
-
-@pytest.mark.parametrize(
-    ("what", "does"),
-    [
-        ("multiprocessing.connection.Pipe", OSError("too many open files")),
-        ("multiprocessing.context.ForkProcess.start", BlockingIOError("too many processes")),
-        ("rigidfleet.cli.drawing._serve", None),
-        ("rigidfleet.cli.drawing._answer", None),
-    ],
-)
-def test_figures_are_drawn_where_processes_fail(folder, monkeypatch, what: str, does):
-    """No pipes, no processes, or some that end at once: this process draws every figure."""
-
-    def fail(*_, **__):
-        raise does
-
-    assert cli.main(["run", "short.toml", "--no-figures"]) == codes.PASSED
-    monkeypatch.setattr("rigidfleet.cli.drawing.at_once", lambda: 2)
-    monkeypatch.setattr(what, fail if does else lambda *_: os._exit(1))
-    assert cli.main(["run", "short.toml", "--force"]) == codes.PASSED
-    drawn = {path.stem for path in Path("flights/short/figures").iterdir()}
-    assert drawn == set(figure_names(Result.load("flights/short/short.nc")))
-
-
 @pytest.mark.long
 def test_demo(folder):
-    """The demonstration passes its verdict, may be repeated, and leaves every figure."""
+    """The demonstration passes its verdict, may be repeated, and leaves every figure that is wanted."""
     for _ in range(2):
-        done = command("run", "narrow-passage", "--force")
+        done = command("run", "narrow-passage", "--force", "--figures", "all")
         assert done.returncode == codes.PASSED, done.stderr
     figures = folder / "flights" / "narrow-passage" / "figures"
     found = {path.name for path in figures.iterdir() if path.stat().st_size > 10_000}
@@ -840,7 +805,7 @@ def test_report(capsys, plot):
     figures = Path("flights/short/figures")
     figures.mkdir()
     write(figures / "cm.png", "earlier")
-    assert cli.main(["report", "flights/short/short.nc"]) == codes.PASSED
+    assert cli.main(["report", "flights/short/short.nc", "--figures", "all"]) == codes.PASSED
     out, err = capsys.readouterr()
     assert "Passed" in out
     assert "2 existing files kept" in err

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any, Literal
 
-from rigidfleet.cli import console, drawing
+from rigidfleet.cli import console
 from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.outputs import Files, keep_existing
 from rigidfleet.errors import RigidfleetError
@@ -32,6 +32,7 @@ def assess(
     axes: str | None = None,
     explain: bool = False,
     out: Path | None = None,
+    figures: Literal["few", "all"] = "few",
     force: bool = False,
     json: bool = False,
 ) -> int:
@@ -75,6 +76,8 @@ def assess(
         Say first what was read: vehicles, span, columns used and ignored, units and axes.
     out : Path
         Folder for a result, the verdict, a report, a replay and figures. Default: write nothing.
+    figures : str
+        Which to draw into the folder: few (summary and trajectory) or all that show something. Default: few.
     force : bool
         Overwrite existing files.
     json : bool
@@ -85,8 +88,6 @@ def assess(
 
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
-    if out is not None:
-        drawing.prepare()
     given: dict[str, Any] = {
         "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
         "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
@@ -133,15 +134,16 @@ def assess(
         console.out().print(verdict)
     if made is not None:
         from rigidfleet.cli.report import write_report
-        from rigidfleet.cli.run import drawings, list_files, write_figures, write_replay
+        from rigidfleet.cli.run import list_files, of_formats, write_figures, write_replay
 
         make_folder(made.folder)
-        with drawings(result, made.figures, None) as pictures:
-            result.save(made.result)
-            write_file(made.verdict, (verdict.json() + "\n").encode())
-            write_report([result], [verdict], made.report, quiet=json)
-            write_replay(result, made.replay)
-            write_figures(pictures, quiet=json)
+        result.save(made.result)
+        for earlier in made.figures:
+            earlier.unlink(missing_ok=True)
+        write_file(made.verdict, (verdict.json() + "\n").encode())
+        write_report([result], [verdict], made.report, quiet=json)
+        write_replay(result, made.replay)
+        write_figures(result, of_formats(made.figures, figures, None), quiet=json)
         if not json:
             console.out().print()
             list_files(made)

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from rigidfleet.cli import console, drawing
+from rigidfleet.cli import console
 from rigidfleet.cli.outputs import Files, keep_existing
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.run import Format, drawings, list_files, of_formats, write_figures, write_replay
+from rigidfleet.cli.run import (
+    Format,
+    check_width,
+    list_files,
+    of_formats,
+    write_figures,
+    write_replay,
+)
 
 
 def report(
@@ -22,6 +29,7 @@ def report(
     *others: Path,
     out: Path | None = None,
     force: bool = False,
+    figures: Literal["few", "all"] = "few",
     no_figures: bool = False,
     format: list[Format] | None = None,
     no_titles: bool = False,
@@ -44,6 +52,8 @@ def report(
         comparison.html the current folder.
     force : bool
         Overwrite existing files. Without it they are kept.
+    figures : str
+        Which files to draw: few (summary and trajectory) or all that show something. Default: few.
     no_figures : bool
         Write no figure files. The report has its figures in any case.
     format : list
@@ -61,9 +71,7 @@ def report(
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 
-    drawing.check_width(width)
-    if not (no_figures or others):
-        drawing.prepare()
+    check_width(width)
     paths = [result, *others]
     records = [Result.load(path) for path in paths]
     if others:
@@ -87,16 +95,15 @@ def report(
     else:
         if not (json or quiet):
             console.out().print(verdicts[0])
-        drawn = [] if no_figures else of_formats(files.figures, format)
+        drawn = [] if no_figures else of_formats(files.figures, figures, format)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:
             write_file(files.verdict, (verdicts[0].json() + "\n").encode())
         left = [path for path in drawn if path not in kept]
-        with drawings(records[0], left, format, titles=not no_titles, width=width) as pictures:
-            if files.report not in kept:
-                write_report(records, verdicts, files.report, quiet=quiet)
-            write_figures(pictures, quiet=quiet)
+        if files.report not in kept:
+            write_report(records, verdicts, files.report, quiet=quiet)
+        write_figures(records[0], left, quiet=quiet, titles=not no_titles, width=width)
         if not (json or quiet):
             console.out().print()
             list_files(files)

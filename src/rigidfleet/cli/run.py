@@ -6,13 +6,12 @@ import os
 import signal
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from rigidfleet.cli import console, drawing
+from rigidfleet.cli import console
 from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
 
@@ -25,8 +24,8 @@ from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
 Format = Literal["png", "svg", "pdf"]
 #: Default formats of figures.
 DRAWN: tuple[Format, ...] = ("png",)
-#: Each drawing process holds a copy of the result: larger positions [bytes] are drawn in this process.
-_LARGEST = 50_000_000
+#: Figures that are drawn unless all are wanted: those that are looked at after a flight.
+FEW = ("summary", "trajectory")
 
 
 def run(
@@ -35,6 +34,7 @@ def run(
     *,
     out: Path | None = None,
     force: bool = False,
+    figures: Literal["few", "all"] = "few",
     no_figures: bool = False,
     format: list[Format] | None = None,
     no_titles: bool = False,
@@ -56,6 +56,8 @@ def run(
         Folder for NAME.nc, verdict.json and figures/. Default: flights/NAME.
     force : bool
         Overwrite the files of an earlier flight. Without it, the command stops before the flight.
+    figures : str
+        Which to draw: few (summary and trajectory) or all that show something. Default: few.
     no_figures : bool
         Draw no figures; "rigidfleet report" can draw them later.
     format : list
@@ -81,9 +83,7 @@ def run(
         raise RigidfleetError("--csv-rate and --flown say what --csv writes. Add --csv.")
     if csv_rate is not None and not csv_rate > 0.0:
         raise RigidfleetError(f"--csv-rate must be positive [Hz], not {csv_rate:g}.")
-    drawing.check_width(width)
-    if not no_figures:
-        drawing.prepare()
+    check_width(width)
     from rigidfleet.mission import load_mission
 
     asked = load_mission(mission)
@@ -96,30 +96,30 @@ def run(
     from rigidfleet.assessment import assess
 
     make_folder(files.folder)
-    drawn = [] if interrupted or no_figures else files.figures
-    with drawings(result, drawn, format, titles=not no_titles, width=width) as pictures:
-        result.save(files.result)
-        files.forget()
-        if csv:
-            try:
-                result.to_csv(files.table, rate=csv_rate, flown=flown)
-            except ValueError as error:
-                raise RigidfleetError(f"--csv-rate: {error}.") from None
-        verdict = assess(result)
-        write_file(files.verdict, (verdict.json() + "\n").encode())
-        if json:
-            console.print_exactly(verdict.json() + "\n")
-        elif not quiet:
-            console.out().print(verdict)
-        so_far = "the flight so far is saved, marked incomplete,"
-        what = so_far if interrupted else "the complete flight is saved"
-        if not interrupted:
-            try:
-                if replay:
-                    write_replay(result, files.replay)
-                write_figures(pictures, quiet=quiet)
-            except KeyboardInterrupt:
-                interrupted = True
+    result.save(files.result)
+    files.forget()
+    if csv:
+        try:
+            result.to_csv(files.table, rate=csv_rate, flown=flown)
+        except ValueError as error:
+            raise RigidfleetError(f"--csv-rate: {error}.") from None
+    verdict = assess(result)
+    write_file(files.verdict, (verdict.json() + "\n").encode())
+    if json:
+        console.print_exactly(verdict.json() + "\n")
+    elif not quiet:
+        console.out().print(verdict)
+    so_far = "the flight so far is saved, marked incomplete,"
+    what = so_far if interrupted else "the complete flight is saved"
+    if not interrupted:
+        try:
+            if replay:
+                write_replay(result, files.replay)
+            if not no_figures:
+                paths = of_formats(files.figures, figures, format)
+                write_figures(result, paths, quiet=quiet, titles=not no_titles, width=width)
+        except KeyboardInterrupt:
+            interrupted = True
     if not (json or quiet):
         console.out().print()
         list_files(files)
@@ -206,41 +206,37 @@ def heeding_interrupts() -> Generator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def of_formats(figures: Iterable[Path], formats: Iterable[Format] | None) -> list[Path]:
-    """Paths of figures that have one of the formats, by default `DRAWN`."""
+def check_width(width: float | None) -> None:
+    """Raise an error if figures cannot have this width [mm]."""
+    from rigidfleet.plotting import WIDTHS
+
+    if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
+        raise RigidfleetError("--width must be {:g} to {:g} [mm], not {:g}.".format(*WIDTHS, width))
+
+
+def of_formats(
+    paths: Iterable[Path], which: Literal["few", "all"], formats: Iterable[Format] | None
+) -> list[Path]:
+    """Paths of figures, `FEW` or all, that have one of the formats, by default `DRAWN`."""
     kinds = {f".{kind}" for kind in formats or DRAWN}
-    return [path for path in figures if path.suffix in kinds]
+    return [p for p in paths if p.suffix in kinds and (which == "all" or p.stem in FEW)]
 
 
-def drawings(
-    result: Result, figures: Iterable[Path], kinds: Iterable[Format] | None, **look: Any
-) -> drawing.Drawings:
-    """Begin to draw the figures that apply to the flight, each for the file of its name, with `plot`'s ``look``."""
-    from rigidfleet.plotting import figure_names, rendered
+def write_figures(result: Result, paths: Iterable[Path], *, quiet: bool, **look: Any) -> None:
+    """Draw the figures with these paths that apply to the flight, with `plot`'s ``look``."""
+    from rigidfleet.plotting import figure_names, plot
 
+    names = figure_names(result)
     formats: dict[Path, list[str]] = {}
-    if paths := of_formats(figures, kinds):
-        result.evaluate()  # by the kernel, which is loaded in this process alone
-        names = figure_names(result)
-        for path in paths:
-            if path.stem in names:
-                formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
-    draw = partial(rendered, result, **look)
-    return drawing.Drawings(formats, draw, alone=result.position.nbytes > _LARGEST)
-
-
-def write_figures(pictures: drawing.Drawings, *, quiet: bool = False) -> list[Path]:
-    """Write figures as they are drawn, and return their files."""
-    from rigidfleet.plotting import write_files
-
-    files: list[Path] = []
+    for path in paths:
+        if path.stem in names:
+            formats.setdefault(path.with_suffix(""), []).append(path.suffix[1:])
     shown = console.err().is_interactive and not quiet
     with console.err().status("Drawing the figures") if shown else nullcontext() as status:
-        for n, (path, drawn) in enumerate(pictures, start=1):
-            files += write_files(path, drawn)
+        for n, (path, kinds) in enumerate(formats.items(), start=1):
             if status is not None:
-                status.update(f"Drawing the figures: {path.name}, {n} of {len(pictures.figures)}")
-    return files
+                status.update(f"Drawing the figures: {path.name}, {n} of {len(formats)}")
+            plot(result, path.parent, names=[path.name], formats=kinds, **look)
 
 
 def write_replay(result: Result, path: Path) -> None:

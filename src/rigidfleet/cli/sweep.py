@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import os
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from rigidfleet.cli import console, drawing
+from rigidfleet.cli import console
 from rigidfleet.cli.arguments import check_workers, exact
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
-from rigidfleet.cli.run import DRAWN, Format, watching, write_figures
+from rigidfleet.cli.run import DRAWN, Format, watching
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
@@ -95,8 +94,6 @@ def sweep(
         Print only errors, and JSON with --json.
     """
     check_workers(workers)
-    if not no_figures:
-        drawing.prepare("rigidfleet.sweep.figures")
     from rigidfleet._common.files import write_file
     from rigidfleet.sweep import figures, fly, store
     from rigidfleet.sweep.record import UNJUDGED, called
@@ -127,17 +124,16 @@ def sweep(
             again = f"To resume: rigidfleet sweep {folder}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
-    names = [] if no_figures else figures.NAMES
-    draw = partial(figures.rendered, table, over=map_ or (), metric=metric, titles=not no_titles)
-    asked_for = {folder / "figures" / name: format or DRAWN for name in names}
-    with drawing.Drawings(asked_for, draw) as pictures:
-        found = summarise(table)
-        write_file(folder / "summary.json", (found.json() + "\n").encode())
-        if json:
-            console.print_exactly(found.json() + "\n")
-        elif not quiet:
-            console.print_table(found)
-        drawn = write_figures(pictures, quiet=quiet)
+    found = summarise(table)
+    write_file(folder / "summary.json", (found.json() + "\n").encode())
+    if json:
+        console.print_exactly(found.json() + "\n")
+    elif not quiet:
+        console.print_table(found)
+    drawn = [] if no_figures else figures.plot(
+        table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
+        titles=not no_titles,
+    )  # fmt: skip
     if not (json or quiet):
         console.out().print(f"\nRuns     {folder / store.FILE}", soft_wrap=True)
         console.out().print(f"Summary  {folder / 'summary.json'}", soft_wrap=True)

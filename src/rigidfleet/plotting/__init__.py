@@ -71,6 +71,12 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
 }  # fmt: skip
 #: File formats of figures.
 FORMATS = ("png", "svg", "pdf")
+#: How each is saved: without a date, so that the same flight gives the same file, and PNG compressed quickly.
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "png": {"pil_kwargs": {"compress_level": 3}},
+    "svg": {"metadata": {"Date": None}},
+    "pdf": {"metadata": {"CreationDate": None}},
+}
 #: Least and greatest width of a figure [mm].
 WIDTHS = (80.0, 400.0)
 _MARGIN = 0.05  # [in] around a figure cropped to its content
@@ -191,15 +197,22 @@ def _drawn(result: Result, name: str, *, titles: bool = True, width: float | Non
 
 def rendered(result: Result, name: str, formats: Iterable[str], **look: Any) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
+    figure = _drawn(result, name, **look)
     with settings():
-        figure = _drawn(result, name, **look)
-        keep_layout(figure)
-        return contents(figure, formats, close=not look.get("titles", True))
+        figure.set_layout_engine(None)  # it is laid out; with "none", matplotlib draws it once more
+    return contents(figure, formats, close=not look.get("titles", True))
 
 
 def contents(figure: Figure, formats: Iterable[str], *, close: bool = False) -> dict[str, bytes]:
     """Contents of a figure's files by format; with ``close``, cropped to what is drawn."""
-    return {kind: _rendered(figure, kind, close=close) for kind in formats}
+    files = {}
+    with settings():
+        box = _ink(figure) if close else None
+        for kind in formats:
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format=kind, bbox_inches=box, **_OPTIONS[kind])
+            files[kind] = buffer.getvalue()
+    return files
 
 
 def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
@@ -208,23 +221,6 @@ def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
         if name not in known:
             raise ValueError(f"there is no {what} {name!r}; known: {', '.join(known)}")
     return asked
-
-
-def _rendered(figure: Figure, kind: str, *, close: bool = False) -> bytes:
-    # No date in the file, so that the same flight gives the same file.
-    metadata: dict[str, Any] = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
-    buffer = io.BytesIO()
-    with settings():
-        box = _ink(figure) if close else None
-        figure.savefig(buffer, format=kind, metadata=metadata.get(kind), bbox_inches=box)
-    keep_layout(figure)
-    return buffer.getvalue()
-
-
-def keep_layout(figure: Figure) -> None:
-    """Make the layout that a figure has its last one: neither it nor a drawing for it is computed again."""
-    with settings():
-        figure.set_layout_engine(None)  # with "none", matplotlib still draws the figure once more
 
 
 def _ink(figure: Figure) -> Bbox:

@@ -391,7 +391,6 @@ def shape_error(result: Result) -> Floats:
 def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
     from matplotlib.lines import Line2D
-    from matplotlib.ticker import FuncFormatter
 
     ax.set_ylabel("error |c| of an edge [m]")
     size, shape = np.abs(result.constraint), shape_error(result)
@@ -410,7 +409,6 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
         st.note(ax, "neither edges nor slots")
         return []
     ax.set_yscale("log", nonpositive="clip")
-    ax.yaxis.set_major_formatter(FuncFormatter(st.power))
     seen = np.concatenate([size.ravel(), shape])
     seen = seen[np.isfinite(seen)]
     large = seen[seen > _SMALLEST]

@@ -47,14 +47,15 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
         The file's name does not end in .png, .svg or .pdf, or it cannot be written.
     """
     from rigidfleet.errors import ResultError
-    from rigidfleet.plotting import _rendered, write
+    from rigidfleet.plotting import contents, write
 
     if path.suffix not in _FORMATS:
         known = ", ".join(_FORMATS)
         raise ResultError(
             f"{path}: the name has no figure format. Give a name that ends in {known}."
         )
-    write(path, _rendered(graphs(mission, judged), path.suffix[1:]))
+    (drawn,) = contents(graphs(mission, judged), [path.suffix[1:]]).values()
+    write(path, drawn)
 
 
 def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:

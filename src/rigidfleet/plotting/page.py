@@ -32,6 +32,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     flown, wanted, _ = curves.flown_and_wanted_euler(result)
     if not np.isfinite(flown).any():
         entries = curves.draw_error(ax, result)
+        ax.yaxis.labelpad = 2  # powers of ten are wide
         if entries:
             _legend_above(ax, entries)
         return

@@ -136,8 +136,8 @@ def _shots(result: Result, rows: Any) -> list[int]:
 
     def keep(candidates: list[int], gap: float) -> None:
         for k in candidates:
-            apart = [np.sqrt(np.mean(np.sum((r[k] - r[j]) ** 2, axis=1))) for j in kept]
-            if k in usable and min(apart) > gap:
+            apart = np.sqrt(np.mean(np.sum((r[k] - r[kept]) ** 2, axis=2), axis=1))
+            if k in usable and apart.min() > gap:
                 kept.append(k)
 
     keep([int(rows[-1])], 1e-3 * size)
@@ -420,21 +420,19 @@ def trajectory(result: Result) -> Figure:
     fig = st.blank(wide, 2.2 * wide if st.narrow() else 6.2)
     st.head(fig, result, "Trajectory")
     view = scene(result)
+    entries = handles(result, view)
+    columns = max(1, min(len(entries), max(int(0.9 * wide), 2) if st.narrow() else 11))
     if st.narrow():  # the view from above stands below
         draw_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))
-        above = fig.add_axes((0.55 / wide, 0.13, 0.96 - 0.55 / wide, 0.35))
+        low = (0.65 + 0.18 * math.ceil(len(entries) / columns)) / fig.get_figheight()
+        above = fig.add_axes((0.55 / wide, low, 0.96 - 0.55 / wide, 0.48 - low))
     else:
         draw_space(fig, result, view, (0.0, 0.07, 0.6, 0.87))
         above = fig.add_axes((0.66, 0.16, 0.32, 0.74))
     draw_above(above, result, view)
     above.set_anchor("C")
-    entries = handles(result, view)
     fig.legend(
-        handles=entries,
-        loc="lower center",
-        ncols=min(len(entries), max(int(0.9 * wide), 2) if st.narrow() else 11),
-        borderaxespad=0.8,
-        columnspacing=1.4,
+        handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8, columnspacing=1.4
     )
     return fig
 

@@ -15,7 +15,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from rigidfleet.plotting.applied import applied
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -61,8 +60,6 @@ _ENTRIES = 12  # greatest number of entries of a legend
 #: [m, m/s, deg, deg/s, N]
 STILL = 1e-3
 _ROUNDING = 1e-9  # smaller deviations are not mentioned
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 #: A possible place of a text: a point and its coordinate system, an offset [points] from it, alignment.
 Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
@@ -121,9 +118,6 @@ _RC: dict[str, Any] = {
 @contextmanager
 def settings() -> Generator[None]:
     """Apply matplotlib's defaults and our style, whatever the user has set; restored at the end."""
-    if applied.get():  # to apply it takes 2 ms
-        yield
-        return
     import matplotlib as mpl
 
     # As `matplotlib.style` does, which loads all styles first
@@ -131,11 +125,7 @@ def settings() -> Generator[None]:
     with mpl.rc_context(look), warnings.catch_warnings():
         # Letters that the font lacks show as boxes in a PNG, and correctly in an SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        before = applied.set(True)
-        try:
-            yield
-        finally:
-            applied.reset(before)
+        yield
 
 
 def styled(draw: Draw) -> Draw:
@@ -224,10 +214,6 @@ def time_figure(
     head(fig, result, title)
     for ax in axes.flat:
         over_time(ax, result)
-    # Upper time axes have neither numbers nor a name; matplotlib would seek places for them
-    for ax in axes[:-1].flat:
-        ax.xaxis.set_in_layout(False)
-        ax.xaxis.set_label_coords(0.5, 0.0)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
     return fig, axes.reshape(stacked).T if stacked else axes
@@ -263,18 +249,10 @@ def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
 
 def over_time(ax: Axes, result: Result) -> None:
     """Time axis with every second phase shaded."""
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path
-
     t = result.time
     ax.set_xlim(t[0], t[-1] if t[-1] > t[0] else t[0] + 1.0)
-    bands = [(p.t_start, p.t_end) for p in result.phases[1::2]]
-    if bands:  # all as one path
-        corners = [at for a, b in bands for at in ((a, 0), (a, 1), (b, 1), (b, 0), (a, 0))]
-        strokes = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
-        path, along = Path(corners, strokes * len(bands)), ax.get_xaxis_transform()
-        # As an artist, without a search for the limits of its data
-        ax.add_artist(PathPatch(path, facecolor=BAND, linewidth=0, zorder=0, transform=along))
+    for phase in result.phases[1::2]:
+        ax.axvspan(phase.t_start, phase.t_end, facecolor=BAND, linewidth=0, zorder=0)
     if not result.complete:
         ax.axvline(t[-1], color=ALERT, linewidth=0.8)
 
@@ -441,14 +419,6 @@ def note(ax: Axes, words: str) -> None:
     """Write text in an axes that has nothing to show."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
     ax.tick_params(left=False, labelleft=False)
-
-
-def power(value: float, _: int) -> str:
-    """A power of ten on a logarithmic axis, in letters: formulas take twenty times as long."""
-    exponent = math.log10(value) if value > 0.0 else 0.5
-    if abs(exponent - round(exponent)) > 1e-9:  # as a user's ticks may be
-        return f"{value:g}"
-    return "10" + f"{exponent:.0f}".translate(_RAISED)
 
 
 def name_box(ax: Axes, box: Artist, x: float, y: float, name: str) -> None:

@@ -7,8 +7,6 @@ from base64 import b64encode
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -447,9 +445,7 @@ def _figures(result: Result) -> list[dict[str, str]]:
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:
-    with TemporaryDirectory() as folder:
-        plotting.plot(result, folder, formats=["svg"], names=[name])
-        svg = Path(folder, f"{name}.svg").read_bytes()
+    svg = plotting.rendered(result, name, ["svg"])["svg"]
     return _picture(name, svg, _CAPTIONS.get(name, ""))
 
 

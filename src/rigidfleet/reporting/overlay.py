@@ -25,10 +25,8 @@ _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible und
 
 def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Path of the centre of mass from above, and its height over time, as an SVG."""
-    from matplotlib.figure import Figure
-
     with st.settings():
-        fig = Figure(figsize=(st.WIDTH, 3.6), layout="constrained")
+        fig = st.blank(st.WIDTH, 3.6, "constrained")
         above, height = fig.subplots(1, 2)
         for flight, look in zip(flights, _looks(flights), strict=True):
             above.plot(flight.cm[:, 0], flight.cm[:, 1], **look)
@@ -43,8 +41,6 @@ def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Distances, thrust, speed and errors over time, as an SVG."""
-    from matplotlib.figure import Figure
-
     panels: list[tuple[str, Callable[[Result], Floats], bool]] = [
         ("least distance between vehicles [m]", lambda r: _finite(r.separation), False),
         ("greatest thrust [N]", lambda r: _greatest(r.thrust), False),
@@ -58,7 +54,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         )
     with st.settings():
         rows = (len(panels) + 1) // 2
-        fig = Figure(figsize=(st.WIDTH, 0.6 + 1.9 * rows), layout="constrained")
+        fig = st.blank(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for ax, (name, values, logarithmic) in zip(axes, panels, strict=False):
             known = [
@@ -84,14 +80,12 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
     """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
-    from matplotlib.figure import Figure
-
     times = [s for m in missions if (s := m.constraint.settling_time) is not None]
     if not times:
         return None
     t = np.linspace(0.0, 1.6 * max(times), 400)
     with st.settings():
-        fig = Figure(figsize=(st.WIDTH, 2.2), layout="constrained")
+        fig = st.blank(st.WIDTH, 2.2, "constrained")
         ax = fig.subplots()
         ax.axhspan(-0.02, 0.02, color=st.BAND, linewidth=0)
         for mission, look in zip(missions, _looks(missions), strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,8 +42,6 @@ _VALUES = 20
 _ROWS = 14
 #: Ratio of the largest to the smallest value beyond which an axis is logarithmic.
 _LOGARITHMIC = 100.0
-#: Names of the figures, from the one that takes longest to draw.
-NAMES = ("histograms", "envelopes", "outcome", "drivers", "map")
 
 
 def plot(
@@ -71,33 +69,20 @@ def plot(
     ResultError
         A file cannot be written.
     """
-    files = []
-    for name in NAMES:
-        drawn = rendered(table, name, formats, over=over, metric=metric, titles=titles)
-        files += write_files(Path(folder, name), drawn)
-    return files
-
-
-def rendered(
-    table: Table,
-    name: str,
-    formats: Iterable[str],
-    *,
-    over: Sequence[str] = (),
-    metric: str = "",
-    titles: bool = True,
-) -> dict[str, bytes]:
-    """Contents of a figure's files by format, none if it would be empty; parameters are those of `plot`."""
-    draw = {
-        "outcome": outcome,
+    draw: dict[str, Callable[[Table], Figure | None]] = {
         "histograms": histograms,
         "envelopes": envelopes,
+        "outcome": outcome,
         "drivers": correlations,
         "map": partial(over_two, over=over, metric=metric),
     }
-    with st.settings(), st.shape(titles=titles):
-        figure = draw[name](table)
-    return {} if figure is None else contents(figure, formats, close=not titles)
+    files = []
+    for name, drawn in draw.items():
+        with st.settings(), st.shape(titles=titles):
+            figure = drawn(table)
+        made = {} if figure is None else contents(figure, formats, close=not titles)
+        files += write_files(Path(folder, name), made)
+    return files
 
 
 def outcome(table: Table) -> Figure | None:
@@ -293,9 +278,7 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
 
 def _figure(table: Table, title: str, wide: float, high: float) -> Figure:
     """A figure of a size [in], with its title and what the sweep is."""
-    from rigidfleet.plotting.figure import Figure
-
-    fig = Figure(figsize=(wide, high), layout="constrained")
+    fig = st.blank(wide, high, "constrained")
     of = "" if table.complete else f" of {table.sweep.runs}"
     words = f"{table.sweep.name}: {len(table.run)}{of} runs"
     st.heading(fig, title, words, st.GREY if table.complete else st.ALERT)
