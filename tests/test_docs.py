@@ -217,7 +217,8 @@ def test_sweep_page(tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     text = page("sweep.md")
-    lines = re.findall(r"^    (\S+ \S?= .*?\))(?:  .*)?$", text, re.MULTILINE)
+    (listed,) = blocks(text, "text")
+    lines = re.findall(r"^(\S+ \S?= .*?\))(?:  .*)?$", listed, re.MULTILINE)
     assert len(lines) == 7
     Sweep.of("narrow-passage", lines, runs=1)
     (file,) = blocks(text, "toml")
