@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
@@ -358,7 +359,8 @@ def _planned(collector: FindingCollector, parts: dict[str, Any]) -> None:
     """Find limits of the plan in a mission whose plan keeps none."""
     limits = parts.get("limits", Limits())
     flown = vehicles.flies_vehicles(collector)  # the verdict judges their tilt
-    for key in ("jerk",) if flown else ("jerk", "tilt_deg"):
+    jerks = (q.name for q in MOTIONS if q.order == 3)
+    for key in jerks if flown else (*jerks, "tilt_deg"):
         if getattr(limits, key) is not None and parts.get("smoothness") == "lqr":
             problem = "has no effect: only the plan of a smooth mission keeps it"
             collector.add(
