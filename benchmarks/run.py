@@ -161,13 +161,16 @@ def with_records(result: Result) -> Result:
 
 def in_kernel(job: Callable[[], object], at_least: float) -> tuple[float, float]:
     """Time [s] of one call, as `seconds`, and what of it is spent in the kernel's integrator and monitor."""
-    inside, whole = 0.0, {kind: kind.__call__ for kind in (native.Integration, native.Watch)}
+    inside = 0.0
+    watch = native.Watch
+    parts = (native.Integration, "__call__"), (watch, "distances"), (watch, "forces")
+    whole = [(kind, name, getattr(kind, name)) for kind, name in parts]
 
     def timed(call: Callable[..., int]) -> Callable[..., int]:
-        def of(*arguments: object) -> int:
+        def of(*arguments: object, **options: object) -> int:
             nonlocal inside
             begun = time.perf_counter()
-            status = call(*arguments)
+            status = call(*arguments, **options)
             inside += time.perf_counter() - begun
             return status
 
@@ -181,12 +184,12 @@ def in_kernel(job: Callable[[], object], at_least: float) -> tuple[float, float]
         job()
 
     try:
-        for kind, call in whole.items():
-            kind.__call__ = timed(call)
+        for kind, name, call in whole:
+            setattr(kind, name, timed(call))
         spent = seconds(counted, at_least)
     finally:
-        for kind, call in whole.items():
-            kind.__call__ = call
+        for kind, name, call in whole:
+            setattr(kind, name, call)
     return spent, inside / calls
 
 
