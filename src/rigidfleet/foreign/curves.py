@@ -18,7 +18,7 @@ NAMES = ("x", "y", "z", "yaw")
 CHANNELS = len(NAMES)
 
 
-def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:
+def curve_through_states(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:
     """The way through states (m, K, 3) at times (K,) [s]: m derivatives of position are met, 4, 2, or 1 (lines).
 
     Yaw (2, K) [rad, rad/s] or (1, K) is met in the same way; without it, yaw is NaN. A single state stays for a second.
@@ -65,7 +65,7 @@ def greatest_jumps(curve: Piecewise) -> tuple[Floats, Floats]:
     return far.max(axis=1), curve.time[1 + far.argmax(axis=1)]
 
 
-def least_jerk(curve: Piecewise) -> Piecewise:
+def least_jerk_curve(curve: Piecewise) -> Piecewise:
     """The natural quintic spline through the knots of a curve: of all curves through them the one with the least jerk.
 
     Its fourth derivative is continuous. Full turns of yaw between two knots do not count.

@@ -13,8 +13,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.columns import yaws
-from rigidfleet.foreign.samples import sampled
+from rigidfleet.foreign.columns import yaws_of
+from rigidfleet.foreign.samples import curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
 
 _POSE = "geometry_msgs/msg/PoseStamped"
@@ -39,15 +39,15 @@ def read_poses(
         raise TrajectoryError(
             f"{name}: needs the package 'mcap', which is not installed. Run: pip install mcap"
         )
-    found = _messages(data, name)
-    if not found:
+    topics = _poses_by_topic(data, name)
+    if not topics:
         raise TrajectoryError(
             f"{name}: has no {_POSE}. Record the topics with the vehicles' poses."
         )
-    first = min(rows[0][0] for rows in found.values())
+    first = min(rows[0][0] for rows in topics.values())
     dated = first > 1_000_000 * _BILLION
     curves = []
-    for topic, rows in found.items():
+    for topic, rows in topics.items():
         table = np.array([row[1:] for row in rows])
         time = (
             np.array([row[0] - first for row in rows]) / _BILLION
@@ -59,19 +59,21 @@ def read_poses(
         where = lambda k, topic=topic: f"{topic}: message {k + 1}"  # noqa: E731
         offset = 0.0 if dated else first / _BILLION
         curves.append(
-            sampled(time + offset, table[:, :3], yaws(table[:, 3:]), interpolation, name, where)
+            curve_through_samples(
+                time + offset, table[:, :3], yaws_of(table[:, 3:]), interpolation, name, where
+            )
         )
-    return tuple(found), tuple(curves), int(first) if dated else None
+    return tuple(topics), tuple(curves), int(first) if dated else None
 
 
-def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
+def _poses_by_topic(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
     """Stamp [ns], position and quaternion (scalar last) of each pose, by topic."""
     from mcap.exceptions import McapError
     from mcap.reader import make_reader
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
 
-    found: dict[str, list[tuple[float, ...]]] = {}
+    topics: dict[str, list[tuple[float, ...]]] = {}
     try:
         records = StreamReader(io.BytesIO(data), emit_chunks=True).records
         sizes = [x.uncompressed_size for x in records if isinstance(x, Chunk)]
@@ -86,7 +88,7 @@ def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
                 raise TrajectoryError(
                     f"{name}: {channel.topic}: is encoded as {channel.message_encoding!r}, not as CDR."
                 )
-            rows = found.setdefault(channel.topic, [])
+            rows = topics.setdefault(channel.topic, [])
             try:
                 rows.append(_pose(message.data))
             except struct.error:
@@ -104,13 +106,15 @@ def _messages(data: bytes, name: str) -> dict[str, list[tuple[float, ...]]]:
         RuntimeError,
         MemoryError,
     ) as error:
-        told = " ".join(str(error).split()) or type(error).__name__
-        raise TrajectoryError(f"{name}: the recording is damaged ({told}). Record again.") from None
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise TrajectoryError(
+            f"{name}: the recording is damaged ({reason}). Record again."
+        ) from None
     except ImportError as error:
         raise TrajectoryError(
             f"{name}: is compressed, and a package is missing ({error})."
         ) from None
-    return found
+    return topics
 
 
 def _pose(data: bytes) -> tuple[float, ...]:

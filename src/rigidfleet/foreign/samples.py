@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import through
+from rigidfleet.foreign.curves import curve_through_states
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
@@ -18,7 +18,7 @@ ASSUMED = {
 }
 
 
-def sampled(
+def curve_through_samples(
     time: Floats,
     position: Floats,
     yaw: Floats | None,
@@ -44,7 +44,7 @@ def sampled(
             f"{name}: {place(k)}: the time {time[k]:.9g} s {how} {time[k - 1]:.9g} s. Give increasing times."
         )
     turned = None if yaw is None else np.unwrap(yaw)[None]
-    lines = through(time, position[None], turned)
+    lines = curve_through_states(time, position[None], turned)
     if kind == "linear" or len(time) < 3:
         return lines
     return Piecewise.cubic_spline(time, position).beside(Piecewise(time, lines.pieces[:, 3:]))

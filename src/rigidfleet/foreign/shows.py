@@ -48,7 +48,7 @@ def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Piecewise,
                 raise TrajectoryError(
                     f"{name}: unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}. It is not a show."
                 )
-            return _drones(archive, name)
+            return _curves_of_drones(archive, name)
     except RecursionError:
         raise TrajectoryError(
             f"{name}: show.json is nested too deeply. Export the show again."
@@ -59,9 +59,11 @@ def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Piecewise,
         ) from None
 
 
-def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
-    show = _json(archive, "show.json", name)
-    drones = _get(show, "swarm.drones", list, f"{name}: show.json")
+def _curves_of_drones(
+    archive: zipfile.ZipFile, name: str
+) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
+    show = _read_json(archive, "show.json", name)
+    drones = _value_at(show, "swarm.drones", list, f"{name}: show.json")
     if not drones:
         raise TrajectoryError(f"{name}: show.json: has no drones.")
     names: list[str] = []
@@ -69,14 +71,14 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
     room = _COEFFICIENTS
     for k, drone in enumerate(drones, 1):
         where = f"{name}: show.json: drone {k}"
-        settings = _get(drone, "settings", dict, where)
+        settings = _value_at(drone, "settings", dict, where)
         who = settings.get("name")
         names.append(
             who if isinstance(who, str) and who.strip() and who.isprintable() else f"drone {k}"
         )
-        trajectory = _resolved(archive, settings.get("trajectory"), name, f"{where}: trajectory")
+        trajectory = _dereference(archive, settings.get("trajectory"), name, f"{where}: trajectory")
         yaw = settings.get("yawControl")
-        turned = None if yaw is None else _resolved(archive, yaw, name, f"{where}: yawControl")
+        turned = None if yaw is None else _dereference(archive, yaw, name, f"{where}: yawControl")
         curves.append(_curve(trajectory, turned, f"{name}: {names[-1]}"))
         room -= curves[-1].pieces.size
         if room < 0:
@@ -86,7 +88,7 @@ def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple
     return tuple(names), tuple(curves)
 
 
-def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
+def _read_json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
     try:
         size = archive.getinfo(entry).file_size
         data = archive.read(entry) if size <= _ENTRY else b""
@@ -94,7 +96,7 @@ def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
             raise TrajectoryError(
                 f"{name}: {entry}: has {size >> 20:,} MiB, more than a show needs. Give each drone an entry of its own."
             )
-        return json.loads(data, parse_constant=_no_constant)
+        return json.loads(data, parse_constant=_refuse_constant)
     except KeyError:
         raise TrajectoryError(f"{name}: has no {entry}. Is it a show of Skybrush?") from None
     except (ValueError, zlib.error) as error:
@@ -103,20 +105,20 @@ def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
         ) from None
 
 
-def _no_constant(told: str) -> float:
-    raise ValueError(f"has {told}, not a finite number")
+def _refuse_constant(constant: str) -> float:
+    raise ValueError(f"has {constant}, not a finite number")
 
 
-def _get(given: Any, path: str, kind: type, where: str) -> Any:
+def _value_at(value: Any, path: str, kind: type, where: str) -> Any:
     for key in path.split("."):
-        given = given.get(key) if isinstance(given, dict) else None
-    if not isinstance(given, kind):
+        value = value.get(key) if isinstance(value, dict) else None
+    if not isinstance(value, kind):
         word = "list" if kind is list else "object"
         raise TrajectoryError(f"{where}: has no {word} {path!r}. Export the show again.")
-    return given
+    return value
 
 
-def _resolved(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> dict[str, Any]:
+def _dereference(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> dict[str, Any]:
     """An object of a show, or the one in the entry that it refers to."""
     if not isinstance(value, dict):
         raise TrajectoryError(f"{where}: is missing. Export the show again.")
@@ -128,33 +130,33 @@ def _resolved(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> di
         raise TrajectoryError(
             f"{where}: refers to {entry[:80]!r}, outside of the show, which is not read."
         )
-    found = _json(archive, entry, name)
-    if not isinstance(found, dict):
+    entered = _read_json(archive, entry, name)
+    if not isinstance(entered, dict):
         raise TrajectoryError(f"{name}: {entry}: is no object. Export the show again.")
-    return found
+    return entered
 
 
 def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Piecewise:
-    points = _get(trajectory, "points", list, where)
+    points = _value_at(trajectory, "points", list, where)
     if not points:
         raise TrajectoryError(f"{where}: its trajectory has no points.")
 
-    def told(k: int) -> str:
+    def place_of(k: int) -> str:
         return f"{where}: point {k + 1}"
 
     start = _floats(trajectory.get("takeoffTime", 0), (), lambda: f"{where}: takeoffTime")
     for k, point in enumerate(points):
         if not isinstance(point, list) or len(point) < 2:
-            raise TrajectoryError(f"{told(k)}: is not [time, [x, y, z], [control points]].")
-    time = np.array([_floats(p[0], (), lambda k=k: told(k)) for k, p in enumerate(points)])
-    ends = [_floats(p[1], (3,), lambda k=k: told(k)) for k, p in enumerate(points)]
+            raise TrajectoryError(f"{place_of(k)}: is not [time, [x, y, z], [control points]].")
+    time = np.array([_floats(p[0], (), lambda k=k: place_of(k)) for k, p in enumerate(points)])
+    ends = [_floats(p[1], (3,), lambda k=k: place_of(k)) for k, p in enumerate(points)]
     if len(points) == 1:
         points, time, ends = [*points, [0, ends[0], []]], np.append(time, time + 1.0), ends * 2
     late = np.flatnonzero(~(np.diff(time) > 0.0))
     if len(late):
         k = int(late[0])
         raise TrajectoryError(
-            f"{told(k + 1)}: its time {time[k + 1]:g} s is not after {time[k]:g} s. Give increasing times."
+            f"{place_of(k + 1)}: its time {time[k + 1]:g} s is not after {time[k]:g} s. Give increasing times."
         )
     inner = [p[2] if len(p) > 2 and p[2] is not None else [] for p in points[1:]]
     powers = 2 + max((len(c) if isinstance(c, list) else 0 for c in inner), default=0)
@@ -164,7 +166,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
         )
     pieces = np.zeros((len(inner), 4, max(powers, 2)))
     for k, ((begin, end), between) in enumerate(zip(pairwise(ends), inner, strict=True)):
-        middle = _floats(between or np.zeros((0, 3)), (None, 3), lambda k=k: told(k + 1))
+        middle = _floats(between or np.zeros((0, 3)), (None, 3), lambda k=k: place_of(k + 1))
         control = np.vstack([begin, middle, end])
         piece = Piecewise.of_bernstein(time[k : k + 2], control.T[None])
         pieces[k, :3, : len(control)] = piece.pieces[0]
@@ -174,7 +176,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
         pieces[:, 3] = np.nan
         return curve
     setpoints = _floats(
-        _get(yaw, "setpoints", list, where), (None, 2), lambda: f"{where}: yaw setpoints"
+        _value_at(yaw, "setpoints", list, where), (None, 2), lambda: f"{where}: yaw setpoints"
     )
     if (np.diff(setpoints[:, 0]) < 0.0).any():
         raise TrajectoryError(f"{where}: yaw setpoints: times go back. Give increasing times.")
@@ -184,16 +186,16 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
     return with_headings(curve, setpoints[:, 0], -np.radians(setpoints[:, 1]))
 
 
-def _floats(given: Any, shape: tuple[int | None, ...], where: Callable[[], str]) -> Any:
+def _floats(value: Any, shape: tuple[int | None, ...], where: Callable[[], str]) -> Any:
     """Finite numbers of a shape, in which None is any length."""
     try:
-        found = np.asarray(given, dtype=float)
+        numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        found = np.array(np.nan)
-    fits = found.ndim == len(shape) and all(
-        n in (None, m) for n, m in zip(shape, found.shape, strict=True)
+        numbers = np.array(np.nan)
+    fits = numbers.ndim == len(shape) and all(
+        n in (None, m) for n, m in zip(shape, numbers.shape, strict=True)
     )
-    if not fits or not np.isfinite(found).all() or isinstance(given, str | bool):
+    if not fits or not np.isfinite(numbers).all() or isinstance(value, str | bool):
         words = "numbers" if shape else "a number"
-        raise TrajectoryError(f"{where()}: has {str(given)[:60]!r} where {words} must be.")
-    return found if shape else float(found)
+        raise TrajectoryError(f"{where()}: has {str(value)[:60]!r} where {words} must be.")
+    return numbers if shape else float(numbers)

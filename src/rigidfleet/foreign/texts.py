@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.tables import Table, fault
-from rigidfleet.foreign.columns import Units, parse, read_tracks
-from rigidfleet.foreign.curves import NAMES, rows_to_curve, through
-from rigidfleet.foreign.samples import ASSUMED, sampled
+from rigidfleet._common.tables import TextTable, fault
+from rigidfleet.foreign.columns import Units, parse_table, read_tracks
+from rigidfleet.foreign.curves import NAMES, curve_through_states, rows_to_curve
+from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 
@@ -30,9 +30,9 @@ def read_text(
     TableError, TrajectoryError
         The table cannot be read, or a time does not increase.
     """
-    table, notes = parse(data, words)
+    table, notes = parse_table(data, words)
     if table.place("duration", "x^0"):
-        curve = _pieces(table)
+        curve = _curve_of_coefficients(table)
         return (
             [path.stem],
             [curve],
@@ -44,7 +44,9 @@ def read_text(
     curves, off, fastest = [], 0.0, 0.0
     for track in tracks:
         where = lambda k, track=track: f"line {track.lines[k]}"  # noqa: E731
-        curve = sampled(track.time, track.place, track.yaw, interpolation, str(path), where)
+        curve = curve_through_samples(
+            track.time, track.place, track.yaw, interpolation, str(path), where
+        )
         curves.append(curve)
         # At the inner samples, where lines have two velocities.
         between = curve.pieces[1:, :3, 1]
@@ -58,7 +60,7 @@ def read_text(
     return [track.name for track in tracks], curves, ASSUMED[interpolation], notes, record
 
 
-def _pieces(table: Table) -> Piecewise:
+def _curve_of_coefficients(table: TextTable) -> Piecewise:
     """The curve in Crazyswarm2's table: duration [s], 8 coefficients of x, y, z [m] and yaw [rad] a piece, any order.
 
     Raises
@@ -80,18 +82,18 @@ def _pieces(table: Table) -> Piecewise:
 
 def read_polynomial(data: bytes) -> list[Piecewise]:
     """The curve in a table of `crazyflie.write_polynomial`, from time zero on."""
-    return [_pieces(Table(data, {}))]
+    return [_curve_of_coefficients(TextTable(data, {}))]
 
 
 def read_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
-    table = Table(data, {})
+    table = TextTable(data, {})
     every = table.numbers(table.place("time", *axes, "yaw", "yaw_rate"))
     code, labels = table.codes(table.names.index("agent"))
     curves = []
     for agent in sorted(range(len(labels)), key=lambda k: int(labels[k])):
         own = every[code == agent]
         states = own[:, 1:13].reshape(-1, 4, 3).swapaxes(0, 1)
-        curves.append(through(own[:, 0], states, own[:, 13:15].T))
+        curves.append(curve_through_states(own[:, 0], states, own[:, 13:15].T))
     return curves
