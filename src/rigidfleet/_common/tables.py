@@ -31,7 +31,7 @@ _HEAD, _SAMPLE, _TOGETHER, _LONGEST = 200, 20, 1 << 14, 100_000
 
 
 class Fault(NamedTuple):
-    """One error in a table: the line (from 1; 0: the whole file), its text, what is wrong, and the remedy."""
+    """One error in a file: the line (from 1; 0: the whole file), its text, what is wrong, and the remedy."""
 
     line: int
     text: str
@@ -39,17 +39,20 @@ class Fault(NamedTuple):
     remedy: str
 
 
-class TableError(ValueError):
-    """A table cannot be read; it has at least one fault."""
+class ContentError(ValueError):
+    """The content of a file cannot be read; it has at least one fault."""
 
     def __init__(self, *faults: Fault) -> None:
         self.faults = faults
-        super().__init__(f"{faults[0].problem}. {faults[0].remedy}")
+        line, _, problem, remedy = faults[0]
+        place = f"line {line}: " if line else ""
+        words = f"{place}{problem}. {remedy}".rstrip(". ")
+        super().__init__((words if words.endswith("?") else f"{words}.").replace("?. ", "? "))
 
 
-def fault(problem: str, remedy: str, line: int = 0, text: str = "") -> TableError:
+def fault(problem: str, remedy: str = "", line: int = 0, text: str = "") -> ContentError:
     """The error of a single fault."""
-    return TableError(Fault(line, text, problem, remedy))
+    return ContentError(Fault(line, text, problem, remedy))
 
 
 class TextTable:
@@ -74,7 +77,7 @@ class TextTable:
 
     Raises
     ------
-    TableError
+    ContentError
         The file is no table, has names that are not understood, an unknown unit, or two columns for a quantity.
     """
 
@@ -108,7 +111,7 @@ class TextTable:
 
         Raises
         ------
-        TableError
+        ContentError
             The unit is unknown, said twice in other ways, or said for some columns of a dimension only.
         """
         name, said, below = self.names[k], self.kinds[k].unit, self._below[k]
@@ -134,7 +137,7 @@ class TextTable:
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
 
-    def missing(self, *kinds: str) -> TableError:
+    def missing(self, *kinds: str) -> ContentError:
         """The error of a table without some quantities."""
         if self.place("latitude"):
             return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
@@ -155,7 +158,7 @@ class TextTable:
 
         Raises
         ------
-        TableError
+        ContentError
             A field is no finite number, or a row has another number of fields.
         """
         factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
@@ -185,7 +188,7 @@ class TextTable:
                 remedy = "Write decimals with a point" if _COMMA.fullmatch(field) else remedy
                 faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
         if faults:
-            raise TableError(*(faults[line] for line in sorted(faults)))
+            raise ContentError(*(faults[line] for line in sorted(faults)))
         return values * factors
 
 
@@ -225,7 +228,7 @@ def _lines(data: bytes) -> list[str]:
 
     Raises
     ------
-    TableError
+    ContentError
         It is no text.
     """
     wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")

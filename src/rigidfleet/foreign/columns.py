@@ -102,7 +102,7 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
 
     Raises
     ------
-    TableError
+    ContentError
         It is none.
     """
     table, notes = TextTable(data, {len(_TUM): _TUM}, words.words), []
@@ -174,7 +174,7 @@ def read_tracks(
 
     Raises
     ------
-    TableError
+    ContentError
         The table cannot be read, or does not say whose rows they are.
     """
     sets = _columns_of_vehicles(table, axes, notes)
@@ -234,7 +234,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
 
     Raises
     ------
-    TableError
+    ContentError
         A place is missing, or some columns may be those of another vehicle; or names of axes contradict the option.
     """
     sets: dict[str, _Places] = {}
@@ -281,7 +281,7 @@ def _rows_of_vehicles(
 
     Raises
     ------
-    TableError
+    ContentError
         A name is empty, or a time has two places, or two columns may be the names.
     """
     names, kinds, n = table.names, [q.kind for q in table.kinds], len(time)
@@ -407,7 +407,7 @@ def _yaw_unless_doubtful(
 
     Raises
     ------
-    TableError
+    ContentError
         A yaw changes by more than half a turn from one row to the next, in yaws of more than a turn.
     """
     step, far = np.abs(np.diff(yaw)), float(np.abs(yaw).max())

@@ -6,6 +6,7 @@ Yaw is NaN where a format does not have it.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,29 @@ from rigidfleet.typing import Floats
 #: Names of the channels of a curve.
 NAMES = ("x", "y", "z", "yaw")
 CHANNELS = len(NAMES)
+
+
+class Trajectories(NamedTuple):
+    """Trajectories of N vehicles as piecewise polynomials.
+
+    Attributes
+    ----------
+    names : of the vehicles, in order
+    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown
+    assumed : the curve that was assumed between the points of the file, in words
+    notes : what a reader of the verdict should know, in sentences without a full stop
+    read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
+    away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
+    since : seconds since 1970 from which times count; 0 if they are no dates
+    """
+
+    names: tuple[str, ...]
+    curves: tuple[Piecewise, ...]
+    assumed: str
+    notes: tuple[str, ...] = ()
+    read: tuple[dict[str, Any], ...] = ({},)
+    away: bool = False
+    since: float = 0.0
 
 
 def curve_through_states(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:

@@ -11,15 +11,16 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from rigidfleet._common.files import why_not
-from rigidfleet._common.tables import TableError
+from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
+from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.math.piecewise import Piecewise
 
@@ -42,29 +43,6 @@ _SUFFIXES = {".csv", ".skyc", ".mcap"}
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
 #: Share of a number that is rounding, and the greatest number of things that a note lists.
 _ROUNDING, _LISTED = 1e-6, 5
-
-
-class Trajectories(NamedTuple):
-    """Trajectories of N vehicles as piecewise polynomials.
-
-    Attributes
-    ----------
-    names : of the vehicles, in order
-    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown
-    assumed : the curve that was assumed between the points of the file, in words
-    notes : what a reader of the verdict should know, in sentences without a full stop
-    read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
-    away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
-    since : seconds since 1970 from which times count; 0 if they are no dates
-    """
-
-    names: tuple[str, ...]
-    curves: tuple[Piecewise, ...]
-    assumed: str
-    notes: tuple[str, ...] = ()
-    read: tuple[dict[str, Any], ...] = ()
-    away: bool = False
-    since: float = 0.0
 
 
 def read_trajectories(
@@ -300,60 +278,46 @@ def _read_file(path: Path, interpolation: Interpolation, units: Units) -> Trajec
         data = path.read_bytes()
     except OSError as error:
         raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
-    name = str(path)
     if data.startswith(_HDF):
-        raise TrajectoryError(f"{name}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
-    record: dict[str, Any] = {}
-    notes: Sequence[str] = ()
-    if data.startswith(_ZIP) or path.suffix.lower() == ".skyc":
-        names, curves = shows.read_show(data, name)
-        assumed = shows.BEZIER
-    elif data.startswith(_MCAP) or path.suffix.lower() == ".mcap":
-        names, curves, record["since_1970_ns"] = poses.read_poses(data, name, interpolation)
-        assumed = ASSUMED[interpolation]
-    else:
-        try:
-            names, curves, assumed, notes, record = texts.read_text(
-                data, path, interpolation, units
-            )
-        except TableError as error:
-            line, _, problem, remedy = error.faults[0]
-            place = f"line {line}: " if line else ""
-            ends = "" if remedy.endswith("?") else "."
-            words = f"{name}: {place}{problem}. {remedy}{ends}".replace("?. ", "? ")
-            raise TrajectoryError(words) from None
-    read = Trajectories(tuple(names), tuple(curves), assumed, tuple(notes), (record,))
-    if (units.words or units.axes) and "units" not in record:
-        raise TrajectoryError(f"{name}: says its units and axes itself. Remove --units and --axes.")
-    for who, curve in zip(read.names, read.curves, strict=True):
-        _check_size(name, who, curve)
+        raise TrajectoryError(f"{path}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
+    suffix = path.suffix.lower()
+    try:
+        if data.startswith(_ZIP) or suffix == ".skyc":
+            read = shows.read_show(data)
+        elif data.startswith(_MCAP) or suffix == ".mcap":
+            read = poses.read_poses(data, interpolation)
+        else:
+            read = texts.read_text(data, path.stem, interpolation, units)
+        if (units.words or units.axes) and "units" not in read.read[0]:
+            raise fault("says its units and axes itself", "Remove --units and --axes")
+        for who, curve in zip(read.names, read.curves, strict=True):
+            _refuse_far_numbers(who, curve)
+    except ContentError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
     return read
 
 
-def _check_size(name: str, who: str, curve: Piecewise) -> None:
+def _refuse_far_numbers(who: str, curve: Piecewise) -> None:
     """Refuse numbers with which no distance can be computed.
 
     Raises
     ------
-    TrajectoryError
+    ContentError
         A position or time is not finite or larger than `FARTHEST`.
     """
-    h = np.diff(curve.time)
+    begin, end = curve.time[[0, -1]]
+    if not (abs(begin) <= FARTHEST and abs(end) <= FARTHEST):
+        why = f"{who} flies from {begin:.9g} to {end:.9g} s; the most is {FARTHEST:g} s"
+        raise fault(why, "Let times begin at 0, in seconds, or name their unit: time [ms]")
     with np.errstate(all="ignore"):
-        powers = h[:, None, None] ** np.arange(curve.pieces.shape[2])
+        powers = np.diff(curve.time)[:, None, None] ** np.arange(curve.pieces.shape[2])
         reach = np.abs(curve.pieces[:, :3] * powers).sum(axis=2).max(axis=1)
-    if not (np.abs(curve.time[[0, -1]]) <= FARTHEST).all():
-        raise TrajectoryError(
-            f"{name}: {who} flies from {curve.time[0]:.9g} to {curve.time[-1]:.9g} s; the most is {FARTHEST:g} s. Let "
-            "times begin at 0, in seconds, or name their unit: time [ms]."
-        )
     bad = np.flatnonzero(~(reach <= FARTHEST))
     if len(bad):
         k = int(bad[0])
-        raise TrajectoryError(
-            f"{name}: {who} reaches {reach[k]:.3g} m from the origin in piece {k + 1}, which begins at "
-            f"{curve.time[k]:.3g} s; the most is {FARTHEST:g} m. Give metres and seconds, or name other units."
-        )
+        where = f"from the origin in piece {k + 1}, which begins at {curve.time[k]:.3g} s"
+        why = f"{who} reaches {reach[k]:.3g} m {where}; the most is {FARTHEST:g} m"
+        raise fault(why, "Give metres and seconds, or name other units")
 
 
 def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -> list[str]:

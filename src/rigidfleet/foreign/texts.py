@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from rigidfleet._common.tables import TextTable, fault
 from rigidfleet.foreign.columns import Units, parse_table, read_tracks
-from rigidfleet.foreign.curves import NAMES, curve_through_states, rows_to_curve
+from rigidfleet.foreign.curves import NAMES, Trajectories, curve_through_states, rows_to_curve
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
@@ -20,44 +17,34 @@ POLYNOMIALS = "the polynomials of the file"
 _SHARE, _LEAST = 0.05, 0.05
 
 
-def read_text(
-    data: bytes, path: Path, interpolation: str, words: Units
-) -> tuple[list[str], list[Piecewise], str, list[str], dict[str, Any]]:
-    """Names and curves of a table, what is assumed between samples, notes, and what was taken for what.
+def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Trajectories:
+    """The vehicles of a table; the only one is named by the file's stem.
 
     Raises
     ------
-    TableError, TrajectoryError
+    ContentError
         The table cannot be read, or a time does not increase.
     """
-    table, notes = parse_table(data, words)
+    table, notes = parse_table(data, units)
     if table.place("duration", "x^0"):
         curve = _curve_of_coefficients(table)
-        return (
-            [path.stem],
-            [curve],
-            POLYNOMIALS,
-            notes,
-            {"columns": table.names, "rows": len(curve.pieces)},
-        )
-    tracks, record = read_tracks(table, path.stem, words.axes, notes)
+        record = {"columns": table.names, "rows": len(curve.pieces)}
+        return Trajectories((stem,), (curve,), POLYNOMIALS, tuple(notes), (record,))
+    tracks, record = read_tracks(table, stem, units.axes, notes)
     curves, off, fastest = [], 0.0, 0.0
-    for track in tracks:
-        where = lambda k, track=track: f"line {track.lines[k]}"  # noqa: E731
-        curve = curve_through_samples(
-            track.time, track.place, track.yaw, interpolation, str(path), where
-        )
-        curves.append(curve)
+    for _, lines, time, place, velocity, yaw in tracks:
+        where = lambda k, lines=lines: f"line {lines[k]}"  # noqa: E731
+        curves.append(curve_through_samples(time, place, yaw, interpolation, where))
         # At the inner samples, where lines have two velocities.
-        between = curve.pieces[1:, :3, 1]
-        if track.velocity is not None and interpolation == "cubic" and len(between):
-            off = max(off, float(np.linalg.norm(track.velocity[1:-1] - between, axis=1).max()))
+        between = curves[-1].pieces[1:, :3, 1]
+        if velocity is not None and interpolation == "cubic" and len(between):
+            off = max(off, float(np.linalg.norm(velocity[1:-1] - between, axis=1).max()))
             fastest = max(fastest, float(np.linalg.norm(between, axis=1).max()))
     if off > _LEAST + _SHARE * fastest:
-        notes.append(
-            f"the velocities of the table are up to {off:.3g} m/s off those of its positions, which count"
-        )
-    return [track.name for track in tracks], curves, ASSUMED[interpolation], notes, record
+        words = f"up to {off:.3g} m/s off those of its positions, which count"
+        notes.append(f"the velocities of the table are {words}")
+    names = tuple(track.name for track in tracks)
+    return Trajectories(names, tuple(curves), ASSUMED[interpolation], tuple(notes), (record,))
 
 
 def _curve_of_coefficients(table: TextTable) -> Piecewise:
@@ -65,7 +52,7 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
 
     Raises
     ------
-    TableError
+    ContentError
         A column is missing, or a duration is not positive.
     """
     due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]

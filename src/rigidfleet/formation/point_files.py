@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.names import meaning_of
-from rigidfleet._common.tables import Fault, TableError, TextTable, fault
+from rigidfleet._common.tables import ContentError, Fault, TextTable, fault
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
 
@@ -78,7 +78,7 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
         else:
             lines, points, colours, notes = _read_table(data)
             place = "line"
-    except TableError as error:
+    except ContentError as error:
         raise MissionError(_findings(error.faults, name)) from None
     except ValueError as error:
         remedy = "write it again, with one agent per row: x, y, z [m]"
@@ -156,7 +156,7 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
     Raises
     ------
     ValueError
-        A column is not understood or there twice, or (TableError) a row has no numbers.
+        A column is not understood or there twice, or (ContentError) a row has no numbers.
     """
     unnamed = {2: _AXES[:2], 3: _AXES, 6: [*_AXES, *_HUES]}
     if re.search(rb"#[0-9a-fA-F]{6}\s", data):

@@ -102,7 +102,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
 
 def read_skyc(data: bytes) -> list[Piecewise]:
     """The ways in a show, from its time zero on. Yaw is on lines between its setpoints."""
-    return list(read_show(data, "skyc")[1])
+    return list(read_show(data).curves)
 
 
 def _bezier_segments(curve: Piecewise) -> list[list[Any]]:
