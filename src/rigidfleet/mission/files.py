@@ -6,7 +6,6 @@ the files.
 
 from __future__ import annotations
 
-import copy
 import csv
 import hashlib
 import io
@@ -34,8 +33,6 @@ from rigidfleet.mission.text import unread
 _DIGEST = "SHA-256 "
 #: What stands before the notes on a file.
 _DOUBTS = ". Note: "
-#: What a text has that may name a file.
-_MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
 #: What is said where a file cannot be found, because a mission is not from a file itself.
 NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
 
@@ -62,29 +59,12 @@ class Content(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def completed(text: str, path: Path) -> str:
-    """Text of a mission as `with_files` gives it; itself if it names no files.
-
-    Raises
-    ------
-    MissionError
-        As `with_files` does.
-    """
-    if _MAY_NAME.search(text) is None or bounds.excess(text):
-        return text  # which need not, or must not, be parsed
-    try:
-        data = tomllib.loads(text)
-    except (ValueError, RecursionError):
-        return text  # whose errors the check tells
-    return with_files(text, data, path)
-
-
-def with_files(text: str, data: dict[str, Any], path: Path) -> str:
-    """Text of a mission in which numbers stand instead of the names of files, with the SHA-256 digest of each.
+def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
+    """A mission in which numbers stand instead of the names of files, with the SHA-256 digest of each in its text.
 
     Parameters
     ----------
-    text, data : the mission's text, and what it says
+    data, text : what the mission's text says, which is changed, and the text
     path : the mission file; names of files are relative to its folder, and do not leave it
 
     Raises
@@ -92,7 +72,7 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     MissionError
         A file is outside the folder, cannot be read, or has not the numbers asked for.
     """
-    data, digests = copy.deepcopy(data), []
+    digests = []
     for named in list(_named(data)):
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
@@ -112,12 +92,17 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"
         text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
+    if digests and not _says(text, data):  # where a file is named within a line
+        text = "".join(digests) + to_toml(data)
+    return data, text
+
+
+def _says(text: str, data: dict[str, Any]) -> bool:
+    """Whether TOML text says what data say."""
     try:
-        if tomllib.loads(text) == data:
-            return text
+        return tomllib.loads(text) == data
     except tomllib.TOMLDecodeError:
-        pass
-    return "".join(digests) + to_toml(data)  # where a file is named within a line
+        return False
 
 
 def digests(text: str) -> str:

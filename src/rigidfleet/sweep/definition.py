@@ -522,7 +522,7 @@ def _taken(
         value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
         apply(document, whole, column, value)
     try:
-        Mission.from_dict(document)
+        Mission.from_plain(document, "<dict>")
     except MissionError as error:
         for finding in error.findings:
             names = [[c.name, finding.key.replace("[", ".")] for _, c in lacked]
