@@ -21,11 +21,6 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
-from rigidfleet.foreign.columns import Doubt
-from rigidfleet.foreign.curves import curve_to_rows, least_jerk
-from rigidfleet.foreign.files import files_of, read_trajectories
-from rigidfleet.foreign.samples import ASSUMED
-from rigidfleet.formation.point_files import parse_points, read_bytes
 from rigidfleet.mission import bounds
 from rigidfleet.mission.text import unread
 
@@ -74,6 +69,8 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
     """
     digests = []
     for named in list(_named(data)):
+        from rigidfleet.formation.point_files import read_bytes
+
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
         rows, colours, notes = named.read(content, str(path.parent / name))
@@ -129,6 +126,8 @@ def _names(path: Path, named: _Named) -> list[str]:
     found = _inside(path, named.where, name)
     if not named.folder or not found.is_dir():
         return [name]
+    from rigidfleet.foreign.files import files_of
+
     try:
         inside = [file for group in files_of(found) for file in group]
     except TrajectoryError as error:
@@ -187,6 +186,8 @@ def _inside(path: Path, where: str, name: str) -> Path:
 
 
 def _points(data: bytes, name: str) -> Content:
+    from rigidfleet.formation.point_files import parse_points
+
     found = parse_points(data, name)
     return Content(found.slots.tolist(), found.colours)
 
@@ -196,6 +197,11 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
 
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
+    from rigidfleet.foreign.columns import Doubt
+    from rigidfleet.foreign.curves import curve_to_rows, least_jerk
+    from rigidfleet.foreign.files import read_trajectories
+    from rigidfleet.foreign.samples import ASSUMED
+
     try:
         read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
     except TrajectoryError as error:

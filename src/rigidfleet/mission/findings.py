@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -207,6 +206,8 @@ def look_up(data: Any, path: Keys, default: Any = None) -> Any:
 
 def near(word: object, known: Iterable[str]) -> str:
     """Return 'did you mean ...?' if a known word is similar, else ''."""
+    import difflib
+
     words = {k.lower(): k for k in known}
     match = difflib.get_close_matches(str(word).lower(), words, n=1, cutoff=0.55)
     return f"did you mean '{words[match[0]]}'?" if match else ""

@@ -26,7 +26,7 @@ from rigidfleet.mission.describe import counted
 from rigidfleet.mission.files import digests
 from rigidfleet.mission.findings import Shared
 from rigidfleet.mission.kinds import Establish, Phase
-from rigidfleet.mission.obstacles import Ground, is_ground
+from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents
 from rigidfleet.mission.text import parse_toml, unread
@@ -464,11 +464,15 @@ class Mission(Contents):
         """Height of the highest `ground` [m]; minus infinity if there is none."""
         return max((o.height for o in self.obstacles if isinstance(o, Ground)), default=-np.inf)
 
+    @property
+    def solids(self) -> list[Obstacle]:
+        """Obstacles but for the ground, which is everywhere."""
+        return [o for o in self.obstacles if not isinstance(o, Ground)]
+
     @cached_property
     def roofs(self) -> Solids:
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
-        things = (o for o in self.obstacles if is_ground(o) and not isinstance(o, Ground))
-        return joined([o.solid for o in things])
+        return joined([o.solid for o in self.solids if is_ground(o)])
 
     def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.
