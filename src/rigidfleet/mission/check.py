@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
@@ -326,8 +327,9 @@ def _limits(m: Draft) -> Breaches:
     if limits.separation_altitude is not None and limits.separation is None:
         problem = "has no effect without separation"
         yield Breach("separation_altitude", problem, "remove it or add separation")
+    jerks = (q.name for q in MOTIONS if q.order == 3)
     for key in (
-        ("jerk",) if m.flies_vehicles else ("jerk", "tilt_deg")
+        jerks if m.flies_vehicles else (*jerks, "tilt_deg")
     ):  # of vehicles, the verdict judges the tilt
         if getattr(limits, key) is not None and not m.smooth:
             problem = "has no effect: only the plan of a smooth mission keeps it"
