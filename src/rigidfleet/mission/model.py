@@ -24,7 +24,6 @@ from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check, defaults
 from rigidfleet.mission.describe import counted
 from rigidfleet.mission.files import digests
-from rigidfleet.mission.findings import Shared
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end
@@ -119,19 +118,15 @@ class Mission(Contents):
         return cls.from_plain(parse_toml(text, origin), origin, text=text)
 
     @classmethod
-    def from_plain(
-        cls, data: dict[str, Any], origin: str, shared: Shared | None = None, *, text: str = ""
-    ) -> Self:
+    def from_plain(cls, data: dict[str, Any], origin: str, *, text: str = "") -> Self:
         """Check a mission given as the plain data of its TOML text, as `to_dict` returns it; the mission keeps them.
-
-        Tables that are ``shared`` with other missions are validated once for all of them.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        parts = check(data, origin, shared)
+        parts = check(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)
