@@ -260,7 +260,7 @@ def test_lists_of_a_phase_side_by_side_do_not_outlast_it():
             flight.begin()
         phases = [flight.under_way() for flight in flights]
         vector = together._vector(phases)
-        assert together._fly(phases, vector)
+        assert together._fly([phase.stepper for phase in phases], vector)
         for flight in flights:
             flight.arrive()
         for phase in phases:

@@ -35,6 +35,7 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     RotorCommand,
 )
+from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
@@ -338,11 +339,11 @@ class Flight:
             plan = self._planned(phase)
             phase = plan.phase
             self._check_frame(plan)
-            make = ActivePhase
+            stepper = PointPhase
             if self._vehicles is not None:
-                make = partial(SampledPhase, vehicles=self._vehicles)
-            self._active = make(
-                len(self.phases), plan, extremes=self._extremes, external=self.external,
+                stepper = partial(SampledPhase, vehicles=self._vehicles)
+            self._active = ActivePhase(
+                len(self.phases), plan, stepper, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip
         except MissionError as error:
@@ -625,7 +626,7 @@ class Flight:
         record.extremes = self._extremes.phase()
         record.abandoned = abandoned
         record.controller = None if self.controller is None else active.asked > 0
-        if active.delay > 0.0:
+        if active.stepper.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.settled
         active.count()
