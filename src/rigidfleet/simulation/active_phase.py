@@ -288,6 +288,7 @@ class ActivePhase:
     def release(self) -> None:
         """Give back what the phase holds, after the end: nothing more is asked of it."""
         self.stepper.release()
+        del self.stepper  # which refers back to the phase: its memory is free at once
 
     # -- inside -----------------------------------------------------------------------------------
 
