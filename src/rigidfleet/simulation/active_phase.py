@@ -29,9 +29,7 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.diagnosis import Place
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import LayerSamples, Led, Piece, Unevaluated, VehicleSamples
-from rigidfleet.simulation.solver_setup import (
-    equip,
-)
+from rigidfleet.simulation.solver_setup import equip
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -39,8 +37,6 @@ if TYPE_CHECKING:
 
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
-
-
 #: Function that gives the times in (t, t_end] to record: sampling(plan, t, t_end, first=..., stop=...).
 Sampler = Callable[..., Floats]
 
