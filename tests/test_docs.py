@@ -456,6 +456,15 @@ def test_five_lines_of_the_readme(tmp_path, monkeypatch):
     assert list(tmp_path.rglob("*.png"))
 
 
+FIRST_MET = ("establish", "blend", "certificate", "flip", "handedness", "open", "prestress")
+
+
+@pytest.mark.parametrize("word", FIRST_MET)
+def test_words_of_the_house_are_explained(word):
+    """The glossary says in a few words what the program's own words mean."""
+    assert re.search(rf"^\| {word} \| \S.{{20,}} \|$", page("glossary.md"), re.MULTILINE)
+
+
 # -- pictures ----------------------------------------------------------------------------------------
 
 

@@ -367,11 +367,11 @@ def test_limits_are_found_between_samples():
         leg = planned.leg
         expected = dense(leg, mission)
         for x in reached(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end):
-            share = expected[x.limit.name]
+            share = expected[x.limit.of.called]
             assert x.share == pytest.approx(share, rel=1e-3, abs=1e-9)
             who = np.array([x.agent])
             at = d.slot_derivatives(leg.reference, leg.motion, np.array([x.time]))[:, :, who]
-            assert x.limit.quantity(at, who)[0, 0] == pytest.approx(x.value, rel=1e-9, abs=1e-12)
+            assert x.limit.values(at, who)[0, 0] == pytest.approx(x.value, rel=1e-9, abs=1e-12)
 
 
 def test_a_time_that_is_too_short_is_refused_with_the_least_one():

@@ -30,10 +30,6 @@ _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
 _CLOSE, _STEP, _NEARLY, _NEAR = 1.006, 4.0, 1.002, 1.005
 #: A time that is more than twice as long has to lower the greatest share of a limit at least to this part of it.
 _STALLED = 0.98
-#: Root of each share that falls in proportion to the time, for ways from rest to rest.
-_POWERS = {"jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
-_POWERS |= {f"{way}speed": 1.0 for way in ("", "horizontal ", "vertical ")}
-_POWERS |= {f"{way}acceleration": 1 / 2 for way in ("", "horizontal ", "vertical ")}
 #: What automatic times have in reserve, and the unit to which they are rounded up [s].
 _MARGIN, _UNIT = 1.005, 1e-3
 #: Excess over a limit that is ignored.
@@ -112,7 +108,7 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
     if time is None:
         key = phase.automatic[0]
         problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
-        remedy = f"raise limits.{worst.limit.name.replace(' ', '_')}, or change the way"
+        remedy = f"raise {worst.limit.of.key}, or change the way"
         path = f"phases[{number + 1}].{key}"
         raise MissionError([Finding(mission.origin, path, AUTO, problem, remedy)])
     if time > shortest:
@@ -141,10 +137,10 @@ def broken(mission: Mission, leg: Leg) -> list[Reached]:
 
 def said(worst: Reached, phase: Phase) -> str:
     """What is reached of a limit, in words."""
-    limit = worst.limit
+    q, most = worst.limit.of, worst.limit.most[worst.agent]
     return (
-        f"agent {worst.agent + 1} would need {worst.value:.3g} {limit.unit} of {limit.name} at {worst.time:.2f} s in"
-        f" '{phase.name}' (limit {limit.most[worst.agent]:g} {limit.unit})"
+        f"agent {worst.agent + 1} would need {worst.value:.3g} {q.unit} of {q.called} at {worst.time:.2f} s in"
+        f" '{phase.name}' (limit {most:g} {q.unit})"
     )
 
 
@@ -170,8 +166,8 @@ def _least(
         return reached(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
     def excess(time: float) -> float:
-        """Greatest share of a limit [-], as a power that falls in proportion to the time."""
-        return max(x.share ** _POWERS[x.limit.name] for x in each(time))
+        """Greatest share of a limit [-], as a power that falls in proportion to the time of ways from rest to rest."""
+        return max(x.share ** (1 / x.limit.of.order) for x in each(time))
 
     # At rest at both ends, every share falls with a power of the time: from a trial, the first guess is the solution.
     low, high, time = 0.0, math.inf, max(_TRIAL, shortest)
