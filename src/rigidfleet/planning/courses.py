@@ -228,7 +228,7 @@ def _whole_turns(yaw: float, near: float) -> float:
 
 def misled(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    return _MISLED[phase.kind](phase, now) if phase.kind in _MISLED else ""
+    return _MISLED.get(phase.kind, lambda *_: "")(phase, now)
 
 
 def _misled_slots(phase: Reshape, now: PhaseState) -> str:

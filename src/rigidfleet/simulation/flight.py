@@ -323,9 +323,8 @@ class Flight:
                 return False
             phase = self._route[self._following]
             self._following += 1
-        elif isinstance(
-            phase, Mapping
-        ):  # checked first: a phase under way goes on where it has errors
+        elif isinstance(phase, Mapping):  # no phase yet
+            # Checked first: a phase under way goes on where it has errors.
             flown = len(self.phases) - (self._active is not None and not self._active.flew)
             phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
         else:
