@@ -36,7 +36,8 @@ def code(answer: int) -> bytes:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     text = "define i64 @{}(i64, i64, i64, i64) {{ ret i64 {} }}"
-    module = llvm.parse_assembly("\n".join(text.format(e, answer) for e in objects.ENTRIES))
+    symbols = map(objects.symbol, objects.ENTRIES["flight"])
+    module = llvm.parse_assembly("\n".join(text.format(name, answer) for name in symbols))
     return objects.target_machine().emit_object(module)
 
 

@@ -126,10 +126,14 @@ class Monitor(NamedTuple):
     # of the ball about the third control point that holds all five: its centre and its radius [m]
     balls: Annotated[Floats, Extents(("N", 4))]
     curve: Annotated[Floats, Extents((5, 3))]  # of one pair
+    # a path in the world, cut at waypoints, and in the axes of an obstacle
+    curves: Annotated[Floats, Extents((3, 5, 3))]
     work: Annotated[Floats, Extents((40, 11))]  # polynomials
     pieces: Annotated[Floats, Extents((40, 17))]  # curves
     basis: Annotated[Floats, Extents((5, 5))]
-    poses: Annotated[Floats, Extents((5, 15))]  # attitude, centre and its velocity at knots
+    # of the body axes at knots, world to body; their centre [m] and its velocity [m/s]
+    attitudes: Annotated[Floats, Extents((5, 3, 3))]
+    centres: Annotated[Floats, Extents((5, 6))]
     knots: Annotated[Floats, Extents((5, 3))]
     scratch: Annotated[Floats, Extents((3, 10))]
 
@@ -150,9 +154,10 @@ def monitor(
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
         "rank": np.zeros(_NODES, dtype=np.int64),
-        "places": np.zeros((n, 5, 3)), "balls": np.zeros((n, 4)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
-        "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
-        "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
+        "places": np.zeros((n, 5, 3)), "balls": np.zeros((n, 4)), "curve": np.zeros((5, 3)),
+        "curves": np.zeros((3, 5, 3)), "work": np.zeros((40, 11)),
+        "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "attitudes": np.zeros((5, 3, 3)),
+        "centres": np.zeros((5, 6)), "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
     }  # fmt: skip
     return Monitor(**(fields | given))
 

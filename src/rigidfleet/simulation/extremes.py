@@ -196,7 +196,7 @@ class CurveWatch:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
         steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, np.arange(steps))
+        self._take_solids(problem, state, 0, steps)
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
@@ -236,24 +236,21 @@ class CurveWatch:
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
-        self._take_solids(problem, state, np.arange(len(steps[0])))
+        self._take_solids(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
         found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
         return found
 
-    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: Ints) -> None:
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, first: int, end: int
+    ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
-        if self.solids is None:
-            return
-        from rigidfleet.kernel import obstacles  # loads the compiler
+        if self.solids is not None:
+            from rigidfleet.kernel.engine.solids import watch_solids  # loads the compiler
 
-        trail, body = state.trail, bool(problem.body_formulation)
-        laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
-        watched = obstacles.monitor_of(self.monitor.monitor)
-        for row in _rows(state, steps):
-            obstacles.watch(trail.points[row], *trail.clock[row], laid, self.solids, watched)
+            watch_solids(self.monitor, problem, state, first, end, self.solids)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -506,7 +503,7 @@ class Extremes(CurveWatch):
         new: Ints = np.arange(int(count[records.STAYED]), steps)
         listed = int(count[records.LISTED_DISTANCES])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, new)
+        self._take_solids(problem, state, steps - len(new), steps)
         if self.n > _FEW:
             for step in new:
                 self._step(problem, work, state, step)

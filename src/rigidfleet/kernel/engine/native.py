@@ -16,6 +16,7 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
@@ -24,13 +25,12 @@ import numpy as np
 from rigidfleet._common.files import replacing
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
 from rigidfleet.kernel.engine.objects import (
-    AVOIDANCE_ENTRY,
     ELSEWHERE,
     ENTRIES,
-    SAMPLED_ENTRIES,
     build_process,
     concatenated,
     separated,
+    symbol,
     target_machine,
 )
 from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed, use
@@ -121,17 +121,18 @@ class Watch:
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
         self._kept = pack(segment), pack(UNRECORDED)
         self.monitor = monitor._replace(
-            recorder=_code().recorder, segment=self._kept[0].address, record=self._kept[1].address
+            recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
         self._packed = pack(self.monitor)
+        self.address = self._packed.address
 
     def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
-        _call(_code().bound_moves, packed(problem), packed(state), self._packed)
+        _code().bound_moves(packed(problem).address, packed(state).address, self.address)
 
     def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
-        of = packed(problem).address, packed(state).address, self._packed.address
+        of = packed(problem).address, packed(state).address, self.address
         _code().watch_distances(first, end, *of)
 
     def forces(
@@ -139,7 +140,7 @@ class Watch:
     ) -> None:
         """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
         of = [packed(x).address for x in (problem, workspace, state)]
-        _code().watch_forces(int(last), *of, self._packed.address)
+        _code().watch_forces(int(last), *of, self.address)
 
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
@@ -196,62 +197,39 @@ def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> 
     _call(_code().follow, pack(Recursion(x, a, False, y, first, b)))
 
 
-class _Code(NamedTuple):
-    integrate: Any
-    record: Any
-    bound_moves: Any
-    watch_distances: Any
-    watch_forces: Any
-    measure: Any
-    spectrum: Any
-    nearest: Any
-    follow: Any
-    integrate_three: Any  # integrate, for three agents with three edges
-    recorder: int  # address of record
-    engine: Any  # keeps the code alive
-    unkept: list[bytes] | None  # objects that could not be stored in the cache
+class Library(SimpleNamespace):
+    """Machine code that is loaded: its functions by name (`objects.ENTRIES`), and their ``addresses``.
 
-
-class Sampled(NamedTuple):
-    """The second library: sampled flights. Flights of points do not load it."""
-
-    fly_ticks: Any
-    evaluate: Any
-    recorder: int  # address of record
-    engine: Any
-    unkept: list[bytes] | None
-
-
-class Avoiding(NamedTuple):
-    """The third library: avoidance in flight, loaded by missions with [avoidance] alone."""
-
-    avoid: Any
-    address: int
-    engine: Any
-    unkept: list[bytes] | None
+    The ``engine`` keeps the code alive; ``unkept`` are its objects if they could not be stored in the cache.
+    """
 
 
 _loading = threading.RLock()
 #: The libraries that are loaded, by part.
-_loaded: dict[str, Any] = {}
+_loaded: dict[str, Library] = {}
 
 
-def _code() -> _Code:
+def _code() -> Library:
     """The kernel's machine code: from the cache, or compiled."""
     return _library("flight")
 
 
-def sampled() -> Sampled:
+def sampled() -> Library:
     """The machine code of sampled flights: from the cache, or compiled."""
     return _library("sampled")
 
 
-def avoiding() -> Avoiding:
+def avoiding() -> Library:
     """The machine code of avoidance in flight: from the cache, or compiled."""
     return _library("avoidance")
 
 
-def _library(part: str) -> Any:
+def recorder_address() -> int:
+    """Address of the recorder, which other libraries and the monitor call."""
+    return _code().addresses["record"]
+
+
+def _library(part: str) -> Library:
     if part not in _loaded:
         with _loading:
             if part not in _loaded:
@@ -259,42 +237,25 @@ def _library(part: str) -> Any:
     return _loaded[part]
 
 
-def _load(part: str) -> Any:
+def _load(part: str) -> Library:
     if (parts := _read(part)) is not None:
-        return _LINKED[part](parts)
+        return _link(part, parts)
     parts = _compile(part)
-    return _LINKED[part](parts, None if _write(parts, part) else parts)
+    return _link(part, parts, None if _write(parts, part) else parts)
 
 
-def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
-    engine = _engine(parts)
-    *calls, gather, three = [_function(engine, *entry) for entry in ENTRIES.items()]
-    use(gather, engine)
-    distance.use(nearest_boxes)
-    recorder = engine.get_function_address("rigidfleet_record")
-    return _Code(*calls, three, recorder, engine, unkept)
-
-
-def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Sampled:
-    engine = _engine(parts)
-    calls = [_function(engine, *entry) for entry in SAMPLED_ENTRIES.items()]
-    return Sampled(*calls, _code().recorder, engine, unkept)
-
-
-def _linked_avoiding(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Avoiding:
-    engine = _engine(parts)
-    address = engine.get_function_address(AVOIDANCE_ENTRY)
-    return Avoiding(_function(engine, AVOIDANCE_ENTRY, 4), address, engine, unkept)
-
-
-#: What makes a library of the objects of each part.
-_LINKED = {"flight": _linked, "sampled": _linked_sampled, "avoidance": _linked_avoiding}
-
-
-def _function(engine: Any, name: str, words: int) -> Any:
-    """A function of machine code that takes this number of words and returns one."""
-    word = ctypes.c_int64
-    return ctypes.CFUNCTYPE(word, *(word,) * words)(engine.get_function_address(name))
+def _link(part: str, parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Library:
+    """Make a library of the objects of a part."""
+    engine, word = _engine(parts), ctypes.c_int64
+    addresses = {name: engine.get_function_address(symbol(name)) for name in ENTRIES[part]}
+    calls = {
+        name: ctypes.CFUNCTYPE(word, *(word,) * words)(addresses[name])
+        for name, words in ENTRIES[part].items()
+    }
+    if part == "flight":
+        use(calls["gather"], engine)
+        distance.use(nearest_boxes)
+    return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 
 def _engine(parts: Sequence[bytes]) -> Any:
@@ -326,7 +287,7 @@ def inherit(given: Inheritance) -> None:
     if given.told:
         told.set()
     for part, code in given.code.items():
-        _loaded[part] = _LINKED[part](code, code)
+        _loaded[part] = _link(part, code, code)
 
 
 def _compile(part: str) -> list[bytes]:

@@ -65,13 +65,13 @@ def _packed(
     law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
     recorded = packed(UNRECORDED)
     call = segment._replace(
-        recorder=native.sampled().recorder, segment=law.address, record=recorded.address
+        recorder=native.recorder_address(), segment=law.address, record=recorded.address
     )
     states = packed(problem), packed(workspace), packed(flight), packed(state)
     if avoidance is None:
         return *states, pack(call), law, recorded
     kept = _of(avoidance, problem, workspace)
-    call = call._replace(guard=native.avoiding().address, avoidance=kept.address)
+    call = call._replace(guard=native.avoiding().addresses["avoid"], avoidance=kept.address)
     return *states, pack(call), law, recorded, kept
 
 
