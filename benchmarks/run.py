@@ -34,6 +34,7 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.tracer import Code, Trace
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.result import Result
@@ -125,7 +126,7 @@ def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[
     """The kernel alone: all that is known before the flight is prepared before the clock starts."""
     agents = mission.agents
     now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
-    plan = plan_phase(mission, mission.phases[0], now)
+    plan = plan_phase(mission, leg_of(mission, mission.phases[0], now))
     work = workspace(len(now.r), len(plan.edges), solver=plan.problem.law.solver)
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
@@ -409,7 +410,7 @@ def straight_line(mission: Mission) -> int:
     """Operations of an evaluation as straight-line code does them, and its share of a step of `lane_steps`."""
     r = np.array(mission.agents.position)
     now = PhaseState(0.0, r, np.zeros_like(r))
-    code = Code(Trace(plan_phase(mission, mission.phases[0], now).problem))
+    code = Code(Trace(plan_phase(mission, leg_of(mission, mission.phases[0], now)).problem))
     # The last two of eight stages are at the same moment.
     return (
         len(code.moment) * 7 // 8 + len(code.lines) + share_of_a_step(mission, stages=8, weights=36)

@@ -43,6 +43,7 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math import attitude
 from rigidfleet.mission import Mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import PhaseState, plan_phase
 from rigidfleet.simulation.flight import simulate
 
@@ -87,7 +88,7 @@ def a_problem(mission: Mission, index: int = 0, now: PhaseState | None = None) -
     if now is None:
         agents = mission.agents
         now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
-    return plan_phase(mission, phase, now).problem
+    return plan_phase(mission, leg_of(mission, phase, now)).problem
 
 
 def random_vectors(seed: int, n: int, scale: float = 1.0) -> np.ndarray:
@@ -597,7 +598,7 @@ def a_flight_with_a_turn() -> tuple[Problem, Workspace]:
         ],
     )
     now = PhaseState(0.0, np.array(mission.agents.position), np.zeros((3, 3)))
-    fly = plan_phase(mission, mission.phases[1], now).problem
+    fly = plan_phase(mission, leg_of(mission, mission.phases[1], now)).problem
     shape = random_vectors(3, 3, 2.0)
     ref = Reference(
         SHAPE, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])

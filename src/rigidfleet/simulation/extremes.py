@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet._common.kept import kept
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -23,7 +24,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
 from rigidfleet.mission.model import Fleet
-from rigidfleet.result import DIRECTIONS, PAD, Extremum, PhaseRecord
+from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -42,30 +43,10 @@ _TOUCH, _INSTANT = 1e-6, 1e-6
 _SHORTEST = 2.0**-20
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
 _ASKED = 2000
-#: Quantities that the monitor stores with the opposite sign.
-_GREATEST = frozenset(
-    ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
-     "constraint", *DIRECTIONS)
-)  # fmt: skip
-#: Quantities by name; the clearances at the start and the end belong to the whole flight.
-_NAMES = {
-    "separation": records.SEPARATION,
-    "lost": records.LOST,
-    "separation_below": records.SEPARATION_BELOW,
-    "separation_flying": records.SEPARATION_FLYING,
-    "clearance": records.CLEARANCE,
-    "geofence": records.GEOFENCE,
-    "lowest": records.LOWEST,
-    "highest": records.HIGHEST,
-    "speed": records.SPEED,
-    "thrust": records.THRUST,
-    "thrust_margin": records.THRUST_MARGIN,
-    "acceleration": records.ACCELERATION,
-    "constraint_force": records.CONSTRAINT_FORCE,
-    "tension": records.TENSION,
-    "constraint": records.CONSTRAINT,
-    **dict(zip(DIRECTIONS, range(records.HORIZONTAL_SPEED, records.QUANTITIES), strict=True)),
-}
+#: The monitor's number of each quantity that it finds; the clearances at the start and the end belong to the flight.
+_NAMES = {q.name: getattr(records, q.name.upper()) for q in QUANTITIES.values() if q.monitored}
+#: Quantities of a direction, which are searched for where one of them has a limit.
+_DIRECTIONS = [q for q in MOTIONS if q.monitored and q.way]
 #: What a monitor writes.
 _WRITTEN = "worst", "when", "who", "standing", "low", "count"
 #: First contacts of a flight by name, each with the quantity that then falls below zero.
@@ -80,7 +61,7 @@ _SAMPLED = (
 )
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 #: The quantities of a phase, each with its name, its index, and the sign with which it is stored.
-_STORED = [(name, k, -1.0 if name in _GREATEST else 1.0) for name, k in _NAMES.items()]
+_STORED = [(name, k, 1.0 if QUANTITIES[name].at_least else -1.0) for name, k in _NAMES.items()]
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
@@ -127,7 +108,7 @@ class CurveWatch:
         self.reach = -math.inf if lowest is None or self.n <= _FEW else limits.separation or 0.0
         self.stacks = self.n <= _FEW or limits.separation_below is not None
         #: Whether there are limits by direction: only then is what they limit searched for.
-        self.directed = any(getattr(limits, name) is not None for name in DIRECTIONS)
+        self.directed = any(getattr(limits, q.name) is not None for q in _DIRECTIONS)
         count = records.QUANTITIES
         self.none = np.full(count, np.inf)
         self.none[records.SEPARATION_FLYING] = abs(self.reach)
