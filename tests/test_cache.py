@@ -49,7 +49,7 @@ def answer() -> int:
 
 def forget() -> None:
     """Let the next warning be the first."""
-    native.told.clear()
+    native.warned.clear()
 
 
 @pytest.fixture(autouse=True)

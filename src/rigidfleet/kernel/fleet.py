@@ -422,26 +422,26 @@ def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 
 
 
 def begin(
-    given: Flight, S: Floats, workspace: Workspace, *, frame: Floats | None = None, rows: int = 0
+    flight: Flight, S: Floats, workspace: Workspace, *, frame: Floats | None = None, rows: int = 0
 ) -> SampledState:
     """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail."""
     n, m = len(S), len(workspace.c)
-    sensing = given.sensing
+    sensing = flight.sensing
     depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
     attitude = _frame(frame)
-    curves = given.vehicles.thrust.T[:, :, None]
-    peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
+    curves = flight.vehicles.thrust.T[:, :, None]
+    peak = np.where(flight.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, VERTICAL + 1))
     worst[:, UPRIGHT] = 1.0 - 2.0 * (S[:, 7:9] ** 2).sum(axis=1)
-    times = np.full(worst.shape, given.start)
+    times = np.full(worst.shape, flight.start)
     trail = NO_TRAIL
     if rows:
         none = np.zeros(0)
         trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
-        S=S.copy(), clock=np.array([given.start, given.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
+        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
         integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),

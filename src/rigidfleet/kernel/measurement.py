@@ -532,7 +532,7 @@ def spectrum(s):
                         s.one[a, b] = s.A[a, b * _AT_ONCE + l]
                 s.least[0, l] = least_eigenvalue(s.one, s.work[0], s.work[1], s.work[2], _ZERO)
         for l in range(min(_AT_ONCE, K - first)):
-            s.found[first + l] = math.sqrt(s.least[0, l])
+            s.values[first + l] = math.sqrt(s.least[0, l])
 
 
 @compiled

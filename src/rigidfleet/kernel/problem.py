@@ -338,11 +338,11 @@ def _meeting(edges: NDArray[np.integer]) -> tuple[Edges, Ints, Ints, Floats]:
         sign = 1.0 - 2.0 * end
         p, q = np.tril_indices(len(k), -1)
         parts.append(np.stack([k[p], k[q], np.full(len(p), float(agent)), sign[p] * sign[q]]))
-    found = np.concatenate(parts, axis=1)
-    pairs, where = np.unique(found[:2].T.astype(np.uint32), axis=0, return_inverse=True)
+    meetings = np.concatenate(parts, axis=1)
+    pairs, where = np.unique(meetings[:2].T.astype(np.uint32), axis=0, return_inverse=True)
     return (
         np.ascontiguousarray(pairs).reshape(-1, 2),
         where.ravel(),
-        found[2].astype(np.int64),
-        found[3],
+        meetings[2].astype(np.int64),
+        meetings[3],
     )

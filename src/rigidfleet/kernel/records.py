@@ -139,9 +139,9 @@ class Monitor(NamedTuple):
 
 
 def monitor(
-    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **given: Any
+    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **changes: Any
 ) -> Monitor:
-    """A new monitor without values; pairs are listed only if ``given`` among the fields."""
+    """A new monitor without values; pairs are listed only if ``changes`` among the fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
     fields: dict[str, Any] = {
         "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
@@ -159,7 +159,7 @@ def monitor(
         "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "attitudes": np.zeros((5, 3, 3)),
         "centres": np.zeros((5, 6)), "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
     }  # fmt: skip
-    return Monitor(**(fields | given))
+    return Monitor(**(fields | changes))
 
 
 class IntegratorState(NamedTuple):
@@ -248,8 +248,17 @@ def recorder(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
 
     Unless ``disturbed``, there are no rows of what disturbances alone give.
     """
-    agent, edge, given = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
-    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(given,) * 3
+    agent, edge, when_disturbed = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
+    shapes = (
+        *(agent,) * 7,
+        *(edge,) * 5,
+        agent,
+        (k, 6),
+        (k, 3),
+        (k, 3, 3),
+        (k, 6),
+        *(when_disturbed,) * 3,
+    )
     return Record._make([np.empty(shape) for shape in shapes])
 
 

@@ -200,9 +200,9 @@ def led(
 ) -> tuple[Floats, Floats, Floats]:
     """The trajectory of `finite_horizon_trajectory`, from the response at its times (K,) [s]."""
     states, inputs = response
-    given = [np.asarray(z, dtype=float) for z in (*start, *target)]
-    alike = all(z.shape == given[0].shape for z in given)
-    x0, v0, x1, v1 = given if alike else np.broadcast_arrays(*given)
+    ends = [np.asarray(z, dtype=float) for z in (*start, *target)]
+    alike = all(z.shape == ends[0].shape for z in ends)
+    x0, v0, x1, v1 = ends if alike else np.broadcast_arrays(*ends)
     e0 = np.array([x0 - (x1 - T * v1), v0 - v1])
     rows, shape = e0.reshape(2, -1), x0.shape
     e = (states.reshape(-1, 2) @ rows).reshape(-1, 2, *shape)

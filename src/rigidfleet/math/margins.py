@@ -316,7 +316,7 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     random = np.random.default_rng(0).uniform(1.0, 2.0, len(matrices))
     X = sum(c * A for c, A in zip(random, matrices, strict=True))
     n = len(X)
-    done, found = np.zeros((n, 0)), {}
+    done, bases = np.zeros((n, 0)), {}
     for v in np.linalg.eigh(X)[1].T:
         rest = v - done @ (done.T @ v)
         size = np.linalg.norm(rest)
@@ -333,8 +333,8 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
                     V = np.column_stack([V, y / size])
             at += 1
         done = np.column_stack([done, V])
-        found.setdefault(tuple(np.round(np.linalg.eigvalsh(V.T @ X @ V), 6)), V)
-    return list(found.values())
+        bases.setdefault(tuple(np.round(np.linalg.eigvalsh(V.T @ X @ V), 6)), V)
+    return list(bases.values())
 
 
 def is_stable(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> bool:
@@ -423,7 +423,7 @@ def _loci_at(loop: Loop, law: Feedback, *, on_axis: bool) -> list[tuple[float, c
         """A number that is whole at a crossing, of log(locus)."""
         return (z.imag - math.pi) / (2 * math.pi) if on_axis else z.real * 1e-3
 
-    found = []
+    crossings = []
     number = place(loci)
     for k, c in np.argwhere(np.floor(number[:-1]) != np.floor(number[1:])):
         target = max(np.floor(number[k, c]), np.floor(number[k + 1, c]))
@@ -439,8 +439,8 @@ def _loci_at(loop: Loop, law: Feedback, *, on_axis: bool) -> list[tuple[float, c
             return complex(z[np.abs(z).argmin()] + guess)
 
         x = _root(lambda x, at=at, target=target: float(place(np.array(at(x)))) - target, *ends)
-        found.append((math.exp(x), complex(np.exp(at(x)))))
-    return found
+        crossings.append((math.exp(x), complex(np.exp(at(x)))))
+    return crossings
 
 
 def _root(f: Callable[[float], float], a: float, b: float) -> float:

@@ -44,7 +44,7 @@ def costs_and_states(
     """
     tau = np.maximum(T - t, 0.0)
     if _grows(A, G, Q, S, T):
-        P, x = (found[:-1] for found in _marched(A, G, Q, S, np.append(tau, T)))
+        P, x = (part[:-1] for part in _marched(A, G, Q, S, np.append(tau, T)))
         return P, x
     P = _doubled(A, G, Q, S, tau)
     X, Phi, W, _ = _flow(A, G, Q, S, t, T)

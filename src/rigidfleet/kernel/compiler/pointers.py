@@ -83,24 +83,24 @@ class _Attribute(AttributeTemplate):
     key = Pointer
 
     def generic_resolve(self, kind: Any, name: str) -> types.Type:
-        found, _ = _field(kind.to, name)
-        return Pointer(found) if isinstance(found, types.BaseNamedTuple) else found
+        field, _ = _field(kind.to, name)
+        return Pointer(field) if isinstance(field, types.BaseNamedTuple) else field
 
 
 @lower_getattr_generic(Pointer)
 def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
-    found, first = _field(kind.to, name)
-    if isinstance(found, types.BaseNamedTuple):
+    field, first = _field(kind.to, name)
+    if isinstance(field, types.BaseNamedTuple):
         return _at(builder, address, first)
-    if isinstance(found, types.Array):
-        array = context.make_array(found)(context, builder)
+    if isinstance(field, types.Array):
+        array = context.make_array(field)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
-        extents = _declared(kind.to.instance_class).get(name, (None,) * found.ndim)
+        extents = _declared(kind.to.instance_class).get(name, (None,) * field.ndim)
         shape = [_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
-        return _described(context, builder, found, array, shape)
-    if found == types.boolean:
+        return _described(context, builder, field, array, shape)
+    if field == types.boolean:
         return builder.trunc(_load(builder, address, first), ir.IntType(1))
-    return _load(builder, address, first, context.get_value_type(found))
+    return _load(builder, address, first, context.get_value_type(field))
 
 
 def _at(builder: Any, address: Any, word: int) -> Any:
@@ -148,16 +148,16 @@ def sized(text: str, sizes: Mapping[str, int]) -> str:
 
     Raises RuntimeError if the text has no such extent.
     """
-    found = set()
+    named = set()
 
     def inlined(function: re.Match[str]) -> str:
-        found.add(function[2])
+        named.add(function[2])
         extent = sizes.get(function[2], "%x")
         return f"define linkonce_odr i64 @{function[1]}(i64 %x) alwaysinline {{ ret i64 {extent} }}"
 
     definition = rf'^define [^\n]*@"?({_NAMED.format("([A-Za-z])")})"?\(.*?^}}'
     text = re.sub(definition, inlined, text, flags=re.DOTALL | re.MULTILINE)
-    if missing := sizes.keys() - found:
+    if missing := sizes.keys() - named:
         raise RuntimeError(f"the translated kernel has no extents {', '.join(sorted(missing))}")
     return text
 

@@ -293,13 +293,13 @@ def collected(_context, addresses, offset):
     """Lanes of the numbers at eight addresses (8,), plus an offset in numbers."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        given = context.make_array(sig.args[0])(context, builder, args[0]).data
-        pointer, found = ir.DoubleType().as_pointer(), ir.Constant(VECTOR, ir.Undefined)
+        places = context.make_array(sig.args[0])(context, builder, args[0]).data
+        pointer, vector = ir.DoubleType().as_pointer(), ir.Constant(VECTOR, ir.Undefined)
         for lane in range(WIDTH):
-            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
             place = builder.gep(builder.inttoptr(place, pointer), [args[1]])
-            found = builder.insert_element(found, builder.load(place), ir.Constant(_INDEX, lane))
-        return found
+            vector = builder.insert_element(vector, builder.load(place), ir.Constant(_INDEX, lane))
+        return vector
 
     return lanes(addresses, types.int64), generate
 
@@ -309,10 +309,10 @@ def spread(_context, x, addresses, offset):
     """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        given = context.make_array(sig.args[1])(context, builder, args[1]).data
+        places = context.make_array(sig.args[1])(context, builder, args[1]).data
         pointer = ir.DoubleType().as_pointer()
         for lane in range(WIDTH):
-            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
             place = builder.gep(builder.inttoptr(place, pointer), [args[2]])
             builder.store(builder.extract_element(args[0], ir.Constant(_INDEX, lane)), place)
         return context.get_dummy_value()

@@ -100,8 +100,8 @@ def apart() -> list[bytes]:
 
         return call
 
-    def gather(of, count, asked, words):
-        return gathering.gather(of, count, asked, words)
+    def gather(of, count, expected, words):
+        return gathering.gather(of, count, expected, words)
 
     functions = (
         bound_moves,
@@ -145,8 +145,8 @@ def avoidance_code() -> list[bytes]:
 
     problem, workspace, *_, flight, state, _, _, avoidance, _, _, _, _ = _pointers()
 
-    def avoid(f, s, given, _):
-        a = avoidance(given)
+    def avoid(f, s, address, _):
+        a = avoidance(address)
         return guard.avoid(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
 
     return [_object(*_module(avoid, "avoid", objects.ENTRIES["avoidance"]["avoid"]), hot=())]

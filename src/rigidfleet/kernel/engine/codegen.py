@@ -123,10 +123,10 @@ class Tables:
     These rows alone become lanes, in the same memory for each phase: they stay in the cache while it is flown.
     """
 
-    def __init__(self, given: Sequence[Disturbance]) -> None:
-        self._steps = {"gust": given[0].gust_step, "noise": given[0].noise_step}
+    def __init__(self, disturbances: Sequence[Disturbance]) -> None:
+        self._steps = {"gust": disturbances[0].gust_step, "noise": disturbances[0].noise_step}
         self._whole = {
-            name: [np.ascontiguousarray(getattr(x, name)) for x in given] for name in _TABLES
+            name: [np.ascontiguousarray(getattr(x, name)) for x in disturbances] for name in _TABLES
         }
         self._addresses = {name: _addresses(parts) for name, parts in self._whole.items()}
         self._lanes = dict.fromkeys(_TABLES, simd.empty((0,)))
@@ -188,11 +188,11 @@ def _prepared(
         code = Code(trace())
         _KNOWN[name] = code, _compile(code, name), _compile_before(code, name)
     code, address, before = _KNOWN[name]
-    uniform, given = (
+    uniform, distinct = (
         simd.empty((len(code.inputs),)),
         simd.pack(np.broadcast_to(values, (len(values), WIDTH))),
     )
-    before(given.ctypes.data, uniform.ctypes.data)
+    before(distinct.ctypes.data, uniform.ctypes.data)
     reference, none = problem.reference, simd.empty((0, 1))
     lanes = lambda count: simd.empty((count,))  # noqa: E731
     return UnrolledProblem(
@@ -292,26 +292,26 @@ def _compile(code: Code, name: str) -> int:
             builder.call(_emit(builder.module, code), arguments)
             return context.get_dummy_value()
 
-        given = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
-        return types.void(*given), generate
+        kinds = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
+        return types.void(*kinds), generate
 
     return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARGUMENTS, _lines=lines)
 
 
-def _numbers_before(given, uniform):
+def _numbers_before(numbers, uniform):
     """What depends on a problem's numbers alone: each copy of `_before` has its own."""
     raise NotImplementedError
 
 
-def _before(given, uniform):
-    _numbers_before(given, uniform)
+def _before(numbers, uniform):
+    _numbers_before(numbers, uniform)
 
 
 def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
     """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
 
     @intrinsic
-    def numbers_before(_context, given, uniform):
+    def numbers_before(_context, source, uniform):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             numbers, inputs = arguments
             load = lambda b, x: b.load(_element(b, numbers, x.arguments[0]), align=8)  # noqa: E731
@@ -322,7 +322,7 @@ def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
                 builder.store(value(x), _element(builder, inputs, index), align=8)
             return context.get_dummy_value()
 
-        return types.void(given, uniform), generate
+        return types.void(source, uniform), generate
 
     address = compiled_for_c(_before, f"before_{name}", arguments=2, _numbers_before=numbers_before)
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
@@ -392,14 +392,16 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         return load(builder, x)
 
     names = "asked", "moment", "state", "gauge", "end"
-    asked, of_moment, of_state, of_gauge, end = map(function.append_basic_block, names)
+    entry, of_moment, of_state, of_gauge, end = map(function.append_basic_block, names)
     bits = ir.IntType(64)
 
     def branch(builder: ir.IRBuilder, bit: int, there: ir.Block, otherwise: ir.Block) -> None:
-        found = builder.and_(builder.ptrtoint(wanted, bits), ir.Constant(bits, bit))
-        builder.cbranch(builder.icmp_unsigned("!=", found, ir.Constant(bits, 0)), there, otherwise)
+        bits_wanted = builder.and_(builder.ptrtoint(wanted, bits), ir.Constant(bits, bit))
+        builder.cbranch(
+            builder.icmp_unsigned("!=", bits_wanted, ir.Constant(bits, 0)), there, otherwise
+        )
 
-    branch(ir.IRBuilder(asked), OF_MOMENT, of_moment, of_state)
+    branch(ir.IRBuilder(entry), OF_MOMENT, of_moment, of_state)
     builder = ir.IRBuilder(of_moment)
     value = _valued(builder, load, code.inputs)
     for x in code.moment:
@@ -416,11 +418,11 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
     for index, x in enumerate(code.outputs):
         if index < code.coordinates:  # a velocity, see `lane_steps`
             continue
-        found = value(x)
+        result = value(x)
         if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
-                found = builder.select(good, found, simd.number(float("nan")))
-        builder.store(found, _element(builder, dy, index), align=8)
+                result = builder.select(good, result, simd.number(float("nan")))
+        builder.store(result, _element(builder, dy, index), align=8)
     branch(builder, OF_GAUGE, of_gauge, end)
 
     builder.position_at_end(of_gauge)

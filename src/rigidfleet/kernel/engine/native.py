@@ -23,7 +23,7 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from rigidfleet._common.files import replacing
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, warned
 from rigidfleet.kernel.engine.objects import (
     ELSEWHERE,
     ENTRIES,
@@ -145,13 +145,13 @@ class Watch:
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    found = _own.segment
-    if found is None or len(found.of.dy) != len(y):
-        found = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
-        _own.segment = found
-    segment: Segment = found.of
+    call = _own.segment
+    if call is None or len(call.of.dy) != len(y):
+        call = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
+        _own.segment = call
+    segment: Segment = call.of
     segment.times[0], segment.samples[0] = t, y
-    _call(_code().record, packed(problem), packed(workspace), found, packed(UNRECORDED))
+    _call(_code().record, packed(problem), packed(workspace), call, packed(UNRECORDED))
     dy[:] = segment.dy
 
 
@@ -168,23 +168,23 @@ def _call(function: Any, *arguments: Packed) -> int:
     return function(*[a.address for a in arguments])
 
 
-def measure(found: Measured) -> None:
+def measure(measured: Measured) -> None:
     """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
-    _call(_code().measure, pack(found))
+    _call(_code().measure, pack(measured))
 
 
 def least_singular_values(r: Floats, edges: Ints) -> Floats:
     """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
-    found = spectrum_of(r, edges)
-    _call(_code().spectrum, pack(found))
-    return found.found
+    spectrum = spectrum_of(r, edges)
+    _call(_code().spectrum, pack(spectrum))
+    return spectrum.values
 
 
 def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
     """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
-    found = nearest_of(r, radius, boxes)
-    _call(_code().nearest, pack(found))
-    return found.least, found.nearest
+    nearest = nearest_of(r, radius, boxes)
+    _call(_code().nearest, pack(nearest))
+    return nearest.least, nearest.nearest
 
 
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
@@ -273,20 +273,20 @@ class Inheritance(NamedTuple):
     """Code by part that a child process need not compile again, and whether it need not repeat a warning."""
 
     code: dict[str, list[bytes]]
-    told: bool
+    warned: bool
 
 
 def bequeath() -> Inheritance:
     """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
     unkept = {part: library.unkept for part, library in _loaded.items()}
-    return Inheritance({part: code for part, code in unkept.items() if code}, told.is_set())
+    return Inheritance({part: code for part, code in unkept.items() if code}, warned.is_set())
 
 
-def inherit(given: Inheritance) -> None:
+def inherit(inheritance: Inheritance) -> None:
     """Take over the code and warnings of the parent process."""
-    if given.told:
-        told.set()
-    for part, code in given.code.items():
+    if inheritance.warned:
+        warned.set()
+    for part, code in inheritance.code.items():
         _loaded[part] = _link(part, code, code)
 
 

@@ -30,9 +30,11 @@ def fly_ticks(
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
     flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
-    given = problem, workspace, flight, state, segment, avoidance
-    if not _last.given or any(a is not b for a, b in zip(given, _last.given, strict=True)):
-        _last.packed, _last.given = _packed(*given), given
+    arguments = problem, workspace, flight, state, segment, avoidance
+    if not _last.arguments or any(
+        a is not b for a, b in zip(arguments, _last.arguments, strict=True)
+    ):
+        _last.packed, _last.arguments = _packed(*arguments), arguments
     return native.sampled().fly_ticks(*(a.address for a in _last.packed[:5]))
 
 
@@ -40,7 +42,7 @@ class _Last(threading.local):
     """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
 
     def __init__(self) -> None:
-        self.given: tuple[Any, ...] = ()
+        self.arguments: tuple[Any, ...] = ()
         self.packed: tuple[Packed, ...] = ()
 
 

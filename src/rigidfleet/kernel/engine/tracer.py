@@ -49,8 +49,8 @@ class Symbol:
     def __init__(self, trace: Trace, operation: str, arguments: tuple[Any, ...]) -> None:
         self.trace, self.operation, self.arguments = trace, operation, arguments
         self.serial = len(trace.made)
-        given = [x.known for x in arguments if isinstance(x, Symbol)]
-        self.known = SOURCES[operation] if operation in SOURCES else max(given, default=UNIFORM)
+        knowledge = [x.known for x in arguments if isinstance(x, Symbol)]
+        self.known = SOURCES[operation] if operation in SOURCES else max(knowledge, default=UNIFORM)
 
     def __add__(self, other: Any) -> Any:
         return self.trace.add(self, other)
@@ -349,8 +349,8 @@ class FlightTrace(Trace):
             zero = not there.get(name, True)
             made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))]
             part, field = name.split(".")
-            found = np.array(made, dtype=object).reshape(np.shape(x))
-            parts.setdefault(part, {})[field] = found if np.ndim(x) else found.item()
+            array = np.array(made, dtype=object).reshape(np.shape(x))
+            parts.setdefault(part, {})[field] = array if np.ndim(x) else array.item()
         motion = self._table(MOTION, (1, 6, 6))
         motion[:, [not moving for moving in self._moves]] = 0.0
         parts["motion"]["coefficients"] = motion
@@ -379,8 +379,8 @@ class FlightTrace(Trace):
 def _places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
     """Name, place among `numbers` and value of each number, and of each array of numbers."""
     index = 0
-    given = (*_numbers_of(problem), *_arrays_of(problem))
-    for name, x in zip((*_NUMBERS, *_ARRAYS), given, strict=True):
+    values = (*_numbers_of(problem), *_arrays_of(problem))
+    for name, x in zip((*_NUMBERS, *_ARRAYS), values, strict=True):
         yield name, index, x
         index += np.size(x)
 
@@ -409,13 +409,18 @@ def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) ->
     UnfitError
         Some of the problems damp deformations, others do not, which is a branch of the law.
     """
-    graph, law, control, given = problem.graph, problem.law, problem.control, problem.disturbance
+    graph, law, control, disturbance = (
+        problem.graph,
+        problem.law,
+        problem.control,
+        problem.disturbance,
+    )
     damps = values[_NUMBERS.index("law.k_def")].astype(bool)
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
     there = [*_there(problem, values).values(), *moves]
-    kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
-    tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
+    kinds = law.solver, law.iterations, problem.reference.kind, control.kind, disturbance.active
+    tables = [len(x) > 0 for x in (disturbance.gust, disturbance.noise_r, disturbance.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
     saturates = bool(problem.vehicles.saturate)
     return repr(
@@ -461,7 +466,7 @@ class Code:
 
     def _needed(self, wanted: Sequence[Any]) -> list[Symbol]:
         """Everything new that symbols need, each after its arguments; without recursion, because chains are long."""
-        found, stack = [], list(wanted[::-1])
+        symbols, stack = [], list(wanted[::-1])
         while stack:
             x = stack.pop()
             if not isinstance(x, Symbol) or x.serial in self._seen:
@@ -473,8 +478,8 @@ class Code:
                 stack += [x, *missing]
                 continue
             self._seen.add(x.serial)
-            found.append(x)
-        return found
+            symbols.append(x)
+        return symbols
 
 
 def _computed(symbols: Iterable[Symbol]) -> list[Symbol]:
@@ -484,8 +489,8 @@ def _computed(symbols: Iterable[Symbol]) -> list[Symbol]:
 
 def _distinct(values: Iterable[Any], known: range) -> list[Symbol]:
     """The different symbols among values of which so much is known."""
-    found = (x for x in values if isinstance(x, Symbol) and x.known in known)
-    return list({x.serial: x for x in found}.values())
+    symbols = (x for x in values if isinstance(x, Symbol) and x.known in known)
+    return list({x.serial: x for x in symbols}.values())
 
 
 def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
