@@ -318,7 +318,7 @@ def digest() -> str:
     from rigidfleet.kernel.compiler import cache
     from rigidfleet.kernel.engine import native
 
-    native.sampled()  # it and what it needs is in the cache from now on
+    native.sampled_library()  # it and what it needs is in the cache from now on
     return cache._digest()
 
 
@@ -332,7 +332,7 @@ def use_plain_functions(digest: str) -> None:
     sources._digest = lambda: digest
 
     def record(_: int, p: Any, w: Any, segment: int, out: int) -> None:
-        of = packing.packed(p).address, packing.packed(w).address
+        of = packing.pack_once(p).address, packing.pack_once(w).address
         native._code().record(*of, segment, out)
 
     def bound_moves(watch: Any, problem: Any, state: Any) -> None:

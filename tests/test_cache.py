@@ -70,7 +70,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", {})
     file = native._file("flight")
-    file.write_bytes(objects.concatenated([code(PLANTED)]))
+    file.write_bytes(objects.concatenate([code(PLANTED)]))
     file.chmod(0o600)
     forget()
     yield folder
@@ -254,7 +254,7 @@ def test_users_without_a_number():
     """Where every user has a number, as outside of containers, nobody is only nobody."""
     whole = Path("/proc/self/uid_map").read_text().split() == ["0", "0", "4294967295"]
     nobody = int(Path("/proc/sys/kernel/overflowuid").read_text())
-    assert cache._unnamed() == (None if whole else nobody)
+    assert cache._overflow_user() == (None if whole else nobody)
 
 
 @pytest.mark.parametrize("home", ["/dev/null", "", "unknown"])

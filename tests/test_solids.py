@@ -175,7 +175,7 @@ def test_the_kernel_compiles_the_same_distances():
     """Numbers, compiled, against arrays: the same source gives the same values, of every kind and while it moves."""
     from rigidfleet.kernel import obstacles
 
-    s = records.joined(
+    s = records.join(
         [records.single(f, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]]) for f in FORMS.values()]
     )
     where = WHERE[:, :60]

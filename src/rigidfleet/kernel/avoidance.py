@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, joined
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, join
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of `Avoidance.count`: ticks, entries of the list of neighbours, whether the list is too short.
@@ -194,7 +194,7 @@ def avoidance(
 
     Obstacles that move are known in advance, without ``seen``.
     """
-    solids = joined([]) if solids is None else solids
+    solids = join([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     radius = np.asarray(radius, dtype=float)
@@ -221,7 +221,7 @@ def avoidance(
     )  # fmt: skip
 
 
-def renewed(avoidance: Avoidance) -> Avoidance:
+def of_next_phase(avoidance: Avoidance) -> Avoidance:
     """The same avoidance in the next phase, which has a record of its own."""
     avoidance.count[TICKS] = 0
     return avoidance._replace(**_record(len(avoidance.b)))

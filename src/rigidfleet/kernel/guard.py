@@ -37,10 +37,10 @@ from rigidfleet.kernel.moving import (
     brake_beside,
     braking_beside,
     follow_flow,
+    is_known,
     look,
     miss,
     need_beside,
-    present,
     room_beside,
     stop_beside,
     way_to_rest,
@@ -323,7 +323,7 @@ def set_floor_beside(t, i, o, r, v, closest, a):
 
     Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
     """
-    if not present(o, a):
+    if not is_known(o, a):
         return closest
     stop, speed = stop_beside(i, o, r, v, a)
     need, way = need_beside(i, o, speed, braking_beside(i, o, a), a), a.shifted
@@ -403,7 +403,7 @@ def safe(i, r, v, far, a):
 
 
 @compiled
-def pushed(i, a):
+def is_pushed(i, a):
     """Whether barriers push vehicle i."""
     push = a.known[2, i]
     return push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0
@@ -415,7 +415,7 @@ def propose(i, k, v, a, c):
     last = a.candidates.shape[0] + 1
     if k == 0:
         c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
-        if a.soft[i] > 0.0 and a.overruled[i] == 0 and not pushed(i, a):
+        if a.soft[i] > 0.0 and a.overruled[i] == 0 and not is_pushed(i, a):
             for q in range(3):
                 c[q] = at_once(i, q, a)
     elif k < last:
@@ -580,7 +580,7 @@ def avoid(p, w, flight, state, a):
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
-        if changed and pushed(i, a):
+        if changed and is_pushed(i, a):
             state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue

@@ -75,7 +75,7 @@ class Nearest(NamedTuple):
     places: Annotated[Floats, Extents((3, BLOCK))]  # of one agent
 
 
-def measured(n: int, m: int, K: int, **samples: Any) -> Measured:
+def measurement_of(n: int, m: int, K: int, **samples: Any) -> Measured:
     """Arrays for the measurement of K samples of ``n`` agents and ``m`` edges."""
     work = np.zeros((9, 4, 4))
     work[5] = np.eye(4)

@@ -140,7 +140,7 @@ def look(t, r, lost, a):
 
 
 @compiled
-def present(o, a):
+def is_known(o, a):
     """Whether obstacle o stands still, or moves and is known."""
     return a.sight.moves[o] == 0 or a.sight.known[o] == KNOWN
 
@@ -285,7 +285,7 @@ def follow_flow(i, r, v, a):
     for q in range(3):
         ask[q] = v[q] + a.wanted[i, q] / _FLOW_RATE
     for o in range(s.moves.shape[0]):
-        if not (s.ball[o] < math.inf and present(o, a)):
+        if not (s.ball[o] < math.inf and is_known(o, a)):
             continue
         x = s.track[o]
         away = from_solid(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)

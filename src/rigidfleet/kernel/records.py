@@ -9,7 +9,15 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, padded, zeros
+from rigidfleet.kernel.problem import (
+    Extents,
+    PerAgent,
+    Places,
+    PlacesInTime,
+    Vector,
+    padded_size,
+    zeros,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
@@ -189,11 +197,11 @@ def integrator(
     """
     n = len(y)
     count = np.empty(FIRST_ROW + 1, dtype=np.int64)
-    state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
-    return restarted(state, y, t, rtol=rtol, atol=atol, step=step)
+    state = IntegratorState(np.empty(n), zeros(10, padded_size(n)), np.empty(3), count, rtol, trail)
+    return integrator_in(state, y, t, rtol=rtol, atol=atol, step=step)
 
 
-def restarted(
+def integrator_in(
     state: IntegratorState, y: Floats, t: float, *, rtol: float, atol: Floats, step: float = 1e-3
 ) -> IntegratorState:
     """An `integrator` of as many states as another, in its memory and with its trail."""

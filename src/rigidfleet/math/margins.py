@@ -181,7 +181,7 @@ class Loop(NamedTuple):
     channels: tuple[tuple[Lag, bool], ...]
 
     @property
-    def constrained(self) -> bool:
+    def is_constrained(self) -> bool:
         """Whether the constraint law has a share in it."""
         return bool(np.abs(self.S[0]).max() > _NO_SHARE)
 
@@ -353,19 +353,19 @@ def _unstable(loop: Loop, law: Feedback, growth: float) -> int:
     if end == 0.0:
         return 0
 
-    def returned(omega: Floats) -> Complexes:
+    def return_difference(omega: Floats) -> Complexes:
         return np.eye(n) + loop.gain(growth + 1j * omega, law)
 
     # The poles of L at 0 are left of this line. To its right L is analytic and vanishes at infinity.
     omega = np.append(0.0, np.geomspace(0.1 * growth, end, _SAMPLES))
-    F = returned(omega)
+    F = return_difference(omega)
     turn = np.linalg.solve(F[:-1], F[1:])
     for _ in range(30):
         far = np.flatnonzero(np.linalg.norm(turn - np.eye(n), axis=(1, 2)) > near)
         if not len(far):
             break
         middle = 0.5 * (omega[far] + omega[far + 1])
-        between = returned(middle)
+        between = return_difference(middle)
         # Only the halves of an interval that is divided are new.
         halves = np.linalg.solve(F[far], between), np.linalg.solve(between, F[far + 1])
         turn[far] = halves[0]
@@ -459,7 +459,7 @@ def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
     omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
     values = _eigenvalues(loop.gain(1j * omega, law))
     for _ in range(12):
-        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+        loci = _follow(np.log(np.where(values == 0, 1e-300, values)))
         step = np.abs(np.diff(loci, axis=0))
         # Where loci are fainter than the threshold, they turn as they please.
         step[np.maximum(loci[1:].real, loci[:-1].real) < math.log(_FAINT)] = 0.0
@@ -470,11 +470,11 @@ def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
         omega = np.insert(omega, coarse + 1, middle)
         values = np.insert(values, coarse + 1, _eigenvalues(loop.gain(1j * middle, law)), axis=0)
     else:
-        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+        loci = _follow(np.log(np.where(values == 0, 1e-300, values)))
     return omega, loci
 
 
-def _followed(loci: Complexes) -> Complexes:
+def _follow(loci: Complexes) -> Complexes:
     """Logarithms (K, n), reordered and unwrapped so that each column is continuous."""
     from scipy.optimize import linear_sum_assignment
 

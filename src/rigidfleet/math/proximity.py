@@ -127,7 +127,7 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
         if near is not None:
             apart = near.separations(p)
             at = int(apart.argmin())
-        if near is None or apart[at] > near.beyond - 2.0 * _moved(rest, p):
+        if near is None or apart[at] > near.beyond - 2.0 * _greatest_move(rest, p):
             near, rest = _near(p, radius), p
             apart = near.separations(p)
             at = int(apart.argmin())
@@ -168,7 +168,7 @@ def _near(p: Floats, radius: Floats) -> _Near:
     return _Near(np.ascontiguousarray(pairs[:, near]), candidates.radii[near], beyond)
 
 
-def _moved(before: Floats, after: Floats) -> float:
+def _greatest_move(before: Floats, after: Floats) -> float:
     """Greatest displacement [m] of an agent, from (3, N) to (3, N), after removing the rigid motion of all."""
     U, _, Vt = np.linalg.svd(after @ before.T)
     moved = after - (U @ Vt) @ before  # a reflection also preserves distances

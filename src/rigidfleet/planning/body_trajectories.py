@@ -147,7 +147,7 @@ class SmoothTrajectory:
         given = [at.time for at in self.through if at.time is not None]
         if len(given) == len(self.through):
             return np.array([0.0, *given, total])
-        return splines.allocated(total, *self._to_meet)
+        return splines.best_times(total, *self._to_meet)
 
     @property
     def _to_meet(self) -> tuple[Floats, ...]:

@@ -25,7 +25,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
 from rigidfleet.mission.model import Fleet
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class CurveWatch:
         #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
         self.solids = None
         if None in corners:
-            self.solids, corners = joined([thing.solid for thing in obstacles]), []
+            self.solids, corners = join([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
     def _begin_monitor(self, states: int, gauge: int, steps: int) -> None:
@@ -427,7 +427,7 @@ class Extremes(CurveWatch):
             trail = records.trail(*size[1:])
             state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
         else:
-            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
+            state = records.integrator_in(state, y, t, rtol=rtol, atol=atol)
         self.state, self.size = state, size
         if not known:
             steps, gauge = state.trail.gauge.shape

@@ -74,7 +74,7 @@ class SampledPhase(ActivePhase):
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
-            vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
+            vehicles.avoidance = avoidance.of_next_phase(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.led_until = -math.inf  # end of what the leader has decided [s]
@@ -108,7 +108,7 @@ class SampledPhase(ActivePhase):
         if before is None:
             begun.integral[:] = integral
         else:
-            renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
+            renewed = fleet.under_problem(before, self.workspace, integral, frame=frame)
             if self.parted.any():  # without a link, vehicles do not come to the same integrals
                 own = [
                     ByEdge().updated(given.edges, x).of(plan.edges, integral)

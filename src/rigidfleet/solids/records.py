@@ -182,7 +182,7 @@ def single(
     )  # fmt: skip
 
 
-def joined(parts: Sequence[Solids]) -> Solids:
+def join(parts: Sequence[Solids]) -> Solids:
     """All solids of several records in one."""
     if not parts:
         return single(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))

@@ -40,10 +40,10 @@ def cache_directory() -> Path:
     OSError
         The folder cannot be created, or others could write into it; ``strerror`` says where, and what to do.
     """
-    return _private(_named())
+    return _private(_environment_folder())
 
 
-def _named() -> Path:
+def _environment_folder() -> Path:
     """The folder named by the environment."""
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(os.path.expanduser(base), "rigidfleet", f"kernel-{_digest()}")
@@ -60,7 +60,7 @@ def _digest() -> str:
 
 
 @contextmanager
-def opened(file: str | Path) -> Generator[IO[bytes]]:
+def open_safely(file: str | Path) -> Generator[IO[bytes]]:
     """Open a file of the cache for reading: exactly the file that was checked, even if its name is changed meanwhile.
 
     Raises
@@ -86,8 +86,9 @@ def not_kept(error: OSError) -> None:
     if not warned.is_set():
         warned.set()
         warnings.warn(
-            f"the compiled flight kernel cannot be cached in {_named()}: {error.strerror or error}. Every process"
-            " compiles it again, which takes about 20 s. Set NUMBA_CACHE_DIR to a folder that only you can write",
+            f"the compiled flight kernel cannot be cached in {_environment_folder()}: {error.strerror or error}. Every"
+            " process compiles it again, which takes about 20 s. Set NUMBA_CACHE_DIR to a folder that only you can"
+            " write",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -130,7 +131,7 @@ def _private(folder: Path) -> Path:
             with suppress(FileExistsError):  # made by another process at this moment
                 os.mkdir(there, 0o700)
             state = os.lstat(there)
-        if not (_own(state) or (state.st_uid == _unnamed() and not shared)):
+        if not (_own(state) or (state.st_uid == _overflow_user() and not shared)):
             raise _foreign(there)
         if stat.S_ISLNK(state.st_mode):
             if (links := links + 1) > _LINKS:
@@ -174,7 +175,7 @@ def _own(state: os.stat_result) -> bool:
 
 
 @cache
-def _unnamed() -> int | None:
+def _overflow_user() -> int | None:
     """The user id that stands for all users without an id here, including the machine's root; None if all have one.
 
     This happens in containers of ordinary users, such as Apptainer's. On the path to the last folder, items of such an

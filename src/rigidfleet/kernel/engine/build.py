@@ -19,7 +19,7 @@ from numba import cfunc, typeof, types
 from rigidfleet.kernel import dopri5, measurement, monitor, nearest, recorder, recursion
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, sized
+from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
 from rigidfleet.kernel.engine import objects, packing
 
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
@@ -71,7 +71,7 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
     text, symbol, _ = modules[0]
     codes = [_object(*module) for module in modules]
     three = _object(text, symbol, "integrate_three", sizes=THREE)
-    made = None if second is None else objects.separated(second.communicate()[0])
+    made = None if second is None else objects.separate(second.communicate()[0])
     return [*codes, *(made or apart()), three]
 
 
@@ -93,7 +93,7 @@ def apart() -> list[bytes]:
         monitor.watch_forces(last, problem(p), workspace(w), integrator(state), watching(watch))
         return 0
 
-    def called(function, of):
+    def caller(function, of):
         def call(address):
             function(of(address))
             return 0
@@ -107,10 +107,10 @@ def apart() -> list[bytes]:
         bound_moves,
         watch_distances,
         watch_forces,
-        called(measurement.measure, measured),
-        called(measurement.spectrum, spectrum),
-        called(nearest.nearest_boxes, boxes),
-        called(recursion.follow, recursing),
+        caller(measurement.measure, measured),
+        caller(measurement.spectrum, spectrum),
+        caller(nearest.nearest_boxes, boxes),
+        caller(recursion.follow, recursing),
         gather,
     )
     entries = list(objects.ENTRIES["flight"].items())[2:-1]
@@ -175,11 +175,11 @@ def _object(
     *,
     loops: bool = False,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, the function ``name``, is called from outside; see `sized`.
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`.
 
     ``loops``: make vectors of its loops.
     """
-    module = _simplified(sized(text, sizes), symbol, name, hot)
+    module = _simplify(with_sizes(text, sizes), symbol, name, hot)
     builder = _passes(3, loops=loops)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
@@ -190,7 +190,7 @@ def _object(
     return objects.target_machine().emit_object(module)
 
 
-def _simplified(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> llvm.ModuleRef:
+def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> llvm.ModuleRef:
     """Return a module of which ``symbol`` alone, the function ``name``, is called from outside; ``hot`` is inlined."""
     # Only addresses of named tuples are declared dereferenceable, and these are never written.
     module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
@@ -228,4 +228,4 @@ def main(part: str) -> None:
             objects.build_process("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
         codes = machine_code(second)
-    sys.stdout.buffer.write(objects.concatenated(codes))
+    sys.stdout.buffer.write(objects.concatenate(codes))

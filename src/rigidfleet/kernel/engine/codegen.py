@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected, unpack
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, gather, unpack
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_bounds, lane_steps
 from rigidfleet.kernel.engine.lane_bounds import Search
@@ -73,7 +73,7 @@ class UnrolledProblem(NamedTuple):
     search: Search
 
 
-def unrolled(problem: Problem) -> UnrolledProblem:
+def unroll(problem: Problem) -> UnrolledProblem:
     """Prepare a problem of eight flights for `integrate`; compile its code if it is not yet in the cache.
 
     Raises
@@ -82,10 +82,10 @@ def unrolled(problem: Problem) -> UnrolledProblem:
         The problem has branches that depend on the state.
     """
     description, values, _ = structure(problem)
-    return _prepared(problem, description, values[:, None], lambda: Trace(problem))
+    return _prepare(problem, description, values[:, None], lambda: Trace(problem))
 
 
-def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
+def unroll_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
     """Prepare eight problems, which `batch.fit_together`, of one flight each; with rows of their `Tables`.
 
     Raises
@@ -97,15 +97,15 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     turns = values[TURN].any(axis=0)
     if turns.any():  # slots that do not turn, where others do
         values[TURN, ~turns] = _BARELY
-    motion = interleaved(
+    motion = interleave(
         [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
     )
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
     description = flight_structure(first, values, moves)
-    ready = _prepared(first, description, values, lambda: FlightTrace(first, values, moves))
+    ready = _prepare(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
-        before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
+        before=lanes_of([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
         **tables,
     )  # fmt: skip
 
@@ -157,12 +157,12 @@ class Tables:
 _TABLES = "gust", "noise_r", "noise_v"
 
 
-def packed(parts: Sequence[Floats]) -> LaneArray:
+def lanes_of(parts: Sequence[Floats]) -> LaneArray:
     """Lanes (...) of eight small arrays of one shape (...)."""
     return simd.pack(np.stack(parts, axis=-1))
 
 
-def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
+def interleave(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
     """Lanes of eight large arrays, in C order, as an array of some shape."""
     parts = [np.ascontiguousarray(x) for x in parts]
     made = simd.empty(shape)
@@ -177,10 +177,10 @@ def _addresses(arrays: Sequence[Floats]) -> Ints:
 @compiled
 def _interleave(addresses, first, made):
     for k in range(made.shape[0]):
-        made[k] = collected(addresses, first + k)
+        made[k] = gather(addresses, first + k)
 
 
-def _prepared(
+def _prepare(
     problem: Problem, description: bytes, values: Floats, trace: Callable[[], Trace]
 ) -> UnrolledProblem:
     name = hashlib.sha256(description).hexdigest()[:16]
@@ -315,7 +315,7 @@ def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             numbers, inputs = arguments
             load = lambda b, x: b.load(_element(b, numbers, x.arguments[0]), align=8)  # noqa: E731
-            value = _valued(builder, load)
+            value = _value_of(builder, load)
             for x in code.before:
                 value(x)
             for index, x in enumerate(code.inputs):
@@ -334,7 +334,7 @@ def _element(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
     return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
 
 
-def _valued(
+def _value_of(
     builder: ir.IRBuilder,
     load: Callable[[ir.IRBuilder, Symbol], ir.Value],
     known: Sequence[Symbol] = (),
@@ -403,7 +403,7 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
 
     branch(ir.IRBuilder(entry), OF_MOMENT, of_moment, of_state)
     builder = ir.IRBuilder(of_moment)
-    value = _valued(builder, load, code.inputs)
+    value = _value_of(builder, load, code.inputs)
     for x in code.moment:
         value(x)
     for index, x in enumerate(code.known):
@@ -411,7 +411,7 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
     builder.branch(of_state)
 
     builder.position_at_end(of_state)
-    value = _valued(builder, load_known, code.inputs + code.known)
+    value = _value_of(builder, load_known, code.inputs + code.known)
     for x in code.lines:
         value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]

@@ -172,7 +172,7 @@ def advance(k, stage, _a, h, p):
 
 
 @inlined
-def _scaled(k, q, e, rtol):
+def _squared_error(k, q, e, rtol):
     """Square of an error over its tolerance."""
     size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
     e *= rough_inverse(k[ATOL, q] + rtol * size)
@@ -187,10 +187,10 @@ def squared_errors(k, h, rtol, p):
     v, r = _weights(E, h), _weights(_EA, h * h)
     for q in range(coordinates):
         i = coordinates + q
-        squares += _scaled(k, q, _sum(k, i, r, 3, STAGES - 1), rtol)
-        squares += _scaled(k, i, _sum(k, i, v, 3, STAGES), rtol)
+        squares += _squared_error(k, q, _sum(k, i, r, 3, STAGES - 1), rtol)
+        squares += _squared_error(k, i, _sum(k, i, v, 3, STAGES), rtol)
     for q in range(2 * coordinates, k.shape[1]):
-        squares += _scaled(k, q, _sum(k, q, v, 3, STAGES), rtol)
+        squares += _squared_error(k, q, _sum(k, q, v, 3, STAGES), rtol)
     return squares
 
 

@@ -23,17 +23,17 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from rigidfleet._common.files import replacing
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, warned
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, open_safely, warned
 from rigidfleet.kernel.engine.objects import (
     ELSEWHERE,
     ENTRIES,
     build_process,
-    concatenated,
-    separated,
+    concatenate,
+    separate,
     symbol,
     target_machine,
 )
-from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed, use
+from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, pack_once, use
 from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
 from rigidfleet.kernel.problem import (
     Problem,
@@ -64,7 +64,11 @@ def integrate(
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
     segment = pack(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
     return _call(
-        _integrator(problem, workspace), packed(problem), packed(workspace), packed(state), segment
+        _integrator(problem, workspace),
+        pack_once(problem),
+        pack_once(workspace),
+        pack_once(state),
+        segment,
     )
 
 
@@ -81,7 +85,7 @@ class Integration:
         samples: Floats,
     ) -> None:
         self._segment = pack(Segment(t_end, False, 0, times, samples, NOTHING))
-        self._kept = packed(problem), packed(workspace), packed(state), self._segment
+        self._kept = pack_once(problem), pack_once(workspace), pack_once(state), self._segment
         self._addresses = [x.address for x in self._kept]
         self._integrate = _integrator(problem, workspace)
 
@@ -100,7 +104,7 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    record_into(pack(out), 0, packed(problem), workspace, times, samples)
+    record_into(pack(out), 0, pack_once(problem), workspace, times, samples)
     return out
 
 
@@ -109,7 +113,7 @@ def record_into(
 ) -> None:
     """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(_code().record, problem, packed(workspace), pack(segment), out)
+    _call(_code().record, problem, pack_once(workspace), pack(segment), out)
 
 
 class Watch:
@@ -128,18 +132,18 @@ class Watch:
 
     def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
-        _code().bound_moves(packed(problem).address, packed(state).address, self.address)
+        _code().bound_moves(pack_once(problem).address, pack_once(state).address, self.address)
 
     def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
-        of = packed(problem).address, packed(state).address, self.address
+        of = pack_once(problem).address, pack_once(state).address, self.address
         _code().watch_distances(first, end, *of)
 
     def forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
     ) -> None:
         """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
-        of = [packed(x).address for x in (problem, workspace, state)]
+        of = [pack_once(x).address for x in (problem, workspace, state)]
         _code().watch_forces(int(last), *of, self.address)
 
 
@@ -151,7 +155,7 @@ def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Wo
         _own.segment = call
     segment: Segment = call.of
     segment.times[0], segment.samples[0] = t, y
-    _call(_code().record, packed(problem), packed(workspace), call, packed(UNRECORDED))
+    _call(_code().record, pack_once(problem), pack_once(workspace), call, pack_once(UNRECORDED))
     dy[:] = segment.dy
 
 
@@ -214,12 +218,12 @@ def _code() -> Library:
     return _library("flight")
 
 
-def sampled() -> Library:
+def sampled_library() -> Library:
     """The machine code of sampled flights: from the cache, or compiled."""
     return _library("sampled")
 
 
-def avoiding() -> Library:
+def avoidance_library() -> Library:
     """The machine code of avoidance in flight: from the cache, or compiled."""
     return _library("avoidance")
 
@@ -303,7 +307,7 @@ def _compile(part: str) -> list[bytes]:
             done = subprocess.run(
                 build_process(part), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
-            if done.returncode == 0 and (parts := separated(done.stdout)) is not None:
+            if done.returncode == 0 and (parts := separate(done.stdout)) is not None:
                 return parts
     from rigidfleet.kernel.engine import build
 
@@ -325,8 +329,8 @@ def _file(part: str) -> Path:
 def _read(part: str) -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
-        with opened(_file(part)) as stream:
-            return separated(stream.read())
+        with open_safely(_file(part)) as stream:
+            return separate(stream.read())
     except OSError:
         return None
 
@@ -335,7 +339,7 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replacing(_file(part), private=True) as stream:
-            stream.write(concatenated(parts))
+            stream.write(concatenate(parts))
     except OSError as error:
         not_kept(error)
         return False
@@ -345,7 +349,7 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
 def is_compiled() -> bool:
     """Return whether the machine code is in the cache, so that nothing has to be compiled."""
     try:
-        with opened(_file("flight")):
+        with open_safely(_file("flight")):
             return True
     except OSError:
         return False

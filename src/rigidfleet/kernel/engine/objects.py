@@ -68,14 +68,14 @@ def target_machine() -> Any:
     )  # fmt: skip
 
 
-def concatenated(parts: Sequence[bytes]) -> bytes:
+def concatenate(parts: Sequence[bytes]) -> bytes:
     """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
 
-def separated(data: bytes) -> list[bytes] | None:
-    """Objects that were `concatenated`; None if they are not whole."""
+def separate(data: bytes) -> list[bytes] | None:
+    """Objects that were `concatenate`; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:
         return None

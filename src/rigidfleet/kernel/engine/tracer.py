@@ -134,7 +134,7 @@ class Trace:
         dy = np.full(len(y), 0.0, dtype=object)
         p = self._with_symbols(problem)
         reference = p.reference._replace(d0=p.reference.d0[order], d1=p.reference.d1[order])
-        p = p._replace(graph=_ordered(p.graph, order), reference=reference)
+        p = p._replace(graph=_reorder(p.graph, order), reference=reference)
         self._plain(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
         self.coordinates = 3 * n
@@ -146,7 +146,7 @@ class Trace:
         """The problem with symbols in place of its numbers."""
         _, self._values, which = structure(problem)
         self._numbers = iter(which.tolist())
-        p = _used(problem)
+        p = _parts_in_use(problem)
         p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
         before = [self.symbol("before", k) for k in range(len(problem.graph.edges))]
         return p._replace(reference=p.reference._replace(d0=np.array(before, dtype=object)))
@@ -452,19 +452,19 @@ class Code:
         self.gauge = trace.gauge
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
         self._seen: set[int] = set()
-        needed = self._needed([*self.positive, *self.outputs])
-        last = self._needed(self.gauge)
+        needed = self._collect([*self.positive, *self.outputs])
+        last = self._collect(self.gauge)
         self.before = [x for x in needed + last if x.known == UNIFORM]
-        self.moment = _computed(x for x in needed + last if UNIFORM < x.known < STATE)
-        self.lines = _computed(x for x in needed if x.known == STATE)
-        self.last = _computed(x for x in last if x.known == STATE)
+        self.moment = _in_order(x for x in needed + last if UNIFORM < x.known < STATE)
+        self.lines = _in_order(x for x in needed if x.known == STATE)
+        self.last = _in_order(x for x in last if x.known == STATE)
         of_state = [x for line in self.lines + self.last for x in line.arguments]
         of_state += self.outputs + self.gauge + self.positive
         self.known = _distinct(of_state, range(FLIGHT, STATE))
         used = of_state + [x for line in self.moment for x in line.arguments]
         self.inputs = _distinct(used, range(UNIFORM, FLIGHT))
 
-    def _needed(self, wanted: Sequence[Any]) -> list[Symbol]:
+    def _collect(self, wanted: Sequence[Any]) -> list[Symbol]:
         """Everything new that symbols need, each after its arguments; without recursion, because chains are long."""
         symbols, stack = [], list(wanted[::-1])
         while stack:
@@ -482,7 +482,7 @@ class Code:
         return symbols
 
 
-def _computed(symbols: Iterable[Symbol]) -> list[Symbol]:
+def _in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
     """Those that are no sources, in the order in which the kernel computes them."""
     return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
 
@@ -501,7 +501,7 @@ def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
     """
     numbers: list[Floats] = []
     others: list[Any] = [problem.has_frame, problem.body_formulation, problem.external]
-    used = _used(problem)
+    used = _parts_in_use(problem)
     for name in _PARTS:
         _sort_out(getattr(used, name), numbers, others)
     # By a dictionary: for some hundred numbers, sorting arrays takes several times as long.
@@ -529,7 +529,7 @@ def elimination_order(edges: NDArray[np.integer]) -> Ints:
     return np.array(order, dtype=np.int64)
 
 
-def _ordered(graph: Graph, order: Ints) -> Graph:
+def _reorder(graph: Graph, order: Ints) -> Graph:
     pairs = np.sort(np.argsort(order)[graph.pairs.astype(np.int64)], axis=1)[:, ::-1]
     return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
@@ -538,7 +538,7 @@ def _ordered(graph: Graph, order: Ints) -> Graph:
 _PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
 
 
-def _used(problem: Problem) -> Problem:
+def _parts_in_use(problem: Problem) -> Problem:
     """The problem without the parts that such flights do not use, which the tracer could not handle."""
     none: Any = None
     slots = ("t0", "T_b", "d0", "p0", "dp", "turn", "knots", "ways")
