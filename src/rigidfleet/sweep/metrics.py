@@ -58,7 +58,7 @@ METRICS: dict[str, Metric] = {
     **{
         q.name: Metric(_NOTATION.get(q.unit, q.unit), q.text)
         for q in QUANTITIES.values()
-        if q.metric
+        if q.checked
     },
     "rotor_share": Metric(
         "1", "rotor force closest to its limit, as a share of it; only of vehicles with rotors"
