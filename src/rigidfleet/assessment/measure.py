@@ -10,14 +10,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet.assessment.fits import Fit, Laid, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
-from rigidfleet.result.quantities import SAMPLED, Samples, closeness, of_left, samples
+from rigidfleet.result.quantities import SAMPLED, Samples, closeness, of_left, owner_name, samples
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
@@ -63,17 +62,6 @@ class Measurements:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
-    def owner(self, q: Quantity, who: int, other: int = -1) -> str:
-        """Name of the owner of a value: an agent, two agents, an edge, or an agent and an obstacle (from 0)."""
-        match q.who:
-            case "pair":
-                return agent_names(sorted((who, other)))
-            case "edge":
-                return f"edge {who + 1}-{other + 1}"
-            case "obstacle":
-                return f"agent {who + 1}, {self.mission.obstacles[other].name}"
-        return f"agent {who + 1}" if q.who == "agent" else ""
-
     # -- at samples -----------------------------------------------------------------------------------
 
     def sampled(self, name: str) -> Samples:
@@ -96,7 +84,11 @@ class Measurements:
         at = (k,) if values.ndim == 1 else (k, place)
         phase, who = result.phases[result.phase.item(k)].name, samples.owner(*at)
         return Extreme(
-            values.item(at), result.time.item(k), self.owner(samples.quantity, *who), phase, alone
+            values.item(at),
+            result.time.item(k),
+            owner_name(result, samples.quantity, *who),
+            phase,
+            alone,
         )
 
     # -- between samples ------------------------------------------------------------------------------
@@ -111,7 +103,7 @@ class Measurements:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
         size = abs(x.value) if name == "constraint" else q.scale * x.value
-        return Extreme(size, x.time, self.owner(q, x.who, x.other), phase)
+        return Extreme(size, x.time, owner_name(self.result, q, x.who, x.other), phase)
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""

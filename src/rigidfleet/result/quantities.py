@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
+from rigidfleet._common.text import agent_names
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.bernstein import SIZES
@@ -32,6 +33,12 @@ class Samples:
         rank = q.rank(values)
         self.rank = np.where(np.isfinite(rank), rank, -np.inf).reshape(len(rank), -1)
 
+    @property
+    def worst(self) -> Floats:
+        """Size (K,) of the worst value of each sample; NaN if none is finite."""
+        rank = self.rank.max(axis=1, initial=-np.inf)
+        return np.where(np.isfinite(rank), -rank if self.quantity.at_least else rank, np.nan)
+
 
 def length(x: Floats, more: Floats | None = None) -> Floats:
     """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
@@ -47,6 +54,18 @@ def length(x: Floats, more: Floats | None = None) -> Floats:
         x = x + more
     squares = x * x
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
+
+
+def owner_name(result: Result, q: Quantity, who: int, other: int = -1) -> str:
+    """Name of the owner of a value: an agent, two agents, an edge, or an agent and an obstacle (from 0)."""
+    match q.who:
+        case "pair":
+            return agent_names(sorted((who, other)))
+        case "edge":
+            return f"edge {who + 1}-{other + 1}"
+        case "obstacle":
+            return f"agent {who + 1}, {result.mission.obstacles[other].name}"
+    return f"agent {who + 1}" if q.who == "agent" else ""
 
 
 def of_left(result: Result, values: Floats) -> Floats:
