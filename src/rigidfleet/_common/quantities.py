@@ -191,6 +191,12 @@ QUANTITIES: dict[str, Quantity] = {
 MOTIONS = tuple(
     q for q in QUANTITIES.values() if q.way in ("", "horizontal", "vertical") and q.order
 )
+#: Keys of limits that are numbers and that curves are judged by.
+LIMITS_OF_CURVES = [
+    name
+    for name, q in QUANTITIES.items()
+    if q.monitored and q.key == f"limits.{name}" and not q.limit
+]
 
 
 def shown(unit: str) -> str:

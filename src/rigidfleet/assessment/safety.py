@@ -58,7 +58,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     Limits are those of the verdict; those of the altitude are the geofence's. What the flight does not have, such as a
     vehicle below another one, has no row.
     """
-    measured, checks = Measurements(result), {check.check: check for check in verdict.checks}
+    measured, checks = Measurements(result), verdict.by_name
     rows = []
     for q in QUANTITIES.values():
         limit, worst, passed = None, None, True

@@ -470,6 +470,9 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     st.limit(ax, limit, f"limit {limit:g} m" if limit else "contact")
     if name == "separation":
         _draw_planned(ax, result)
+        if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
+            altitude = result.mission.limits.separation_altitude
+            st.limit(ax, flying, f"limit {flying:g} m from z = {altitude:g} m on")
     k = int(np.nanargmin(values))
     x = result.extreme(name)
     if x is None or x.value > values[k]:

@@ -186,3 +186,5 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     ax.set_ylim(n + 0.6, 0.4)
     ax.set_yticks(range(1, n + 1))
     ax.set_ylabel("saturated\nagent")
+    limit = QUANTITIES["saturation"].limit_of(result.mission)
+    st.annotate(ax, f"limit {limit:.3g} % of a phase", st.corners(), color=st.ALERT)

@@ -335,7 +335,8 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
 
 def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
-    return next((check.worst for check in verdict.checks if check.check == name), None)
+    check = verdict.by_name.get(name)
+    return None if check is None else check.worst
 
 
 def _mean(result: Result) -> float | None:
