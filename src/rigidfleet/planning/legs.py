@@ -72,6 +72,7 @@ class Leg:
     reference : of the slots; the distances of edges are those of a flight, which knows them
     masses, radius : (N,) of all vehicles, lost ones included [kg, m]
     settling : time in which errors of distances settle [s]
+    smooth : whether the next phase begins with the acceleration and jerk of the reference
     """
 
     phase: Phase
@@ -90,6 +91,7 @@ class Leg:
     masses: Floats
     radius: Floats
     settling: float
+    smooth: bool
 
     @property
     def known(self) -> bool:
@@ -165,11 +167,15 @@ class Leg:
         """The planned state at a time [s]."""
         reference, motion = self.paths
         r, v = slot_derivatives(reference, motion, np.array([t]), 2)[0]
-        pose = pose_at(motion, t)
+        pose: Pose | None = pose_at(motion, t)
         frame = self.frame
         if frame is not None and self.phase.control != "open":
             frame = pose.T
-        return self.handed_on(t, r, v, frame, pose if self.phase.control == "tracking" else None)
+        if self.phase.control != "tracking":
+            pose = None
+        elif not self.smooth:
+            pose = Pose(pose.r, pose.v, pose.T, pose.omega)
+        return self.handed_on(t, r, v, frame, pose)
 
     def handed_on(
         self, t: float, r: Floats, v: Floats, frame: Floats | None, pose: Pose | None
@@ -309,6 +315,7 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
     return Leg(
         phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, trajectory,
         reference, mission.fleet.mass, mission.fleet.radius, mission.constraint.settling_time or 0.0,
+        mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
 
 

@@ -89,7 +89,6 @@ class PhasePlan(Leg):
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
     loses: bool  # whether vehicles or links are lost at any time of the mission
     through: tuple[dict[str, Any], ...]  # points to pass on the way (`passed`)
-    smooth: bool  # whether the next phase needs acceleration and jerk of the reference
 
     @cached_property
     def certificate(self) -> Certificate | None:
@@ -277,7 +276,6 @@ def plan_phase(
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
         loses=mission.first_loss < math.inf, through=passed(leg.trajectory),
-        smooth=mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
