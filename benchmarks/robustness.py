@@ -167,9 +167,9 @@ def cases(count: int = 200, seed: int = 1) -> list[Case]:
 
 
 def shipped(seed: int) -> list[Case]:
-    """The formations of up to 20 agents of the missions that ship, each once, from random starts."""
+    """The formations of up to 20 agents of missions that show formations, each once, from random starts."""
     found: dict[bytes, Case] = {}
-    for mission in map(load_mission, mission_names()):
+    for mission in map(load_mission, mission_names("paper", "shapes", "vehicles")):
         for name in mission.formations:
             slots = mission.formation_slots(name)
             if slots is None or len(slots) > LARGEST:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,27 @@ from rigidfleet.mission.findings import near
 
 _SHIPPED = resources.files("rigidfleet") / "missions"
 
+#: Folders of the shipped missions: their names, and what the missions in them are about.
+GROUPS = {
+    "paper": "The paper",
+    "shapes": "Shapes and rigidity",
+    "obstacles": "Obstacles and avoidance",
+    "vehicles": "Vehicles",
+    "shows": "Shows",
+}
+#: Shipped missions to look at first.
+FIRST = ("narrow-passage", "bridge-inspection", "change-of-picture")
 
-def mission_names() -> list[str]:
-    """Names of the shipped missions, in alphabetical order."""
-    names = (entry.name for entry in _SHIPPED.iterdir())
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+def mission_names(*groups: str) -> list[str]:
+    """Names of the shipped missions of some groups (folders of `GROUPS`), of all by default, in alphabetical order."""
+    return sorted(_files(*groups))
+
+
+def _files(*groups: str) -> dict[str, Traversable]:
+    """The files of shipped missions by name."""
+    files = (file for group in groups or GROUPS for file in (_SHIPPED / group).iterdir())
+    return {file.name.removesuffix(".toml"): file for file in files if file.name.endswith(".toml")}
 
 
 def mission_text(name: str) -> str:
@@ -29,9 +46,10 @@ def mission_text(name: str) -> str:
     MissionError
         There is no shipped mission of this name.
     """
-    if name not in mission_names():
+    files = _files()
+    if name not in files:
         raise MissionError([_not_found(name)])
-    return (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
+    return files[name].read_text(encoding="utf-8")
 
 
 def read_text(path: str | Path) -> str:
