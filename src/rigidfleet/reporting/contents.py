@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet import plotting
+from rigidfleet._common.quantities import QUANTITIES, quantity, shown
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
@@ -269,31 +270,27 @@ def _safety_table(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> lis
         {
             "name": name,
             "text": text,
-            "cells": [_safety_cell(column.get(name)) for column in columns],
+            "cells": [_safety_cell(name, column.get(name)) for column in columns],
         }
         for name, text in {row.quantity: row.text for c in columns for row in c.values()}.items()
     ]
 
 
-def _safety_cell(row: Safety | None) -> dict[str, Any]:
+def _safety_cell(name: str, row: Safety | None) -> dict[str, Any]:
+    nothing = quantity(name.replace(" ", "_")).nothing or "nothing to measure"
     if row is None:
-        return {"state": "free", "worst": "", "nothing": "flown by points"}
+        return {"state": "free", "worst": "", "nothing": nothing}
     margin, used, worst = row.margin, row.used, row.worst
     state = "free" if row.limit is None else "ok" if row.passed else "failed"
     left = ""
     if margin is not None:
         left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
-    nothing = {
-        "downwash": "no vehicle is ever below another",
-        "geofence": "no geofence",
-        "saturation": "no vehicle is asked for more than its rotors give",
-    }
     return {
         "state": state,
         "sign": "≤" if not row.at_least else "≥" if row.limit else ">",
         "limit": "" if row.limit is None else value(row.limit, row.unit),
         "worst": "" if worst is None else value(worst.value, row.unit),
-        "nothing": nothing.get(row.quantity, "nothing to measure") if worst is None else "",
+        "nothing": nothing if worst is None else "",
         "left": left,
         "used": None if used is None else min(max(used, 0.0), 1.0),
         "when": "" if worst is None else f"{worst.when:.2f} s" + ", at samples" * worst.at_samples,
@@ -308,10 +305,6 @@ def _safety_cell(row: Safety | None) -> dict[str, Any]:
 def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
     """Numbers of the flights side by side, with whether they differ."""
 
-    def worst(name: str, _: Result, verdict: Verdict) -> float | None:
-        extreme = verdict.worst.get(name)
-        return None if extreme is None else extreme.value
-
     def misses(_: Result, verdict: Verdict) -> float | None:
         found = [p.waypoint.position for p in verdict.phases if p.waypoint is not None]
         return max((miss for miss in found if miss is not None), default=None)
@@ -320,18 +313,8 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
         ("greatest waypoint miss", "m", misses),
-        ("greatest distance from a slot", "m", lambda r, _: _greatest(overlay.slot_error(r))),
-        ("greatest constraint error", "m", partial(worst, "constraint")),
-        ("least distance between vehicles", "m", partial(worst, "separation")),
-        ("least distance to an obstacle", "m", partial(worst, "clearance")),
-        ("greatest speed", "m/s", partial(worst, "speed")),
-        ("greatest acceleration", "m/s²", partial(worst, "acceleration")),
-        ("greatest thrust", "N", partial(worst, "thrust")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
-        ("greatest constraint force", "N", partial(worst, "constraint_force")),
-        ("greatest share of a rotor's limit", "%", lambda _, v: _rotor_share(v)),
-        ("greatest tilt", "deg", partial(_checked, "tilt")),
-        ("greatest saturation of a phase", "%", partial(_checked, "saturation")),
+        *((q.text, shown(q.unit), partial(_checked, q.name)) for q in QUANTITIES.values()),
     ]
     rows = []
     for name, unit, measure in measures:
@@ -342,7 +325,7 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
             {
                 "name": name,
                 "unit": unit,
-                "cells": ["–" if x is None else value(abs(x) if "error" in name else x) for x in found],
+                "cells": ["–" if x is None else value(x) for x in found],
                 "change": [_change(found[0], x) for x in found],
                 "same": all(_same(found[0], x) for x in found),
             }
@@ -353,19 +336,6 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
 def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
     return next((check.worst for check in verdict.checks if check.check == name), None)
-
-
-def _rotor_share(verdict: Verdict) -> float | None:
-    """Force of the rotor nearest to its limit, as a share of it [%]."""
-    found = next((check for check in verdict.checks if check.check == "rotor_force"), None)
-    if found is None or found.worst is None or not found.limit:
-        return None
-    return 100 * found.worst / found.limit
-
-
-def _greatest(values: Any) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if len(known) else None
 
 
 def _mean(result: Result) -> float | None:

@@ -19,6 +19,7 @@ import numpy as np
 from rigidfleet._common import markup
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import write_file
+from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -311,7 +312,7 @@ class Result:
                     alone = x.other not in rotors
                 else:
                     alone = not (-1 <= x.other < n and x.other != x.who)
-                    alone = alone and not name.startswith("clearance")
+                    alone = alone and quantity(name).who != "obstacle"
                 if alone or x.who not in agents:
                     raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
@@ -395,17 +396,11 @@ class Result:
             ("time", f"{self.time[0]:g} to {self.time[-1]:g} s, {len(self.time)} samples"),
             ("ending", "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"),
         ]
-        worst = (
-            ("separation", "least separation", "m"),
-            ("clearance", "least clearance", "m"),
-            ("speed", "greatest speed", "m/s"),
-            ("thrust", "greatest thrust", "N"),
-            ("rotor_force", "greatest rotor force", "N"),
-            ("tracking_error", "greatest tracking error", "m"),
-        )
-        for quantity, words, unit in worst:
-            if (x := self.extreme(quantity)) is not None and math.isfinite(x.value):
-                rows.append((words, f"{x.value:.3g} {unit} at {x.time:.2f} s"))
+        for name in ("separation", "clearance", "speed", "thrust", "rotor_force", "tracking_error"):
+            if (x := self.extreme(name)) is not None and math.isfinite(x.value):
+                q = QUANTITIES[name]
+                words = f"{q.sense} {q.called}"
+                rows.append((words, f"{x.value:.3g} {q.unit} at {x.time:.2f} s"))
         return markup.shown(name, title, (), rows)
 
     @property
@@ -520,9 +515,8 @@ class Result:
         Names are those of `PhaseRecord.extremes`.
         """
         every = [p.extremes[name] for p in self.phases if name in p.extremes]
-        sign = -1.0 if name in _LEAST or name.startswith("clearance") else 1.0
-        size = (lambda x: abs(x.value)) if name == "tension" else (lambda x: sign * x.value)
-        return max(every, key=size, default=None)
+        rank = quantity(name).rank
+        return max(every, key=lambda x: rank(x.value), default=None)
 
     def save(self, path: str | Path) -> None:
         """Write the result to a netCDF-4 file.
@@ -662,10 +656,6 @@ _CHECKED = {
     for name, v in VARIABLES.items()
 }
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
-#: Quantities whose minimum is the worst value. The same holds for all clearances.
-_LEAST = frozenset(
-    ("separation", "separation_below", "separation_flying", "lost", "lowest", "guarantee")
-)
 
 
 def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
