@@ -154,11 +154,12 @@ def missions(
     else:
         import tomllib
 
-        table = console.table("mission", "what it shows", "in the paper")
-        for name in mission_names():
-            head = tomllib.loads(mission_text(name))
-            table.add_row(name, head.get("title", ""), head.get("source", ""))
-        console.print_table(table)
+        from rigidfleet._common.facts import Row, Sheet, Table
+
+        files = {name: tomllib.loads(mission_text(name)) for name in mission_names()}
+        rows = [Row((name, f.get("title"), f.get("source"))) for name, f in files.items()]
+        heads = ("mission", "what it shows", "in the paper")
+        console.show(Sheet("", "", [Table(heads, rows, heads)]))
     return PASSED
 
 
