@@ -24,6 +24,7 @@ from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import BARRIER, GUARD, TICKS, avoidance
 from rigidfleet.kernel.engine import native, sampled
 from rigidfleet.kernel.problem import graph, workspace
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import least_duration, transfer
@@ -76,7 +77,9 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     """Problem, workspace, flight, state and avoidance of n free vehicles of 1 kg without gravity."""
     mission = rf.load_mission("square")
     one = mission.fleet
-    plan = plan_phase(mission, mission.phases[0], PhaseState(0.0, one.position, one.velocity))
+    plan = plan_phase(
+        mission, leg_of(mission, mission.phases[0], PhaseState(0.0, one.position, one.velocity))
+    )
     mass = np.ones(n)
     problem = plan.problem._replace(graph=graph(np.zeros((0, 2), dtype=np.int64), mass))
     vehicles = fleet.quadrotors([fleet.Vehicle(1.0, point=True, limit=THRUST)] * n, 0.0)

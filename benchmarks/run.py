@@ -34,6 +34,7 @@ from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.tracer import Code, Trace
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.result import Result
@@ -125,7 +126,7 @@ def compiled_flight(mission: Mission, tolerance: float = TOLERANCE) -> Callable[
     """The kernel alone: all that is known before the flight is prepared before the clock starts."""
     agents = mission.agents
     now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
-    plan = plan_phase(mission, mission.phases[0], now)
+    plan = plan_phase(mission, leg_of(mission, mission.phases[0], now))
     work = workspace(len(now.r), len(plan.edges), solver=plan.problem.law.solver)
     y = np.concatenate([now.r.ravel(), now.v.ravel(), np.zeros(len(plan.edges))])
     times = np.linspace(0.0, DURATION, SAMPLES)
@@ -160,13 +161,16 @@ def with_records(result: Result) -> Result:
 
 def in_kernel(job: Callable[[], object], at_least: float) -> tuple[float, float]:
     """Time [s] of one call, as `seconds`, and what of it is spent in the kernel's integrator and monitor."""
-    inside, whole = 0.0, {kind: kind.__call__ for kind in (native.Integration, native.Watch)}
+    inside = 0.0
+    watch = native.Watch
+    parts = (native.Integration, "__call__"), (watch, "distances"), (watch, "forces")
+    whole = [(kind, name, getattr(kind, name)) for kind, name in parts]
 
     def timed(call: Callable[..., int]) -> Callable[..., int]:
-        def of(*arguments: object) -> int:
+        def of(*arguments: object, **options: object) -> int:
             nonlocal inside
             begun = time.perf_counter()
-            status = call(*arguments)
+            status = call(*arguments, **options)
             inside += time.perf_counter() - begun
             return status
 
@@ -180,12 +184,12 @@ def in_kernel(job: Callable[[], object], at_least: float) -> tuple[float, float]
         job()
 
     try:
-        for kind, call in whole.items():
-            kind.__call__ = timed(call)
+        for kind, name, call in whole:
+            setattr(kind, name, timed(call))
         spent = seconds(counted, at_least)
     finally:
-        for kind, call in whole.items():
-            kind.__call__ = call
+        for kind, name, call in whole:
+            setattr(kind, name, call)
     return spent, inside / calls
 
 
@@ -406,7 +410,7 @@ def straight_line(mission: Mission) -> int:
     """Operations of an evaluation as straight-line code does them, and its share of a step of `lane_steps`."""
     r = np.array(mission.agents.position)
     now = PhaseState(0.0, r, np.zeros_like(r))
-    code = Code(Trace(plan_phase(mission, mission.phases[0], now).problem))
+    code = Code(Trace(plan_phase(mission, leg_of(mission, mission.phases[0], now)).problem))
     # The last two of eight stages are at the same moment.
     return (
         len(code.moment) * 7 // 8 + len(code.lines) + share_of_a_step(mission, stages=8, weights=36)

@@ -34,6 +34,7 @@ from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.kernel.records import FINISHED
 from rigidfleet.mission import load_mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.simulation.flight import simulate
@@ -82,7 +83,7 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
     flight = fleet.flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
     S = fleet.hovering(vehicles, now.r, now.v)
     for phase in mission.phases:
-        plan = plan_phase(mission, phase, now)
+        plan = plan_phase(mission, leg_of(mission, phase, now))
         m = len(plan.edges)
         work = workspace(len(S), m, solver=plan.problem.law.solver)
         integral = plan.state()[6 * len(S) : 6 * len(S) + m]

@@ -479,12 +479,12 @@ ROOT = Path(__file__).parents[1]
 def test_the_page_says_what_happens(tmp_path, monkeypatch, capsys):
     """The command of the page gives the verdict that it quotes, and its Python runs."""
     page = (ROOT / "docs" / "import.md").read_text(encoding="utf-8")
-    (command,) = re.findall(r"^    rigidfleet (assess .*)$", page, re.MULTILINE)
+    (command,) = re.findall(r"^rigidfleet (assess .*)$", page, re.MULTILINE)
     monkeypatch.chdir(tmp_path)
     tmp_path.joinpath("tests").symlink_to(ROOT / "tests")
     assert main(command.split()) == FAILED
     said = " ".join(capsys.readouterr().out.split())
-    quoted = re.search(r"^    Note: others.*?(?=\n\n)", page, re.MULTILINE | re.DOTALL)
+    quoted = re.search(r"^Note: others.*?(?=\n```)", page, re.MULTILINE | re.DOTALL)
     assert quoted is not None
     assert " ".join(quoted[0].split()) in said
     assert (tmp_path / "flights" / "seven" / "report.html").exists()

@@ -15,6 +15,7 @@ from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission, mission_names, mission_text
 from rigidfleet.plotting import figure_names
+from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
 
 ROOT = Path(__file__).parents[1]
@@ -100,6 +101,23 @@ def test_first_mission_flies():
     (text,) = re.findall(r"<!-- mission -->\n```toml\n(.*?)```", page("missions.md"), re.DOTALL)
     verdict = assess(simulate(Mission.from_toml(text)))
     assert verdict.passed, verdict.summary
+
+
+def test_the_first_twenty_keys():
+    """The first mission has each of the twenty keys that its table lists, no other, and nothing to be mended."""
+    (text,) = re.findall(r"<!-- mission -->\n```toml\n(.*?)```", page("missions.md"), re.DOTALL)
+    table = page("missions.md").split("<!-- the first twenty keys -->")[1].split("\n\n")[0]
+    listed = re.findall(r"^\| `([\w.]+)` \|", table, re.MULTILINE)
+    assert len(listed) == 20
+    data = tomllib.loads(text)
+    used = {name for name, value in data.items() if not isinstance(value, dict | list)}
+    used |= {f"{table}.{key}" for table in ("agents", "limits") for key in data[table]}
+    used |= {
+        f"{many}.{key}" for many in ("obstacles", "phases") for row in data[many] for key in row
+    }
+    used |= {f"formations.NAME.{key}" for form in data["formations"].values() for key in form}
+    assert sorted(listed) == sorted(used)
+    assert check(Mission.from_toml(text)).remarks == []
 
 
 def test_the_example_of_an_orbit_flies():
@@ -199,7 +217,8 @@ def test_sweep_page(tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     text = page("sweep.md")
-    lines = re.findall(r"^    (\S+ \S?= .*?\))(?:  .*)?$", text, re.MULTILINE)
+    (listed,) = blocks(text, "text")
+    lines = re.findall(r"^(\S+ \S?= .*?\))(?:  .*)?$", listed, re.MULTILINE)
     assert len(lines) == 7
     Sweep.of("narrow-passage", lines, runs=1)
     (file,) = blocks(text, "toml")
@@ -435,6 +454,15 @@ def test_five_lines_of_the_readme(tmp_path, monkeypatch):
     assert len([line for line in code.splitlines() if line.strip()]) == 5
     exec(compile(code.replace("narrow-passage", "square"), "README.md", "exec"), {})
     assert list(tmp_path.rglob("*.png"))
+
+
+FIRST_MET = ("establish", "blend", "certificate", "flip", "handedness", "open", "prestress")
+
+
+@pytest.mark.parametrize("word", FIRST_MET)
+def test_words_of_the_house_are_explained(word):
+    """The glossary says in a few words what the program's own words mean."""
+    assert re.search(rf"^\| {word} \| \S.{{20,}} \|$", page("glossary.md"), re.MULTILINE)
 
 
 # -- pictures ----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel.records import bernstein
+from rigidfleet.kernel.records import FIRST_ROW, STAYED, TRAILED, bernstein
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.proximity import headroom, obstacle_clearances
@@ -30,9 +30,9 @@ class Steps:
         take = watching.Extremes.take
 
         def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
-            seen = int(extremes.monitor.monitor.flags[3])
-            for step in range(seen, int(state.count[4])):
-                row = (state.count[5] + step) % len(state.trail.clock)
+            seen = int(extremes.monitor.monitor.count[STAYED])
+            for step in range(seen, int(state.count[TRAILED])):
+                row = (state.count[FIRST_ROW] + step) % len(state.trail.clock)
                 t, h = state.trail.clock[row]
                 self.rows.append((t, h, state.trail.points[row].copy()))
             take(extremes, problem, work, state, last=last)
@@ -276,27 +276,25 @@ def test_agents_that_are_passed_over_are_neither_highest_nor_lowest_nor_fastest(
 @pytest.mark.parametrize("formulation", ["inertial", "body"])
 def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
     """In space and as seen from above, at nine points of each step; what turns as one body has small bounds."""
-    call, found, mission = watching.native.Watch.__call__, [], a_crowd(formulation)
+    call, found, mission = watching.native.Watch.bound_moves, [], a_crowd(formulation)
     n = mission.n_agents
     i, j = np.triu_indices(n, 1)
     basis = bernstein(np.linspace(0.0, 1.0, 9))
 
-    def spy(watch: Any, problem: Any, work: Any, state: Any) -> int:
-        status = call(watch, problem, work, state)
-        if watch.monitor.flags[2] == 3:
-            y = basis @ state.trail.points[0]
-            x = y[:, : 3 * n].reshape(9, n, 3)
-            if formulation == "body":
-                q = y[:, 6 * n : 6 * n + 4]
-                x = x @ att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
-            apart = x[:, i] - x[:, j]
-            lengths = [np.linalg.norm(apart[..., :axes], axis=2) for axes in (3, 2)]
-            changes = [np.abs(d - d[0]).max() for d in lengths]
-            way = np.linalg.norm(x[-1] - x[0], axis=1).max()
-            found.append((*changes, *watch.monitor.moves, way, state.trail.clock[0, 0]))
-        return status
+    def spy(watch: Any, problem: Any, state: Any) -> None:
+        call(watch, problem, state)
+        y = basis @ state.trail.points[0]
+        x = y[:, : 3 * n].reshape(9, n, 3)
+        if formulation == "body":
+            q = y[:, 6 * n : 6 * n + 4]
+            x = x @ att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
+        apart = x[:, i] - x[:, j]
+        lengths = [np.linalg.norm(apart[..., :axes], axis=2) for axes in (3, 2)]
+        changes = [np.abs(d - d[0]).max() for d in lengths]
+        way = np.linalg.norm(x[-1] - x[0], axis=1).max()
+        found.append((*changes, *watch.monitor.moves, way, state.trail.clock[0, 0]))
 
-    monkeypatch.setattr(watching.native.Watch, "__call__", spy)
+    monkeypatch.setattr(watching.native.Watch, "bound_moves", spy)
     simulate(mission)
     space, above, bound, bound_above, way, t = np.array(found).T
     assert (space <= bound + 1e-9).all()
@@ -435,7 +433,7 @@ def test_to_watch_a_large_formation_does_not_change_its_flight(form, monkeypatch
     assert watched.phases[0].extremes
 
     def pass_over(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
-        state.count[4] = 0
+        state.count[TRAILED] = 0
 
     monkeypatch.setattr(watching.Extremes, "take", pass_over)
     alone = simulate(mission)

@@ -1,9 +1,11 @@
 """The compiled kernel against finite differences, NumPy, SciPy and exact solutions."""
 
+import ast
 import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any, get_type_hints
 
 import numba
@@ -13,6 +15,7 @@ from numba import types
 from oracles import jacobian
 from scipy.spatial.transform import Rotation
 
+import rigidfleet
 from rigidfleet import physics
 from rigidfleet.kernel import (
     constraint,
@@ -40,6 +43,7 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.kernel.problem import graph as kernel_graph
 from rigidfleet.math import attitude
 from rigidfleet.mission import Mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import PhaseState, plan_phase
 from rigidfleet.simulation.flight import simulate
 
@@ -84,7 +88,7 @@ def a_problem(mission: Mission, index: int = 0, now: PhaseState | None = None) -
     if now is None:
         agents = mission.agents
         now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
-    return plan_phase(mission, phase, now).problem
+    return plan_phase(mission, leg_of(mission, phase, now)).problem
 
 
 def random_vectors(seed: int, n: int, scale: float = 1.0) -> np.ndarray:
@@ -594,7 +598,7 @@ def a_flight_with_a_turn() -> tuple[Problem, Workspace]:
         ],
     )
     now = PhaseState(0.0, np.array(mission.agents.position), np.zeros((3, 3)))
-    fly = plan_phase(mission, mission.phases[1], now).problem
+    fly = plan_phase(mission, leg_of(mission, mission.phases[1], now)).problem
     shape = random_vectors(3, 3, 2.0)
     ref = Reference(
         SHAPE, 0.0, 4.0, np.zeros(3), np.zeros(3), shape, random_vectors(4, 3), np.array([0.3, 0.9, -0.4])
@@ -943,3 +947,39 @@ def test_the_kernel_for_three_agents_is_for_them_alone(monkeypatch):
     monkeypatch.setitem(native._loaded, "flight", code._replace(integrate_three=refused))
     for mission in ("two-agents", "square", "hexagon"):
         assert simulate(mission).complete
+
+
+def places_by_number() -> list[str]:
+    """Where the package reads places of an array of codes by a number, and not by a name; `[:0]` reads none."""
+    root, lines = Path(rigidfleet.__file__).parent, []
+    for path in sorted(root.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Subscript):
+                continue
+            array = getattr(node.value, "attr", getattr(node.value, "id", ""))
+            at = node.slice
+            parts = [at.lower, at.upper] if isinstance(at, ast.Slice) else [at]
+            named = not any(isinstance(part, ast.Constant) for part in parts)
+            if array in {"flags", "count", "clock"} and not named and ast.unparse(at) != ":0":
+                lines.append(f"{path.relative_to(root)}:{node.lineno}: {ast.unparse(node)}")
+    return lines
+
+
+def test_codes_have_names():
+    """No array of counters and times is read by a number: `count[TRAILED]`, not `count[4]`."""
+    assert places_by_number() == []
+
+
+def test_codes_of_an_array_fill_it():
+    """Each place has one name, and there is none without a name."""
+    state = records.integrator(np.zeros(6), 2.5, rtol=1e-6, atol=np.ones(6), step=0.125)
+    named = {records.TIME: 2.5, records.NEXT_STEP: 0.125, records.LAST_ERROR: math.log(1e-4)}
+    assert [named[k] for k in range(len(state.clock))] == state.clock.tolist()
+    counted = (
+        records.EVALUATIONS, records.ACCEPTED, records.REJECTED, records.SAMPLES, records.TRAILED,
+        records.FIRST_ROW,
+    )  # fmt: skip
+    assert sorted(counted) == list(range(len(state.count)))
+    watch = records.monitor(np.ones(1), np.zeros((0, 6)), np.zeros((0, 6)), 6, 3)
+    listed = records.STAYED, records.LISTED_DISTANCES, records.LISTED_FORCES
+    assert sorted(listed) == list(range(len(watch.count)))

@@ -139,23 +139,22 @@ def test_safety(calm):
     """Every quantity has its worst value, its limit and what is left, as measured on the result."""
     rows = {row.quantity: row for row in safety(calm, assess(calm))}
     assert list(rows) == [
-        "proximity", "downwash", "speed", "acceleration", "lowest", "highest", "geofence", "thrust",
-        "clearance", "tracking error",
+        "separation", "separation as planned", "clearance", "geofence", "lowest", "highest", "speed", "acceleration",
+        "thrust", "tracking error",
     ]  # fmt: skip
     z, r = calm.position[..., 2], calm.position
     assert worst(rows["highest"]).value == z.max()
     assert rows["highest"].margin == pytest.approx(12 - z.max())
     assert worst(rows["lowest"]).value == z.min()
     assert rows["lowest"].margin == pytest.approx(z.min())
-    inside = np.minimum(r - [-5, -5, 0], [15, 15, 12] - r).min()
-    assert worst(rows["geofence"]).value == pytest.approx(inside)
+    outside = np.maximum([-5, -5, 0] - r, r - [15, 15, 12]).max()
+    assert worst(rows["geofence"]).value == pytest.approx(outside)
     assert rows["geofence"].passed
     assert rows["thrust"].used == pytest.approx(calm.thrust.max() / 30)
     assert rows["speed"].limit == 9.0
     assert rows["acceleration"].limit is None
     assert rows["acceleration"].margin is None
-    assert rows["downwash"].worst is None
-    assert rows["proximity"].margin == pytest.approx(np.min(calm.separation) - 1.0)
+    assert rows["separation"].margin == pytest.approx(np.min(calm.separation) - 1.0)
 
 
 def test_safety_of_a_flight_that_breaks_limits(hasty):
@@ -172,7 +171,7 @@ def test_downwash_is_measured_without_a_limit():
     text = TOML.replace("[4, 0, 1]", "[0.1, 0, 3]").replace("establish", "hold")
     text = text.replace('formation = "triangle"\nduration = 4.0', "duration = 1.0")
     result = simulate(Mission.from_toml(text))
-    (row,) = (row for row in safety(result, assess(result)) if row.quantity == "downwash")
+    (row,) = (row for row in safety(result, assess(result)) if row.quantity == "separation below")
     assert row.limit is None
     assert worst(row).value == pytest.approx(1.5)
     assert worst(row).who == "agents 1 and 2"
@@ -182,7 +181,7 @@ def test_vehicles_with_rotors(calm, quick):
     """A flight by quadrotors tells models, rotors, tilt, tracking and saturation; beside points, these have none."""
     result = quadrotors(3, 20.0)
     rows = {row.quantity: row for row in safety(result, assess(result))}
-    assert list(rows)[-4:] == ["rotor force", "saturation", "tilt", "tracking error"]
+    assert list(rows)[-3:] == ["rotor force", "tilt", "tracking error"]
     assert worst(rows["rotor force"]).who == "agent 2"
     assert rows["rotor force"].used == pytest.approx(1.0)
     assert worst(rows["tilt"]).value == pytest.approx(20.0)
@@ -191,7 +190,7 @@ def test_vehicles_with_rotors(calm, quick):
     assert "share of rotor limit" in text
     both = Page(html_page([calm, result])).text
     assert "flown by points" in both
-    assert "greatest share of a rotor's limit" in both
+    assert "force of the rotor that comes nearest to its limit" in both
     assert "rotor" not in Page(html_page(calm)).text
 
 
@@ -204,8 +203,8 @@ def test_side_by_side(calm, hasty, quick):
     }  # fmt: skip
     numbers = {name: cells for name, *cells in (row.cells for row in page["numbers"].rows)}
     assert [cell.text for cell in numbers["length of the flight [s]"]] == ["12", "7"]
-    assert numbers["greatest speed [m/s]"][1].small.startswith(("+", "×"))
-    one, other = numbers["least distance between vehicles [m]"]
+    assert numbers["greatest speed of a vehicle [m/s]"][1].small.startswith(("+", "×"))
+    one, other = numbers["least distance between two vehicles' surfaces [m]"]
     assert one == other
     assert len(page["overlays"]) == 2
     text = Page(html_page([calm, hasty], labels=["calm", "hasty"])).text

@@ -17,6 +17,7 @@ from rigidfleet.kernel.problem import BODY, workspace
 from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
 from rigidfleet.math import attitude
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.simulation.flight import simulate
@@ -413,7 +414,7 @@ def test_the_body_law_and_its_frame():
     slots = mission.formation_slots("triangle")
     assert slots is not None
     now = PhaseState(6.0, slots + [6, 4, 3], np.zeros((3, 3)), formation="triangle")
-    plan = plan_phase(mission, mission.phases[1], now)
+    plan = plan_phase(mission, leg_of(mission, mission.phases[1], now))
     assert plan.frame is not None
     assert plan.problem.control.kind == BODY
     y = plan.state()

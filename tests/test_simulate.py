@@ -17,6 +17,7 @@ from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.kernel.problem import SHAPE, SQUARED
 from rigidfleet.math import attitude, lqr
 from rigidfleet.mission import Establish, Mission, load_mission, mission_names
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import ByEdge, PhaseState, reference_kind
 from rigidfleet.preflight import check as preflight
@@ -279,7 +280,7 @@ def test_distances_lead_by_squares_where_an_affine_map_leads_to_the_slots(slots,
     )
     phase = mission.phases[0]
     assert leader(mission, start @ turn) == by
-    plan = plan_phase(mission, phase, PhaseState(0.0, start @ turn, 0 * start))
+    plan = plan_phase(mission, leg_of(mission, phase, PhaseState(0.0, start @ turn, 0 * start)))
     assert plan.problem.reference.kind == {"squares": SQUARED, "shape": SHAPE}[by]
     result = simulate(mission)
     wanted = distance_geometry.distances(slots, result.edges)

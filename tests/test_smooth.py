@@ -19,9 +19,9 @@ from rigidfleet.math import series, splines
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.mission.draft import draft
 from rigidfleet.planning import derivatives as d
+from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.limits import limits_of, reached
-from rigidfleet.planning.preview import Leg, preview
-from rigidfleet.planning.preview import leg as leg_of
+from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import broken, timed
 from rigidfleet.preflight.check import check
 from rigidfleet.result import Result
@@ -340,7 +340,7 @@ LIMITS = {"speed": 3.0, "acceleration": 1.5, "jerk": 1.5, "tilt_deg": 8.0}
 
 def dense(leg: Leg, mission: Mission) -> dict[str, float]:
     """The greatest share of each limit at 20,001 samples of a leg, from positions alone."""
-    time = np.linspace(leg.begin, leg.end, 20_001)
+    time = np.linspace(leg.start, leg.end, 20_001)
     x = d.slot_derivatives(leg.reference, leg.motion, time)
     force = x[:, 2] + np.array([0.0, 0.0, mission.gravity])
     across = np.linalg.norm(force[..., :2], axis=-1)
@@ -366,12 +366,12 @@ def test_limits_are_found_between_samples():
     for planned in preview(mission)[0]:
         leg = planned.leg
         expected = dense(leg, mission)
-        for x in reached(limits_of(mission), leg.reference, leg.motion, leg.begin, leg.end):
-            share = expected[x.limit.name]
+        for x in reached(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end):
+            share = expected[x.limit.of.called]
             assert x.share == pytest.approx(share, rel=1e-3, abs=1e-9)
             who = np.array([x.agent])
             at = d.slot_derivatives(leg.reference, leg.motion, np.array([x.time]))[:, :, who]
-            assert x.limit.quantity(at, who)[0, 0] == pytest.approx(x.value, rel=1e-9, abs=1e-12)
+            assert x.limit.values(at, who)[0, 0] == pytest.approx(x.value, rel=1e-9, abs=1e-12)
 
 
 def test_a_time_that_is_too_short_is_refused_with_the_least_one():

@@ -12,7 +12,7 @@ from rigidfleet.kernel.engine import batch, codegen, lane_bounds, lane_steps, na
 from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, numbers
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.problem import Problem, workspace
-from rigidfleet.kernel.records import ANY_STEP, LISTED
+from rigidfleet.kernel.records import ANY_STEP, LISTED_DISTANCES
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
 from rigidfleet.simulation import together
@@ -266,7 +266,7 @@ def test_lists_of_a_phase_side_by_side_do_not_outlast_it():
         for phase in phases:
             monitor = phase.extremes.monitor.monitor
             assert monitor.listed.shape == (2, len(phase.state.trail.clock))
-            assert monitor.flags[LISTED:].tolist() == [ANY_STEP, ANY_STEP]
+            assert monitor.count[LISTED_DISTANCES:].tolist() == [ANY_STEP, ANY_STEP]
 
 
 def all_listed(search: Any, first: int, steps: range, monitors: Any) -> None:
@@ -304,7 +304,7 @@ def test_few_steps_are_searched(monkeypatch):
         nonlocal steps, listed
         list_steps(search, first, new, monitors)
         steps += len(new) * len(monitors)
-        listed += sum(m.flags[LISTED:] for m in monitors)
+        listed += sum(m.count[LISTED_DISTANCES:] for m in monitors)
 
     monkeypatch.setattr(lane_bounds, "list_steps", counted)
     simulate_together(varied("windy-passage", windy))

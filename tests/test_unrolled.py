@@ -11,6 +11,7 @@ from rigidfleet.kernel.engine import codegen, lane_steps, native
 from rigidfleet.kernel.engine.tracer import Code, Trace, UnfitError, elimination_order, structure
 from rigidfleet.kernel.problem import Problem, workspace
 from rigidfleet.mission import Mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 
@@ -54,7 +55,7 @@ def make(agents: int, data: dict[str, Any]) -> tuple[Problem, np.ndarray]:
         whole["agents"] |= {"thrust_limit": data["thrust_limit"], "saturate": True}
     mission = Mission.from_dict(whole)
     now = PhaseState(0.0, r, np.zeros_like(r))
-    plan = plan_phase(mission, mission.phases[0], now)
+    plan = plan_phase(mission, leg_of(mission, mission.phases[0], now))
     return plan.problem, r
 
 

@@ -28,6 +28,7 @@ from rigidfleet.kernel.problem import (
     workspace,
 )
 from rigidfleet.mission import load_mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
 
@@ -113,7 +114,7 @@ def planned(
     """A phase of a shipped mission from the mission's start, flown by vehicles of one kind."""
     mission = load_mission(name)
     now = PhaseState(0.0, np.array(mission.agents.position), np.array(mission.agents.velocity))
-    plan = plan_phase(mission, mission.phases[index], now)
+    plan = plan_phase(mission, leg_of(mission, mission.phases[index], now))
     n = len(now.r)
     fleet_ = fleet.quadrotors([vehicle] * n, plan.problem.vehicles.g)
     flight = fleet.flight(fleet_, start=plan.start, h=h, steps=steps, every=every)

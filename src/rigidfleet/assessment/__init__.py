@@ -88,6 +88,6 @@ def assess(result: Result | str | Path) -> Verdict:
         measured.mission.name, measured.mission.title, [], phases, [], uncalled, covers,
         read=[*result.statistics.get("read", [])],
     )  # fmt: skip
-    verdict.checks.extend(all_checks(measured, verdict))
+    verdict.checks.extend(all_checks(measured, phases))
     verdict.notes.extend(notes(measured, phases))
     return verdict

@@ -3,44 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.quantities import Quantity
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import CheckResult, Extreme, bounded, value
-from rigidfleet.result import Extremum, Result
+from rigidfleet.result import Result
 
-#: The two margins: between vehicles, and between vehicles and obstacles.
-_MARGINS = ("guarantee", "clearance_guarantee")
 #: Rate below which the clock counts as slowed: it comes back to 1 by an exponential.
 _SLOWED = 0.99
 
 
-def guarantee_checks(measured: Measurements) -> Iterator[CheckResult]:
+def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Whether stop segments have kept their distances at every tick, if the mission has a guard."""
-    given = measured.mission.avoidance
-    if given is None or not given.guard:
+    avoidance = measured.mission.avoidance
+    if avoidance is None or not avoidance.guard:
         return
-    if (lost := _lost(measured)) is not None:
-        name, x, phase = lost
-        e = Extreme(x.value, x.time, _who(measured, name, x), phase)
+    if lost := _margins(measured, "_lost"):
+        e = min(lost, key=lambda e: e.when)
         words = (
-            f"the guarantee of [avoidance] is lost at {x.time:.2f} s, by {e.who}: braking at once would leave them"
-            f" {value(-x.value, 'm')} too near"
+            f"the guarantee of [avoidance] is lost at {e.when:.2f} s, by {e.who}: braking at once would leave them"
+            f" {value(-e.value, 'm')} too near"
         )
-        yield bounded("guarantee", e, "m", 0.0, words, passed=False, at_least=True)
+        yield bounded(q, e, 0.0, words, passed=False)
         return
     state = "held" if _doubt(measured) else "proved"
-    least = _least(measured)
-    if least is None:
-        words = f"the guarantee of [avoidance] is {state}: no vehicle has come near anything"
-        yield CheckResult("guarantee", True, words, limit=0.0, unit="m", at_least=True)
-        return
-    name, x, phase = least
-    e = Extreme(max(x.value, 0.0), x.time, _who(measured, name, x), phase)
-    words = f"the guarantee of [avoidance] is {state}, with {value(x.value, 'm')} to spare at least"
-    yield bounded("guarantee", e, "m", 0.0, words, passed=True, at_least=True)
+    e = min(_margins(measured), key=lambda e: e.value, default=None)
+    words = f"the guarantee of [avoidance] is {state}: no vehicle has come near anything"
+    if e is not None:
+        words = (
+            f"the guarantee of [avoidance] is {state}, with {value(e.value, 'm')} to spare at least"
+        )
+        e = replace(e, value=max(e.value, 0.0))
+    yield bounded(q, e, 0.0, words, passed=True)
 
 
 def avoidance_notes(measured: Measurements) -> Iterator[str]:
@@ -50,7 +47,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
         return
     if not given.guard:
         yield "[avoidance] without its guard guarantees nothing"
-    elif _lost(measured) is None:
+    elif not _margins(measured, "_lost"):
         doubt = _doubt(measured)
         yield (
             f"the guarantee of [avoidance] was held at every tick, but is not proved: {doubt}"
@@ -97,31 +94,14 @@ def _first_layers(result: Result) -> Iterator[str]:
         yield f"of the samples, by time: {', '.join(told)}{aside}"
 
 
-def _lost(measured: Measurements) -> tuple[str, Extremum, str] | None:
-    """The first time at which a margin was negative."""
-    found = [
-        (name, p.extremes[f"{name}_lost"], p.name)
+def _margins(measured: Measurements, ending: str = "") -> list[Extreme]:
+    """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
+    return [
+        measured.recorded(name + ending, p.extremes[name + ending], p.name)
         for p in measured.result.phases
-        for name in _MARGINS
-        if f"{name}_lost" in p.extremes
+        for name in ("guarantee", "clearance_guarantee")
+        if name + ending in p.extremes
     ]
-    return min(found, key=lambda each: each[1].time, default=None)
-
-
-def _least(measured: Measurements) -> tuple[str, Extremum, str] | None:
-    found = [
-        (name, p.extremes[name], p.name)
-        for p in measured.result.phases
-        for name in _MARGINS
-        if name in p.extremes
-    ]
-    return min(found, key=lambda each: each[1].value, default=None)
-
-
-def _who(measured: Measurements, name: str, x: Extremum) -> str:
-    if name == "guarantee":
-        return agent_names(sorted((x.who, x.other)))
-    return measured.beside(x.who, x.other)
 
 
 def _doubt(measured: Measurements) -> str:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from operator import itemgetter
-from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
+from rigidfleet._common.text import agent_names, percent
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
-from rigidfleet.assessment.avoidance import guarantee_checks
+from rigidfleet.assessment.avoidance import guarantee_check
 from rigidfleet.assessment.fits import is_rigid
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import (
@@ -25,10 +24,7 @@ from rigidfleet.assessment.outcome import (
     bounded,
     value,
 )
-from rigidfleet.assessment.vehicles import tracking_check, vehicle_checks
-from rigidfleet.assessment.verdict import Verdict
-from rigidfleet.result import DIRECTIONS, PAD, Result
-from rigidfleet.typing import Floats
+from rigidfleet.result import LABELS, PAD, Result
 
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
@@ -39,72 +35,47 @@ _CORNER = 0.01
 _UNSEEN = 0.01
 
 
-def all_checks(measured: Measurements, verdict: Verdict) -> Iterator[CheckResult]:
-    """All checks of a flight.
-
-    A check made in several phases yields every failure, or the pass nearest to the limit if there is none.
-    """
+def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """All checks of a flight: whether it is complete and its record true, its ends of phases, its quantities."""
     yield _complete(measured.result)
     yield from _record(measured)
     yield from _unseen(measured)
-    candidates = [
-        *_settled(verdict.phases),
-        *_shapes(measured, verdict.phases),
-        *_waypoints(verdict.phases),
-        *_touch_downs(measured, verdict.phases),
-    ]
-    yield from _failures_or_worst(candidates)
-    worst, limits = verdict.worst, measured.mission.limits
-    if "separation" in worst:
-        yield _separation(measured, worst["separation"])
-        if limits.separation is not None and limits.separation_altitude is not None:
-            yield _flying(measured, limits.separation, limits.separation_altitude)
-        yield from _failures_or_worst(_as_planned(measured, verdict.phases))
-    elif limits.separation is not None and measured.result.interpolation is not None:
-        yield _alone(limits.separation, measured.result.n_agents)
-    if "clearance" in worst:
-        yield from _clearances(measured)
-    if not measured.left.all() and measured.mission.first_loss < math.inf:
-        yield _lost(measured)
-    yield from abandoned(measured)
-    if limits.separation_below is not None:
-        yield _downwash(measured, limits.separation_below)
-    if limits.geofence is not None:
-        yield _geofence(measured, np.array(limits.geofence.min), np.array(limits.geofence.max))
-    yield bounded("speed", worst.get("speed"), "m/s", limits.speed)
-    acceleration = worst.get("acceleration")
-    if acceleration is not None or limits.acceleration is not None:
-        yield _moving("acceleration", acceleration, "m/s^2", limits.acceleration)
-    for name in DIRECTIONS:
-        if (limit := getattr(limits, name)) is not None:
-            unit = "m/s" if name.endswith("speed") else "m/s^2"
-            yield _moving(name, measured.directed(name), unit, limit)
-    yield from _corners(measured)
-    yield from _thrust(measured, worst.get("thrust"))
-    yield from vehicle_checks(measured)
-    yield from tracking_check(measured)
-    yield from guarantee_checks(measured)
-    units = {"constraint": "m", "constraint_force": "N", "tension": "N", "singular_value": ""}
-    yield from (bounded(name, worst[name], units[name], None) for name in units if name in worst)
+    yield from _failures_or_nearest(
+        [
+            *_settled(phases),
+            *_shapes(measured, phases),
+            *_waypoints(phases),
+            *_touch_downs(measured, phases),
+        ]
+    )
+    for q in QUANTITIES.values():
+        yield from _CHECKS.get(q.name, _limited)(measured, q)
 
 
-def _failures_or_worst(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
-    """All failures of each check, or its finding nearest to the limit if none failed."""
+def _failures_or_nearest(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
+    """All failures of each check, or what comes nearest to its limit if none failed."""
     by_check: dict[str, list[CheckResult]] = {}
-    for finding in candidates:
-        by_check.setdefault(finding.check, []).append(finding)
-    for found in by_check.values():
-        failed = [finding for finding in found if not finding.passed]
-        yield from failed or [max(found, key=lambda f: (f.worst or 0.0) / (f.limit or 1.0))]
+    for candidate in candidates:
+        by_check.setdefault(candidate.check, []).append(candidate)
+    for every in by_check.values():
+        failed = [candidate for candidate in every if not candidate.passed]
+        yield from failed or [max(every, key=lambda c: (c.worst or 0.0) / (c.limit or 1.0))]
 
 
-def _beyond_or_greatest(every: list[tuple[Any, ...]], limit: float) -> list[tuple[Any, ...]]:
-    """Those whose first number is beyond a limit, or else the one whose first number is greatest.
-
-    Words are written for these alone: a flight has many waypoints and phases, and few fail.
-    """
-    greatest = max(every, key=itemgetter(0), default=(-math.inf,))
-    return [x for x in every if x[0] > limit] if greatest[0] > limit else [greatest][: len(every)]
+def _limited(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """Compare a quantity with its limit; without a limit, report what a verdict has of each phase."""
+    limit = q.limit_of(measured.mission) if q.key else None
+    if limit is None and not q.by_phase:
+        return
+    e = measured.worst(q.name)
+    if e is None and limit is not None and q in MOTIONS and measured.result.interpolation:
+        words = (
+            f"{q.called} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none. Assume"
+            " cubics, or give velocities"
+        )
+        yield CheckResult(q.name, False, words, None, limit, q.unit)
+    elif e is not None or limit is not None:
+        yield bounded(q, e, limit)
 
 
 def _complete(result: Result) -> CheckResult:
@@ -261,8 +232,9 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
         unit = UNITS[name]
-        misses = [(m, *point) for point in points if (m := getattr(point[2], name)) is not None]
-        for miss, p, what, at in _beyond_or_greatest(misses, limit):
+        for p, what, at in points:
+            if (miss := getattr(at, name)) is None:
+                continue
             passed = miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -298,20 +270,9 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         )
 
 
-def _moving(check: str, e: Extreme | None, unit: str, limit: float | None) -> CheckResult:
-    """As `bounded`; a limit of what a trajectory does not have fails."""
-    if e is not None or limit is None:
-        return bounded(check, e, unit, limit)
-    words = (
-        f"{check.replace('_', ' ')} cannot be judged (limit {limit:g} {unit}): straight lines between samples have"
-        " none. Assume cubics, or give velocities"
-    )
-    return CheckResult(check, False, words, None, limit, unit)
-
-
-def _corners(measured: Measurements) -> Iterator[CheckResult]:
+def _corner(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
-    result, limits = measured.result, measured.mission.limits
+    result = measured.result
     if result.interpolation is None or not np.isfinite(result.acceleration).any():
         return  # of straight lines, accelerations are not judged at all
     first = np.flatnonzero(np.nextafter(result.time[:-1], np.inf) >= result.time[1:])
@@ -322,101 +283,98 @@ def _corners(measured: Measurements) -> Iterator[CheckResult]:
     k, i = np.unravel_index(int(by.argmax()), by.shape)
     e = Extreme(float(by[k, i]), float(result.time[first[k]]), f"agent {i + 1}", "")
     words = f"{e.who} turns at a corner at {e.when:.2f} s: its velocity jumps by {value(e.value, 'm/s')}"
-    judged = any(getattr(limits, f"{way}acceleration") for way in ("", "horizontal_", "vertical_"))
+    judged = any(x.limit_of(measured.mission) for x in MOTIONS if x.order == 2)
     if judged:
         words += f" (limit {_CORNER:g} m/s where accelerations are limited)"
-    yield bounded("corner", e, "m/s", _CORNER if judged else None, words, passed=not judged)
+    yield bounded(q, e, _CORNER if judged else None, words, passed=not judged)
 
 
-def _separation(measured: Measurements, e: Extreme) -> CheckResult:
-    limit = measured.mission.limits.separation_always or 0.0
-    passed = e.value > 0 and e.value >= limit - SLACK
-    words = f"{_near(e)} (limit {limit:g} m)"
-    if (first := measured.first_contact("separation", e)) is not None:
-        words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
-        words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
-    return bounded("separation", e, "m", limit, words, passed=passed, at_least=True, first=first)
+def _separation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    e, limit = measured.worst(q.name), measured.mission.limits.separation
+    if e is not None:
+        words, first = "", measured.first_contact(q.name, e)
+        if first is not None:
+            words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
+            words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
+        yield bounded(q, e, q.limit_of(measured.mission), words, first=first)
+    elif limit is not None and measured.result.interpolation is not None:
+        one = measured.result.n_agents == 1
+        words = (
+            f"separation cannot be judged (limit {limit:g} m): there"
+            f" {'is one vehicle alone' if one else 'are never two vehicles at one time'}. Give the other vehicles, name"
+            " the column that tells which vehicle a row is of, or ask for no separation"
+        )
+        yield CheckResult(q.name, False, words, None, limit, q.unit)
+
+
+def _flying(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """Check the separation of agents of which one is at the altitude from which on it holds."""
+    limit, altitude = q.limit_of(measured.mission), measured.mission.limits.separation_altitude
+    if limit is not None and measured.worst("separation") is not None:
+        e = measured.worst(q.name)
+        words = "no two agents come as near" if e is None else _near(e)
+        words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
+        yield bounded(q, e, limit, words)
+
+
+def _as_planned(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """How much nearer agents come in each phase than its plan's certificate says."""
+    allowed, every = q.limit_of(measured.mission), []
+    for record, worst in zip(measured.result.phases, measured.worst_of, strict=True):
+        if record.planned is not None and (e := worst.get("separation")) is not None:
+            planned = record.planned["separation"]
+            words = (
+                f"in phase '{record.name}' {_near(e)};"
+                f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
+            )
+            every.append(bounded(q, replace(e, value=planned - e.value), allowed, words))
+    yield from _failures_or_nearest(every)
 
 
 def _near(e: Extreme) -> str:
     return f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
 
 
-def _flying(measured: Measurements, limit: float, altitude: float) -> CheckResult:
-    """Check the separation of agents of which one is at the altitude from which on it holds."""
-    e, words = measured.worst("separation_flying", None, lambda x: -x), "no two agents come as near"
-    if e is not None:
-        words = _near(e)
-    words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
-    passed = e is None or e.value >= limit - SLACK
-    return bounded("separation_flying", e, "m", limit, words, passed=passed, at_least=True)
-
-
-def _alone(limit: float, n: int) -> CheckResult:
-    """Fail a separation that was asked for where there is no second vehicle."""
-    words = "is one vehicle alone" if n == 1 else "are never two vehicles at one time"
-    words = (
-        f"separation cannot be judged (limit {limit:g} m): there {words}. Give the other vehicles, name the column that"
-        " tells which vehicle a row is of, or ask for no separation"
-    )
-    return CheckResult("separation", False, words, None, limit, "m")
-
-
-def _as_planned(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """How much nearer agents come in each phase than its plan's certificate says."""
-    allowed = measured.mission.limits.separation_allowance
-    every = [
-        (record.planned["separation"] - phase.worst["separation"].value, record, phase)
-        for record, phase in zip(measured.result.phases, phases, strict=True)
-        if record.planned is not None and "separation" in phase.worst
-    ]
-    for off, record, phase in _beyond_or_greatest(every, allowed):
-        e, planned = phase.worst["separation"], (record.planned or {})["separation"]
-        words = (
-            f"in phase '{phase.name}' {_near(e)};"
-            f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
-        )
-        e = replace(e, value=off)
-        yield bounded("separation_as_planned", e, "m", allowed, words)
-
-
-def _clearances(measured: Measurements) -> Iterator[CheckResult]:
+def _clearance(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the clearance in flight, and separately that of vehicles that stand on an obstacle at start or end."""
-    found = {name: e for name, e in measured.clearances().items() if e is not None}
-    every = [*found.values(), measured.worst_clearance()]
-    e = min((e for e in every if e is not None), key=lambda e: e.value)
+    if (least := measured.worst(q.name)) is None:
+        return
+    apart = {name: e for name, e in measured.clearances().items() if e is not None}
+    e = min([least, *apart.values()], key=lambda e: e.value)
     hit = e.value < -_CONTACT
     if not hit:
-        e = found.pop("clearance_flight", None)
+        e = apart.pop("clearance_flight", None)
     if e is not None:
         agent, obstacle = e.who.split(", ", 1)
         words = f"{agent} comes within {value(e.value, 'm')} of '{obstacle}' at {e.when:.2f} s"
-        if (first := measured.first_contact("clearance", e)) is not None:
+        if (first := measured.first_contact(q.name, e)) is not None:
             who, what = first.who.split(", ", 1)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = f"{who} hits '{what}', first at {first.when:.2f} s; {agent} is deepest in '{obstacle}', {depth}"
-        yield bounded("clearance", e, "m", 0.0, words, passed=not first, at_least=True, first=first)
+        yield bounded(q, e, 0.0, words, passed=not first, first=first)
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
-        if name in found and not hit:
-            e = found[name]
+        if name in apart and not hit:
+            e = apart[name]
             agent, obstacle = e.who.split(", ", 1)
             how = "in contact with" if e.value <= _CONTACT else f"{value(e.value, 'm')} above"
             words = f"{agent} stands {how} '{obstacle}' {when} ({e.when:.2f} s)"
-            yield bounded(name, e, "m", 0.0, words, passed=True, at_least=True)
+            yield bounded(quantity(name), e, 0.0, words, passed=True)
 
 
-def _lost(measured: Measurements) -> CheckResult:
-    """Check that the vehicles that the mission loses do not hit those still flying."""
-    who = np.flatnonzero(~measured.left[-1])
-    when = measured.mission.lost_at[who]
-    told = ", ".join(f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
-    e = measured.fallen_on()
-    if e is None:
-        return bounded("lost", e, "m", 0.0, f"lost: {told}", at_least=True)
-    words = f"lost: {told}; after that, {_near(e)}"
-    if (first := measured.first_contact("lost", e)) is not None:
-        words = f"lost: {told}; after that, {first.who} collide, first at {first.when:.2f} s"
-    return bounded("lost", e, "m", 0.0, words, passed=e.value > 0, at_least=True, first=first)
+def _lost(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """Check that the vehicles that the mission loses do not hit those still flying; report phases not flown."""
+    if not measured.left.all() and measured.mission.first_loss < math.inf:
+        who = np.flatnonzero(~measured.left[-1])
+        when = measured.mission.lost_at[who]
+        losses = (f"agent {i + 1} at {t:.2f} s" for i, t in zip(who, when, strict=True))
+        words, first = f"lost: {', '.join(losses)}", None
+        if (e := measured.worst(q.name)) is not None:
+            if (first := measured.first_contact(q.name, e)) is not None:
+                words += f"; after that, {first.who} collide, first at {first.when:.2f} s"
+            else:
+                words += f"; after that, {_near(e)}"
+        yield bounded(q, e, 0.0, words, first=first)
+    yield from abandoned(measured)
 
 
 def abandoned(measured: Measurements) -> Iterator[CheckResult]:
@@ -441,41 +399,104 @@ def abandoned(measured: Measurements) -> Iterator[CheckResult]:
     )
 
 
-def _downwash(measured: Measurements, limit: float) -> CheckResult:
-    e = measured.below()
-    if e is None:
-        words = "no agent flies below another"
-        return bounded("separation_below", e, "m", limit, words, at_least=True)
-    passed = e.value >= limit - SLACK
-    words = f"{e.who} fly one below the other, {value(e.value, 'm')} apart"
-    words += f" at {e.when:.2f} s (limit {limit:g} m)"
-    return bounded("separation_below", e, "m", limit, words, passed=passed, at_least=True)
-
-
-def _geofence(measured: Measurements, low: Floats, high: Floats) -> CheckResult:
-    e = measured.outside(low, high)
-    assert e is not None
+def _geofence(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    if q.limit_of(measured.mission) is None or (e := measured.worst(q.name)) is None:
+        return
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
     if e.value > 0:
         words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
-    return bounded("geofence", e, "m", 0.0, words)
+    yield bounded(q, e, 0.0, words)
 
 
-def _thrust(measured: Measurements, e: Extreme | None) -> Iterator[CheckResult]:
+def _thrust(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the vehicle nearest to its own thrust limit; report the greatest thrust if another vehicle has it."""
-    beyond = measured.nearest_to_limit()
+    e, beyond = measured.worst(q.name), measured.worst("thrust_margin")
     if e is None:
         return  # nobody knows what a trajectory from elsewhere needs
     if beyond is None:
-        yield bounded("thrust", e, "N", None)
+        yield bounded(q, e, None)
         return
-    limits = measured.mission.agents.thrust_limit
+    limits = q.limit_of(measured.mission)
 
     def limit(who: str) -> float:
         return float(limits[int(who.removeprefix("agent ")) - 1])
 
     if e.value - limit(e.who) < beyond.value:
-        yield bounded("thrust_peak", e, "N", None)
+        yield bounded(quantity("thrust_peak"), e, None)
         most = limit(beyond.who)
         e = replace(beyond, value=beyond.value + most)
-    yield bounded("thrust", e, "N", limit(e.who))
+    yield bounded(q, e, limit(e.who))
+
+
+def _rotor_force(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """The rotor nearest to its limit, from step to step and at samples."""
+    result, limits = measured.result, np.array(q.limit_of(measured.mission))
+    if result.rotor_force is None or not limits.any():
+        return
+    safe = np.where(limits > 0.0, limits, np.inf)
+    rotors = [
+        (x.value / safe[x.who], x.value, x.time, x.who, x.other, p.name)
+        for p in result.phases
+        if (x := p.extremes.get(q.name)) is not None
+    ]
+    force = np.where(measured.left[..., None], result.rotor_force, 0.0)
+    k, i, j = np.unravel_index(int((force / safe[:, None]).argmax()), force.shape)
+    worst, name = float(force[k, i, j]), result.phases[result.phase[k]].name
+    rotors.append((worst / safe[i], worst, float(result.time[k]), int(i), int(j), name))
+    share, worst, when, i, j, phase = max(rotors)
+    limit, e = float(limits[i]), Extreme(worst, when, f"agent {i + 1}", phase, len(rotors) == 1)
+    words = (
+        f"the {LABELS['rotor'][j]} rotor of {e.who} gives up to {value(worst, 'N')} at {when:.2f} s"
+        f" (limit {value(limit, 'N')})"
+    )
+    yield bounded(q, e, limit, words, passed=share <= 1.0 + SLACK)
+
+
+def _saturation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """Share of a phase in which a vehicle with rotors cannot give what is asked of it."""
+    e, limit = measured.worst(q.name), q.limit_of(measured.mission)
+    if e is None or not any(model.rotor_limit for model in measured.mission.vehicle_models or ()):
+        return
+    words = (
+        f"{e.who} cannot give what is asked of it for {percent(e.value / 100)} of phase '{e.phase}'"
+        f" (limit {percent(limit / 100)})"
+    )
+    if e.value == 0.0:
+        yield CheckResult(q.name, True, q.nothing, 0.0, limit, q.unit)
+    else:
+        yield bounded(q, e, limit, words)
+
+
+def _tilt(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """Check the tilt: of vehicles with rotors always, of points where it is limited."""
+    if not any(model.rotor_limit for model in measured.mission.vehicle_models or ()):
+        yield from _limited(measured, q)
+    elif (e := measured.worst(q.name)) is not None:
+        yield bounded(q, e, q.limit_of(measured.mission))
+
+
+def _tracking_error(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """Check how far agents are off the slots that they track: of vehicles at every tick, of points at samples."""
+    limit = q.limit_of(measured.mission)
+    own = measured.result.interpolation is None  # the curves of others are their own slots
+    e = measured.worst(q.name) if own else None
+    if e is not None or limit is not None:
+        yield bounded(q, e, limit)
+
+
+#: Checks that are more than a comparison with a limit, by quantity.
+_CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = {
+    "separation": _separation,
+    "separation_flying": _flying,
+    "separation_as_planned": _as_planned,
+    "clearance": _clearance,
+    "lost": _lost,
+    "geofence": _geofence,
+    "corner": _corner,
+    "thrust": _thrust,
+    "rotor_force": _rotor_force,
+    "saturation": _saturation,
+    "tilt": _tilt,
+    "tracking_error": _tracking_error,
+    "guarantee": guarantee_check,
+}

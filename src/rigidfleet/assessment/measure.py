@@ -4,90 +4,44 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
 from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
-from rigidfleet.assessment.outcome import SENSE, Extreme, PhaseVerdict, Waypoint, value
+from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.bernstein import SIZES
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
 from rigidfleet.typing import Bools, Floats, Ints
 
-if TYPE_CHECKING:
-    from rigidfleet.mission.obstacles import Obstacle
-
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
-#: Extremes of pairs of agents, and of edges.
-_OF_PAIRS = frozenset(
-    f"{name}{part}"
-    for name in ("separation", "separation_below", "separation_flying", "lost")
-    for part in ("", "_first")
-)
-_OF_EDGES = frozenset(("tension", "constraint"))
+
+#: What has a value: by its sample, and its place there, the indices that its quantity needs to name it (from 0).
+Owner = Callable[..., tuple[int, ...]]
 
 
-#: The first sample.
-_START = np.zeros(1, dtype=np.int64)
-
-#: Numbers from which on a product is shared out over threads.
-_PRODUCT = 10_000
-
-
-class Quantity:
-    """Values (K, ...) at samples, with the name of their owner.
+class Samples:
+    """Values (K, ...) of a quantity at samples, with their owners.
 
     Attributes
     ----------
     rank : of each value (K, places): greater is worse; -infinity if the value is not finite
-    most : greatest rank from the start of each phase to that of the next one
     """
 
-    def __init__(self, values: Floats, who: Callable[..., str], rank: Floats, starts: Ints) -> None:
-        """Take values with their ranks (K, ...), and the samples at which phases begin."""
-        self.values, self.who = values, who
-        self.rank, flat = rank.reshape(len(rank), -1), rank.reshape(-1)
-        # Of all tests of few numbers a product is the fastest; one of many would wake other threads, for a sum's time.
-        if not math.isfinite(flat @ flat if flat.size < _PRODUCT else flat.sum()):
-            self.rank = np.where(np.isfinite(self.rank), self.rank, -np.inf)
-        places = self.rank.shape[1]
-        self.most = [-math.inf] * len(starts)
-        if places:
-            self.most = np.maximum.reduceat(self.rank.reshape(-1), places * starts).tolist()
-
-
-def agent(_k: int, i: int) -> str:
-    """Name of agent i (from 0), the same at every sample."""
-    return f"agent {i + 1}"
-
-
-def _edge(edges: Ints, _k: int, e: int) -> str:
-    """Name of edge e (from 0), the same at every sample."""
-    i, j = edges[e].tolist()
-    return f"edge {i + 1}-{j + 1}"
-
-
-def _pair(close: proximity.Closeness, k: int) -> str:
-    """The two agents that are nearest to each other at sample k."""
-    return agent_names(sorted(close.pair[k].tolist()))
-
-
-def _obstacle(close: proximity.Closeness, obstacles: Sequence[Obstacle], k: int) -> str:
-    """Names of the agent nearest to an obstacle at sample k, and of that obstacle."""
-    return _beside(obstacles, close.agent.item(k), close.obstacle.item(k))
-
-
-def _beside(obstacles: Sequence[Obstacle], agent: int, obstacle: int) -> str:
-    return f"agent {agent + 1}, {obstacles[obstacle].name}"
+    def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i: (i, -1)) -> None:
+        self.quantity, self.values, self.owner = q, values, owner
+        rank = q.rank(values)
+        self.rank = np.where(np.isfinite(rank), rank, -np.inf).reshape(len(rank), -1)
 
 
 class Measurements:
@@ -106,6 +60,7 @@ class Measurements:
         self.told = set[str]().union(*(p.extremes for p in result.phases))
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         self._nearest: dict[tuple[float, int], int] = {}
+        self._sampled: dict[str, Samples] = {}
         #: Distances to each other and to obstacles at samples.
         self.close = proximity.closeness(
             result.position,
@@ -120,35 +75,15 @@ class Measurements:
         if result.rotor_force is not None:  # what was given, not what was asked
             thrust = result.rotor_force.sum(axis=2)
         self.thrust = self.of_left(np.maximum(thrust, result.thrust))
-        starts = np.array([self.samples[k].start for k in self.flown])
-        constraint, tension = np.abs(result.constraint), -result.multiplier
-        speed, acceleration, force = (
-            self.of_left(length(x))
-            for x in (result.velocity, result.acceleration, result.constraint_force)
-        )
-        close, single = self.close, result.singular_value
-        # Owners know what they need of this object, not the object: no cycle keeps a record that is judged.
-        edge, pair = partial(_edge, result.edges), partial(_pair, close)
-        obstacle = partial(_obstacle, close, self.mission.obstacles)
-        self.measured: dict[str, Quantity] = {
-            name: Quantity(values, who, rank, starts)
-            for name, values, who, rank in (
-                ("constraint", constraint, edge, constraint),
-                ("separation", close.separation, pair, -close.separation),
-                ("clearance", close.clearance, obstacle, -close.clearance),
-                ("thrust", self.thrust, agent, self.thrust),
-                ("speed", speed, agent, speed),
-                ("acceleration", acceleration, agent, acceleration),
-                ("constraint_force", force, agent, force),
-                ("tension", tension, edge, np.abs(tension)),
-                ("singular_value", single, lambda k: "", -single),
-            )
-        }
+        self.measured = {q.name: self.sampled(q.name) for q in QUANTITIES.values() if q.by_phase}
         #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
         self.rank = {name: [-math.inf] * len(result.phases) for name in self.measured}
-        for name, quantity in self.measured.items():
-            for k, rank in zip(self.flown, quantity.most, strict=True):
-                self.rank[name][k] = rank
+        starts = np.array([self.samples[k].start for k in self.flown])
+        for name, samples in self.measured.items():
+            if places := samples.rank.shape[1]:
+                most = np.maximum.reduceat(samples.rank.reshape(-1), places * starts).tolist()
+                for k, rank in zip(self.flown, most, strict=True):
+                    self.rank[name][k] = rank
         #: The last sample of each phase flown, and positions (F, N, 3) there.
         self.last = [self.samples[k].stop - 1 for k in self.flown]
         self.ends = result.position[self.last]
@@ -157,38 +92,45 @@ class Measurements:
         """Values (K, N), NaN for lost agents."""
         return values if self.whole else np.where(self.left, values, np.nan)
 
-    def beside(self, agent: int, obstacle: int) -> str:
-        """Names of an agent and an obstacle, both counted from 0."""
-        return _beside(self.mission.obstacles, agent, obstacle)
-
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
-    def extreme(
-        self, values: Floats, who: Callable[..., str], sense: Callable[..., Any] = lambda x: x
-    ) -> Extreme | None:
-        """The finite one of ``values`` (K, ...) whose ``sense`` is greatest."""
-        rank = np.ascontiguousarray(sense(values))
-        return self.worst_sample(Quantity(values, who, rank, _START), slice(0, len(values)))
+    def owner(self, q: Quantity, who: int, other: int = -1) -> str:
+        """Name of the owner of a value: an agent, two agents, an edge, or an agent and an obstacle (from 0)."""
+        match q.who:
+            case "pair":
+                return agent_names(sorted((who, other)))
+            case "edge":
+                return f"edge {who + 1}-{other + 1}"
+            case "obstacle":
+                return f"agent {who + 1}, {self.mission.obstacles[other].name}"
+        return f"agent {who + 1}" if q.who == "agent" else ""
+
+    # -- at samples -----------------------------------------------------------------------------------
+
+    def sampled(self, name: str) -> Samples:
+        """Values of a quantity at samples."""
+        if name not in self._sampled:
+            self._sampled[name] = Samples(QUANTITIES[name], *_SAMPLED[name](self))
+        return self._sampled[name]
 
     def worst_sample(
-        self, quantity: Quantity, samples: slice, *, alone: bool = False
+        self, samples: Samples, part: slice = slice(None), *, alone: bool = False
     ) -> Extreme | None:
-        """The worst value of a quantity among some samples; None if none is finite.
-
-        ``alone``: nothing is known between them.
-        """
-        rank, values, result = quantity.rank[samples], quantity.values, self.result
+        """The worst of some values; None if none is finite. ``alone``: nothing is known between them."""
+        rank, values, result = samples.rank[part], samples.values, self.result
         if not rank.size:
             return None
         k, place = divmod(int(rank.argmax()), rank.shape[1])
         if rank.item(k, place) == -math.inf:
             return None
-        k += samples.start
+        k += part.start or 0
         at = (k,) if values.ndim == 1 else (k, place)
-        phase = result.phases[result.phase.item(k)].name
-        return Extreme(values.item(at), result.time.item(k), quantity.who(*at), phase, alone)
+        phase, who = result.phases[result.phase.item(k)].name, samples.owner(*at)
+        return Extreme(
+            values.item(at), result.time.item(k), self.owner(samples.quantity, *who), phase, alone
+        )
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -200,63 +142,47 @@ class Measurements:
 
     def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
-        if name in _OF_PAIRS:
-            who = agent_names(sorted((x.who, x.other)))
-        elif name in _OF_EDGES:
-            who = f"edge {x.who + 1}-{x.other + 1}"
-        elif name.startswith("clearance"):
-            who = self.beside(x.who, x.other)
-        else:
-            who = f"agent {x.who + 1}"
-        return Extreme(abs(x.value) if name == "constraint" else x.value, x.time, who, phase)
+        q = quantity(name)
+        size = abs(x.value) if name == "constraint" else q.scale * x.value
+        return Extreme(size, x.time, self.owner(q, x.who, x.other), phase)
 
-    def worst(
-        self, name: str, sampled: Extreme | None, sense: Callable[..., Any] = lambda x: x
-    ) -> Extreme | None:
-        """The worst value of a flight, at its samples or between them."""
+    def worst(self, name: str) -> Extreme | None:
+        """The worst value of a flight, at its samples or between them; None if it is not known."""
+        if name in self.measured:
+            every = [worst[name] for worst in self.worst_of if name in worst]
+            rank = QUANTITIES[name].rank
+            return max(every, key=lambda e: rank(e.value), default=None)
+        return self.among(name, self.sampled(name) if name in _SAMPLED else None)
+
+    def among(self, name: str, samples: Samples | None) -> Extreme | None:
+        """The worst value of a flight among some ``samples``, or between them."""
+        rank = quantity(name).rank
         every = {
-            k: sense(p.extremes[name].value)
+            k: rank(p.extremes[name].value)
             for k, p in enumerate(self.result.phases)
             if name in p.extremes
         }
         between = self.between(name, max(every, key=every.__getitem__)) if every else None
-        if sampled is None:
-            return between
-        if between is None:
-            return Extreme(sampled.value, sampled.when, sampled.who, sampled.phase, at_samples=True)
-        return between if sense(between.value) > sense(sampled.value) else sampled
-
-    def among(
-        self,
-        name: str,
-        values: Floats,
-        who: Callable[..., str] = agent,
-        sense: Callable[..., Any] = lambda x: x,
-    ) -> Extreme | None:
-        """The worst value of a flight, at its samples, ``values`` (K, ...), or between them."""
-        return self.worst(name, self.extreme(values, who, sense), sense)
+        sampled = None if samples is None else self.worst_sample(samples, alone=between is None)
+        if sampled is None or between is None:
+            return sampled or between
+        return between if rank(between.value) > rank(sampled.value) else sampled
 
     @cached_property
     def worst_of(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         found: list[dict[str, Extreme]] = [{} for _ in self.samples]
-        for name, quantity in self.measured.items():
-            sense, ranks, alone = SENSE[name], self.rank[name], name not in self.told
+        for name, samples in self.measured.items():
+            ranks, alone = self.rank[name], name not in self.told
             for k, phase in enumerate(self.result.phases):
                 x, rank, worst = phase.extremes.get(name), ranks[k], None
-                if x is not None and rank < sense(x.value):
+                if x is not None and rank < samples.quantity.rank(x.value):
                     worst = self.recorded(name, x, phase.name)
                 elif rank != -math.inf:
-                    worst = self.worst_sample(quantity, self.samples[k], alone=alone)
+                    worst = self.worst_sample(samples, self.samples[k], alone=alone)
                 if worst is not None:
                     found[k][name] = worst
         return found
-
-    def directed(self, name: str) -> Extreme | None:
-        """Greatest speed or acceleration in a direction, named as in `DIRECTIONS`; None if unknown."""
-        way, what = name.split("_")
-        x = getattr(self.result, what.replace("speed", "velocity"))
-        return self.among(name, self.of_left(SIZES[way](x)))
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -265,32 +191,9 @@ class Measurements:
         every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
         if every:
             return self.between(f"{name}_first", every[0])
-        quantity = self.measured[name]
-        k = int(np.argmax(quantity.values <= 0.0))
-        return self.worst_sample(quantity, slice(k, k + 1), alone=True) or e
-
-    def below(self) -> Extreme | None:
-        """Least height [m] between two agents, one below the other."""
-        least, pair = proximity.headroom(
-            self.result.position, self.mission.agents.radius, self.left
-        )
-        return self.among("separation_below", least, lambda k: agent_names(pair[k]), np.negative)
-
-    def outside(self, low: Floats, high: Floats) -> Extreme | None:
-        """Greatest distance [m] of an agent's centre outside a box with these corners; negative inside."""
-        r = self.result.position
-        beyond = self.of_left(np.maximum(low - r, r - high).max(axis=2))
-        return self.among("geofence", beyond)
-
-    def height(self, *, lowest: bool) -> Extreme | None:
-        """Least or greatest altitude [m] of an agent's centre."""
-        name, sense = ("lowest", np.negative) if lowest else ("highest", np.positive)
-        return self.among(name, self.of_left(self.result.position[..., 2]), agent, sense)
-
-    def nearest_to_limit(self) -> Extreme | None:
-        """Thrust minus limit [N] of the agent nearest to its own limit, or furthest beyond it."""
-        most = self.mission.fleet.thrust_limit
-        return self.among("thrust_margin", self.thrust - most)
+        samples = self.sampled(name)
+        k = int(np.argmax(samples.values <= 0.0))
+        return self.worst_sample(samples, slice(k, k + 1), alone=True) or e
 
     def clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
@@ -303,7 +206,7 @@ class Measurements:
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.told & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
-            return {"clearance_flight": self.worst_clearance()}
+            return {"clearance_flight": self.worst("clearance")}
         off, beside = clearance > PAD, np.zeros(clearance.shape, dtype=np.bool_)
         near = np.nonzero(clearance <= PAD)
         below = self.standing(*near)
@@ -318,11 +221,13 @@ class Measurements:
             "clearance_end": (k >= first) & (k > last) & ~beside,
         }
 
-        def who(k: int, i: int) -> str:
-            return self.beside(i, int(nearest[k, i]))
+        def owner(k: int, i: int) -> tuple[int, int]:
+            return i, int(nearest[k, i])
 
         return {
-            name: self.among(name, np.where(part, clearance, np.nan), who, np.negative)
+            name: self.among(
+                name, Samples(quantity(name), np.where(part, clearance, np.nan), owner)
+            )
             for name, part in parts.items()
         }
 
@@ -330,27 +235,6 @@ class Measurements:
         """On which obstacles (B, M) agents i (M,) stand, or may stand if they stay, at samples k (M,)."""
         r, things = self.result.position[k, i], self.mission.obstacles
         return proximity.below(r, self.mission.fleet.radius[i], things, self.result.time[k], PAD)
-
-    def worst_clearance(self) -> Extreme | None:
-        """Least clearance to an obstacle [m] of all vehicles, standing ones included."""
-        q = self.measured["clearance"]
-        sampled = self.worst_sample(q, slice(0, len(q.values)))
-        return self.worst("clearance", sampled, SENSE["clearance"])
-
-    def fallen_on(self) -> Extreme | None:
-        """Least clearance [m] between a lost agent and one still flying; None if no agent is lost."""
-        r, radius = self.result.position, self.mission.fleet.radius
-        least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
-        for i in np.flatnonzero(~self.left[-1]):
-            separation = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
-            separation = np.where(self.left & ~self.left[:, [i]], separation, np.inf)
-            j = separation.argmin(axis=1)
-            separation = np.where(self.left[:, i], np.nan, separation[np.arange(len(r)), j])
-            closer = np.fmin(separation, least) != least
-            closer &= np.isfinite(separation)
-            least[closer] = separation[closer]
-            who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
-        return self.among("lost", least, lambda k: agent_names(who[k]), np.negative)
 
     def contradictions(self) -> Iterator[tuple[str, float]]:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
@@ -404,7 +288,7 @@ class Measurements:
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
-                if rank > SENSE[name](x.value) + slack or not (
+                if rank > quantity(name).rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
                     sampled = self.worst_sample(self.measured[name], samples)
@@ -639,3 +523,97 @@ def _greatest(values: Floats) -> list[float | None]:
         most if math.isfinite(most) else max(filter(math.isfinite, row.tolist()), default=None)
         for most, row in zip(sizes.max(axis=1).tolist(), sizes, strict=True)
     ]
+
+
+# -- values at samples -------------------------------------------------------------------------------
+
+
+def _motion(m: Measurements, q: Quantity) -> tuple[Floats, ...]:
+    """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
+    x = (m.result.velocity, m.result.acceleration, m.result.slot_jerk)[q.order - 1]
+    if x is None:
+        return (np.full(m.left.shape, np.nan),)
+    return (m.of_left(SIZES[q.way](x) if q.way else length(x)),)
+
+
+def _separation(m: Measurements) -> tuple[Floats, Owner]:
+    pair = m.close.pair
+    return m.close.separation, lambda k: pair[k].tolist()
+
+
+def _below(m: Measurements) -> tuple[Floats, Owner]:
+    """Least height (K,) [m] between two agents, one below the other."""
+    least, pair = proximity.headroom(m.result.position, m.mission.agents.radius, m.left)
+    return least, lambda k: pair[k]
+
+
+def _clearance(m: Measurements) -> tuple[Floats, Owner]:
+    close = m.close
+    return close.clearance, lambda k: (close.agent.item(k), close.obstacle.item(k))
+
+
+def _fallen(m: Measurements) -> tuple[Floats, Owner]:
+    """Least distance (K,) [m] between a lost agent and one still flying; NaN if no agent is lost."""
+    r, radius = m.result.position, m.mission.fleet.radius
+    least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
+    for i in np.flatnonzero(~m.left[-1]):
+        separation = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
+        separation = np.where(m.left & ~m.left[:, [i]], separation, np.inf)
+        j = separation.argmin(axis=1)
+        separation = np.where(m.left[:, i], np.nan, separation[np.arange(len(r)), j])
+        closer = np.fmin(separation, least) != least
+        closer &= np.isfinite(separation)
+        least[closer] = separation[closer]
+        who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
+    return least, lambda k: who[k]
+
+
+def _outside(m: Measurements) -> tuple[Floats, ...]:
+    """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
+    r, fence = m.result.position, m.mission.limits.geofence
+    if fence is None:
+        return (np.full(m.left.shape, np.nan),)
+    return (m.of_left(np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
+
+
+def _altitude(m: Measurements) -> tuple[Floats, ...]:
+    return (m.of_left(m.result.position[..., 2]),)
+
+
+def _tilt(m: Measurements) -> tuple[Floats, ...]:
+    """Tilt (K, N) [deg] of each vehicle; of points, of the thrust that the slots they track need."""
+    q, wanted = m.result.vehicle_attitude, m.result.slot_acceleration
+    if q is not None:
+        up = att.dcm_from_quaternion(q)[..., 2, 2]
+    elif wanted is not None:
+        force = wanted + np.array([0.0, 0.0, m.mission.gravity])
+        up = force[..., 2] / np.maximum(length(force), 1e-300)
+    else:
+        up = np.full(m.left.shape, np.nan)
+    return (m.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
+
+
+def _edges(m: Measurements, values: Floats) -> tuple[Floats, Owner]:
+    edges = m.result.edges
+    return values, lambda _k, e: edges[e].tolist()
+
+
+#: Values of quantities at samples, with their owners where these are no single agents.
+_SAMPLED: dict[str, Callable[[Measurements], tuple[Any, ...]]] = {
+    **{q.name: partial(_motion, q=q) for q in MOTIONS},
+    "separation": _separation,
+    "separation_below": _below,
+    "clearance": _clearance,
+    "lost": _fallen,
+    "geofence": _outside,
+    "lowest": _altitude,
+    "highest": _altitude,
+    "thrust": lambda m: (m.thrust,),
+    "thrust_margin": lambda m: (m.thrust - m.mission.fleet.thrust_limit,),
+    "tilt": _tilt,
+    "tracking_error": lambda m: (m.off_slot,),
+    "constraint": lambda m: _edges(m, np.abs(m.result.constraint)),
+    "tension": lambda m: _edges(m, -m.result.multiplier),
+    "constraint_force": lambda m: (m.of_left(length(m.result.constraint_force)),),
+    "singular_value": lambda m: (m.result.singular_value, lambda _k: (0,)),
+}

@@ -54,11 +54,11 @@ def _of_others(measured: Measurements) -> Iterator[str]:
         yield f"times count from {zero:.9g} s, the first of the file"
     if any(thing.solid.moves for thing in measured.mission.obstacles):
         yield f"obstacles that move are where they are at the times of the file, from {result.time[0]:.6g} s on"
-    radius, e = measured.mission.fleet.radius, measured.worst("separation", None, lambda x: -x)
+    radius, e = measured.mission.fleet.radius, measured.worst("separation")
     if e is not None and np.ptp(radius) == 0.0:
         far = value(e.value + 2.0 * float(radius[0]), "m")
         yield f"the least distance centre to centre is {far}, {e.who} at {e.when:.2f} s"
-    fast, wide = measured.worst("speed", None), float(np.abs(result.position).max())
+    fast, wide = measured.worst("speed"), float(np.abs(result.position).max())
     if wide > _WIDE or (fast is not None and fast.value > _FAST):
         told = "" if fast is None else f"speeds reach {fast.value:,.0f} m/s and "
         yield (
@@ -118,7 +118,7 @@ def _dips(measured: Measurements) -> Iterator[str]:
         o.kind in ("ground", "heights") for o in mission.obstacles
     ):
         return
-    e = measured.height(lowest=True)
+    e = measured.worst("lowest")
     if e is not None and e.value < -DIP:
         z = measured.of_left(measured.result.position[..., 2])
         low = np.flatnonzero((z < -DIP).any(axis=0))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from rigidfleet._common.facts import Fact, value
+from rigidfleet._common.quantities import Quantity
 
 #: Share of a limit, or of a unit if this is more, by which rounding may exceed it.
 SLACK = 1e-9
@@ -21,20 +20,6 @@ FLIPPED = 90.0
 
 #: Depth below z = 0 from which an agent is noted if the mission has no ground [m].
 DIP = 0.01
-
-
-#: Functions that are greater the worse a value of the quantity is.
-SENSE: dict[str, Callable[..., Any]] = {
-    "constraint": abs,
-    "separation": lambda x: -x,
-    "clearance": lambda x: -x,
-    "thrust": abs,
-    "speed": abs,
-    "acceleration": abs,
-    "constraint_force": abs,
-    "tension": abs,
-    "singular_value": lambda x: -x,
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,33 +139,31 @@ class PhaseVerdict:
 
 
 def bounded(
-    check: str,
+    q: Quantity,
     e: Extreme | None,
-    unit: str,
     limit: float | None,
     words: str = "",
     *,
     passed: bool | None = None,
-    at_least: bool = False,
     first: Extreme | None = None,
 ) -> CheckResult:
     """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
     if e is None:
-        words = words or f"the flight has no {check.replace('_', ' ')} to judge"
+        words = words or q.nothing or f"the flight has no {q.called} to judge"
         return CheckResult(
-            check, True, words, None, limit, unit, at_least, judged=limit is not None
+            q.name, True, words, None, limit, q.unit, q.at_least, judged=limit is not None
         )
     if not words:
-        name = check.replace("_", " ").replace("value", "value of J")
-        who = f", {e.who}," if e.who else ""
-        bound = "" if limit is None else f" (limit {limit:g} {unit})"
-        extreme = "smallest" if check == "singular_value" else "greatest"
-        words = f"{extreme} {name} {value(e.value, unit)}{who} at {e.when:.2f} s{bound}"
+        bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
+        words = q.words or f"greatest {q.called} {{worst}}, {{who}}, at {{when:.2f}} s{bound}"
+        worst = value(e.value, q.unit)
+        words = words.format(worst=worst, who=e.who, when=e.when, limit=limit)
     if e.at_samples:
         words += ", at samples"
-    if passed is None:
-        passed = limit is None or e.value <= limit + SLACK * max(1.0, abs(limit))
+    if passed is None and limit is not None:
+        greatest = limit + SLACK * max(1.0, abs(limit))
+        passed = e.value >= limit - SLACK and e.value > 0 if q.at_least else e.value <= greatest
     return CheckResult(
-        check, passed, words, e.value, limit, unit, at_least, e.when, e.who, e.phase, limit is not None,
-        e.at_samples, first,
+        q.name, passed is not False, words, e.value, limit, q.unit, q.at_least, e.when, e.who, e.phase,
+        limit is not None, e.at_samples, first,
     )  # fmt: skip

@@ -9,11 +9,11 @@ from typing import Any
 
 from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table, worst_values
 from rigidfleet._common.plain import plain
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet._common.text import all_hold
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.outcome import (
     FLIPPED,
-    SENSE,
     CheckResult,
     Extreme,
     PhaseVerdict,
@@ -77,13 +77,15 @@ class Verdict(Shown):
     @property
     def worst(self) -> dict[str, Extreme]:
         """Extremes of the whole flight, named as in `PhaseVerdict.worst`."""
-        found: dict[str, tuple[float, Extreme]] = {}
+        by_name: dict[str, list[Extreme]] = {}
         for phase in self.phases:
             for name, e in phase.worst.items():
-                rank = SENSE[name](e.value)
-                if name not in found or rank > found[name][0]:
-                    found[name] = rank, e
-        return {name: found[name][1] for name in SENSE if name in found}
+                by_name.setdefault(name, []).append(e)
+        return {
+            name: max(by_name[name], key=lambda e: q.rank(e.value))
+            for name, q in QUANTITIES.items()
+            if name in by_name
+        }
 
     @property
     def summary(self) -> str:

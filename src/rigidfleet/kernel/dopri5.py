@@ -8,12 +8,21 @@ from rigidfleet.kernel.compiler.jit import compiled, inlined
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.records import (
+    ACCEPTED,
     ATOL,
     COLLAPSED,
+    EVALUATIONS,
     FINISHED,
+    FIRST_ROW,
+    LAST_ERROR,
     LEAST_ERROR,
+    NEXT_STEP,
     PAUSED,
+    REJECTED,
+    SAMPLES,
     STATE,
+    TIME,
+    TRAILED,
     TRIAL,
 )
 from rigidfleet.kernel.vectors import filled, in_vectors, rough_inverse, total_or_worst
@@ -121,7 +130,7 @@ def keep_step(t, h, p, w, state):
 
     The terms are those of Hairer's form, y + x (rise + (1 - x) (bend + x (rest + (1 - x) twist))).
     """
-    K, row = state.K, (state.count[5] + state.count[4]) % state.trail.clock.shape[0]
+    K, row = state.K, (state.count[FIRST_ROW] + state.count[TRAILED]) % state.trail.clock.shape[0]
     points = state.trail.points[row]
     state.trail.clock[row, 0], state.trail.clock[row, 1] = t, h
     for q in range(points.shape[1]):
@@ -136,28 +145,28 @@ def keep_step(t, h, p, w, state):
         points[3, q] = y + 0.75 * rise + 0.25 * (bend + rest)
         points[4, q] = K[TRIAL, q]
     read_gauge(p, w, state.trail.gauge[row])
-    state.count[4] += 1
+    state.count[TRAILED] += 1
 
 
 @inlined
 def keep_samples(t, h, t_new, times, samples, p, state):
     """Write the states at the times in (t, t_new] by the step's continuous extension, from t [s] on, of length h."""
     K, count = state.K, state.count
-    if count[3] < times.shape[0] and times[count[3]] <= t_new:
+    if count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
         for q in range(samples.shape[1]):  # into K[1], which has weight zero in the sums
             d = _D[0] * K[0, q]
             for s in range(1, 7):
                 d += _D[s] * K[s, q]
             K[1, q] = h * d
-    while count[3] < times.shape[0] and times[count[3]] <= t_new:
-        x = (times[count[3]] - t) / h
+    while count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
+        x = (times[count[SAMPLES]] - t) / h
         for q in range(samples.shape[1]):
             rise = K[TRIAL, q] - K[STATE, q]
             bend = h * K[0, q] - rise
             rest = rise - h * K[6, q] - bend
             inner = bend + x * (rest + (1.0 - x) * K[1, q])
-            samples[count[3], q] = K[STATE, q] + x * (rise + (1.0 - x) * inner)
-        count[3] += 1
+            samples[count[SAMPLES], q] = K[STATE, q] + x * (rise + (1.0 - x) * inner)
+        count[SAMPLES] += 1
 
 
 @compiled
@@ -170,7 +179,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     t_end : time of the end, met exactly [s]
     fresh : True at a start or after a switch, when the derivative at y is not known yet
     times, samples : increasing times (K,) [s] and the array (K, n) for the dense output; the next
-        index to write is ``state.count[3]``
+        index to write is ``state.count[SAMPLES]``
     max_steps : number of steps after which to pause
 
     Returns FINISHED, PAUSED (the trail may be full), or COLLAPSED if the step size collapsed (singular
@@ -182,7 +191,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     for q in range(n):
         y[q] = state.y[q]
     k = in_vectors(K)
-    t, h, last = clock[0], clock[1], clock[2]
+    t, h, last = clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR]
     if fresh:
         forget_stages(k, 0)
     first = 0 if fresh else 1
@@ -196,12 +205,12 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             closed_loop(t + _C[stage] * h, trial, K[stage], p, w)
             if stage == 0 and capacity > 0:
                 keep_start(p, w, state)
-            count[0] += 1
+            count[EVALUATIONS] += 1
             stage += 1
         squares = squared_errors(k, h, state.rtol, p)
         error = math.sqrt(total_or_worst(squares, y) / n)
         if not error <= 1.0:  # NaN too
-            count[2] += 1
+            count[REJECTED] += 1
             first = 1
             shrink = 0.1
             if error < math.inf:
@@ -222,7 +231,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
             k[0, q] = k[_STAGES - 1, q]
         t = t_new
         first = 1
-        count[1] += 1
+        count[ACCEPTED] += 1
         # 0.9 error^-0.17 last^0.04, by logarithms: two powers would cost half an evaluation.
         error = math.log(max(error, 1e-8))
         h *= min(5.0, max(0.2, 0.9 * math.exp(0.04 * last - 0.17 * error)))
@@ -230,9 +239,9 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
         if t >= t_end:
             status = FINISHED
             break
-        if capacity > 0 and count[4] + _TRAIL_ROWS > capacity:
+        if capacity > 0 and count[TRAILED] + _TRAIL_ROWS > capacity:
             break
     for q in range(n):
         state.y[q] = y[q]
-    clock[0], clock[1], clock[2] = t, h, last
+    clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR] = t, h, last
     return status

@@ -21,7 +21,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 STATES = 17
 #: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors.
 FORCE, ATTITUDE, ROTORS = range(3)
-#: Columns of `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
+#: Places in `SampledState.clock`: the time, and that of the last evaluation of the law [s].
+TIME, LAW_TIME = range(2)
+#: Places in `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
 #: written, steps in the trail.
 STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
@@ -238,7 +240,7 @@ class SampledState(NamedTuple):
     """
 
     S: Floats  # (N, 17) true states
-    clock: Floats  # (2,) time, and time of the last evaluation of the law [s]
+    clock: Floats  # (2,) see `TIME`
     count: Ints  # (5,) see `STEPS`
     integral: Floats  # (1, m) of the constraints [m s]; (N, m) if linked
     frame: Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, the one before
@@ -439,7 +441,7 @@ def begin(
         none = np.zeros(0)
         trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
-        S=S.copy(), clock=np.array([given.start, given.start]), count=np.zeros(5, dtype=np.int64),
+        S=S.copy(), clock=np.array([given.start, given.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
         integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
@@ -458,7 +460,7 @@ def renewed(
     With ``integral`` (m,) of its constraints [m s] and its frame, a quaternion (4,). The old state shares arrays with
     the new one and must not be used further.
     """
-    state.clock[1], state.count[LAWS] = state.clock[0], 0
+    state.clock[LAW_TIME], state.count[LAWS] = state.clock[TIME], 0
     views, n = len(state.integral), len(state.S)
     return state._replace(
         integral=np.tile(np.asarray(integral, dtype=float), (views, 1)), frame=_frame(frame),

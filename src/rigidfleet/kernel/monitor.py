@@ -41,6 +41,7 @@ from rigidfleet.kernel.records import (
     CLEARANCE,
     CONSTRAINT,
     CONSTRAINT_FORCE,
+    FIRST_ROW,
     FLYING,
     FROM_KNOTS,
     GEOFENCE,
@@ -48,7 +49,8 @@ from rigidfleet.kernel.records import (
     HORIZONTAL_ACCELERATION,
     HORIZONTAL_SPEED,
     KNOTS,
-    LISTED,
+    LISTED_DISTANCES,
+    LISTED_FORCES,
     LOST,
     LOWEST,
     SEPARATION,
@@ -56,9 +58,11 @@ from rigidfleet.kernel.records import (
     SEPARATION_FLYING,
     SPEED,
     STANDING,
+    STAYED,
     TENSION,
     THRUST,
     THRUST_MARGIN,
+    TRAILED,
     VERTICAL_ACCELERATION,
     VERTICAL_SPEED,
 )
@@ -172,13 +176,16 @@ def in_world(points, i, moving, p, monitor, out):
 
 
 @compiled
-def bound_moves(points, p, monitor):
-    """Bounds [m] of the change of any distance over a step, in space and as seen from above, into ``monitor.moves``.
+def bound_moves(p, state, monitor):
+    """Bounds [m] of the change of any distance over the trail's first step, in space and as seen from above.
+
+    They are written into ``monitor.moves``.
 
     With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| is at most its
     greatest Bernstein coefficient. The rotation is the one that leaves the smallest u_i. As seen from above, tilting
     rotations change distances, too.
     """
+    points = state.trail.points[row_of(0, state)]
     n, left, mean = monitor.left.shape[0], monitor.left, monitor.knots
     count = 0
     for i in range(n):
@@ -438,9 +445,21 @@ def unremarkable(points, i, angle, p, monitor):
 
 
 @compiled
-def watch_distances(row, p, state, monitor):
-    """Monitor distances and speeds over one step of the trail."""
-    trail = state.trail
+def watch_distances(first, end, p, state, monitor):
+    """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``.
+
+    If steps are listed, they alone can hold worse ones.
+    """
+    listed = monitor.count[LISTED_DISTANCES]
+    for k in range(end - first if listed == ANY_STEP else listed):
+        watch_step(first + k if listed == ANY_STEP else monitor.listed[0, k], p, state, monitor)
+    monitor.count[LISTED_DISTANCES] = ANY_STEP
+
+
+@compiled
+def watch_step(step, p, state, monitor):
+    """Take the extremes of distances and speeds over one step of the trail."""
+    trail, row = state.trail, row_of(step, state)
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
     place(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
@@ -638,7 +657,7 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
 @compiled
 def row_of(step, state):
     """Row of the trail that holds one of the steps in it, which are numbered from 0."""
-    return (state.count[5] + step) % state.trail.clock.shape[0]
+    return (state.count[FIRST_ROW] + step) % state.trail.clock.shape[0]
 
 
 @compiled
@@ -658,12 +677,16 @@ def watch_middle(step, before, after, p, w, state, monitor):
 
 
 @compiled
-def watch_forces(p, w, state, monitor, steps, last):
-    """Monitor forces over the steps of a trail; with ``last``, no further step of the segment follows."""
-    trail, before, listed = state.trail, monitor.gauge[0], monitor.flags[LISTED + 1]
+def watch_forces(last, p, w, state, monitor):
+    """Take the extremes of forces over the steps of a trail; with ``last``, no further step of the segment follows.
+
+    Otherwise the last step stays in the trail: a peak at its end shows only once the next step is known.
+    """
+    trail, before, steps = state.trail, monitor.gauge[0], state.count[TRAILED]
+    listed, stayed = monitor.count[LISTED_FORCES], monitor.count[STAYED] == 1
     for k in range(steps if listed == ANY_STEP else listed):
         step = k if listed == ANY_STEP else monitor.listed[1, k]
-        new = step > 0 or monitor.flags[3] == 0
+        new = step > 0 or not stayed
         row = row_of(step, state)
         start, end = trail.clock[row, 0], end_of(step, state)
         after = trail.gauge[row]
@@ -681,45 +704,19 @@ def watch_forces(p, w, state, monitor, steps, last):
             look_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
             watch_middle(step, earlier, after, p, w, state, monitor)
-
-
-# -- entry point ------------------------------------------------------------------------------------
+    monitor.count[LISTED_FORCES] = ANY_STEP
+    if last or steps == 0:
+        monitor.count[STAYED], state.count[TRAILED] = 0, 0
+    else:
+        keep_last(steps, state, monitor)
 
 
 @compiled
-def watch(p, w, state, monitor):
-    """Take the extremes of the steps in a trail.
-
-    Distances are monitored for the steps from ``monitor.flags[0]`` to before ``flags[1]``. ``flags[2]`` chooses the
-    forces: none (0); all but the last step, which stays in the trail until its neighbour is known (1); or all steps,
-    because none follows (2). ``flags[3]`` is 1 if a step has stayed in the trail. With 3 for ``flags[2]``, nothing is
-    monitored: the first step's bounds are computed (`bound_moves`).
-
-    ``flags[LISTED]`` and the next one are the numbers of steps in ``monitor.listed`` that alone can hold worse
-    distances and forces, or `ANY_STEP`. Lists count once. That of forces has the first and the last step of the trail.
-    """
-    trail, flags = state.trail, monitor.flags
-    if flags[2] == 3:
-        bound_moves(trail.points[row_of(flags[0], state)], p, monitor)
-        return 0
-    if flags[LISTED] == ANY_STEP:
-        for step in range(flags[0], flags[1]):
-            watch_distances(row_of(step, state), p, state, monitor)
-    for k in range(flags[LISTED]):
-        watch_distances(row_of(monitor.listed[0, k], state), p, state, monitor)
-    flags[LISTED] = ANY_STEP
-    if flags[2] == 0:
-        return 0
-    steps, last = state.count[4], flags[2] == 2
-    watch_forces(p, w, state, monitor, steps, last)
-    flags[LISTED + 1] = ANY_STEP
-    if last or steps == 0:
-        flags[3], state.count[4] = 0, 0
-        return 0
+def keep_last(steps, state, monitor):
+    """Leave the last of the ``steps`` alone in the trail, and keep the forces at the end of the one before it."""
     if steps > 1:
-        before = trail.gauge[row_of(steps - 2, state)]
+        before = state.trail.gauge[row_of(steps - 2, state)]
         for c in range(before.shape[0]):
             monitor.gauge[0, c] = before[c]
-    state.count[5] = row_of(steps - 1, state)
-    flags[3], state.count[4] = 1, 1
-    return 0
+    state.count[FIRST_ROW] = row_of(steps - 1, state)
+    monitor.count[STAYED], state.count[TRAILED] = 1, 1

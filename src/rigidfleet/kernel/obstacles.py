@@ -251,14 +251,14 @@ def watch_landing(i, curve, t, s, monitor):
 
 
 @compiled
-def watch(points, clock, p, s, monitor):
-    """Take the clearances of a step: control points (5, n) of the states, start and length (2,) [s]."""
+def watch(points, t, h, p, s, monitor):
+    """Take the clearances of a step from t [s] of length h [s]: control points (5, n) of the states."""
     curve, parts = monitor.curves[0], 1
     if p.body_formulation:
         parts = int(min(max(1.0, math.ceil(angle_of(points, p) / _TURN)), 1e4))
-    h = clock[1] / parts
+    h /= parts
     for part in range(parts):
-        start = clock[0] + part * h
+        start = t + part * h
         if p.body_formulation:
             attitudes(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):

@@ -22,6 +22,11 @@ NO_ROWS, NO_FACTORS = np.zeros((0, 0)), np.zeros(0)
 
 #: Return values of an integration.
 FINISHED, PAUSED, COLLAPSED = range(3)
+#: Places in `IntegratorState.clock`: the time [s], the next step to try [s], the logarithm of the last error.
+TIME, NEXT_STEP, LAST_ERROR = range(3)
+#: Places in `IntegratorState.count`: evaluations, steps accepted and rejected, samples written, steps in the trail, and
+#: the row of the first of these.
+EVALUATIONS, ACCEPTED, REJECTED, SAMPLES, TRAILED, FIRST_ROW = range(6)
 #: Rows of `IntegratorState.K` after the seven stages.
 STATE, TRIAL, ATOL = 7, 8, 9
 #: Logarithm of the least value of the last error; also used if there is no last error.
@@ -34,8 +39,10 @@ LEAST_ERROR = math.log(1e-4)
     HORIZONTAL_ACCELERATION, VERTICAL_ACCELERATION,
 ) = range(21)  # fmt: skip
 QUANTITIES = VERTICAL_ACCELERATION + 1
-#: Place among a monitor's flags of the numbers of steps to search, and the number that stands for all of them.
-LISTED, ANY_STEP = 4, -1
+#: Places in `Monitor.count`: 1 if the first step of the trail has been searched, and stays as a neighbour of the next;
+#: steps listed in `Monitor.listed` that alone can hold worse distances, and worse forces, or `ANY_STEP`.
+STAYED, LISTED_DISTANCES, LISTED_FORCES = range(3)
+ANY_STEP = -1
 #: Approximate size of a trail in bytes; the integrator pauses when it is full.
 _TRAIL = 1 << 20
 #: Greatest number of points in a search for a greatest force.
@@ -100,8 +107,9 @@ class Monitor(NamedTuple):
     pairs: Pairs  # whose separation is monitored
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
-    flags: Ints  # (6,) see `monitor.watch`
-    # (2, S) steps of the trail to search, for distances and for forces, if they are known: `flags` has their numbers
+    count: Ints  # (3,) see `STAYED`
+    # (2, S) steps of the trail to search, for distances and for forces; lists count once. That of forces has the first
+    # and the last step of the trail.
     listed: Ints
     moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_moves`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
@@ -131,13 +139,12 @@ def monitor(
 ) -> Monitor:
     """A new monitor without values; pairs are listed only if ``given`` among the fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
-    count = QUANTITIES
     fields: dict[str, Any] = {
-        "worst": np.full(count, np.inf), "when": np.zeros(count), "sign": np.zeros(1),
-        "who": np.full((count, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
+        "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
+        "who": np.full((QUANTITIES, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
         "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
         "low": np.full((n, 3), np.inf), "pad": 0.0, "altitude": np.inf, "pairs": none, "struck": none, "columns": none,
-        "flags": np.array([0, 0, 0, 0, ANY_STEP, ANY_STEP]),
+        "count": np.array([0, ANY_STEP, ANY_STEP]),
         "listed": np.zeros((2, 0), dtype=np.int64), "moves": np.zeros(2),
         "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
@@ -153,12 +160,10 @@ def monitor(
 class IntegratorState(NamedTuple):
     """State of an integration, which can pause and continue."""
 
-    y: Floats  # (n,) state at `clock[0]`
+    y: Floats  # (n,) state at the time reached
     K: Floats  # (10, n padded to eights) stages, K[0] the derivative at y; y, trial, tolerance
-    clock: Vector  # t [s], next step h [s], logarithm of the last error
-    count: NDArray[
-        np.int64
-    ]  # (6,) evaluations, accepted, rejected, samples written, steps in the trail, row of the first of these
+    clock: Vector  # see `TIME`
+    count: NDArray[np.int64]  # (6,) see `EVALUATIONS`
     rtol: float
     trail: Trail
 
@@ -178,7 +183,7 @@ def integrator(
     in the ``trail``.
     """
     n = len(y)
-    count = np.empty(6, dtype=np.int64)
+    count = np.empty(FIRST_ROW + 1, dtype=np.int64)
     state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
     return restarted(state, y, t, rtol=rtol, atol=atol, step=step)
 

@@ -18,11 +18,13 @@ from rigidfleet.kernel.fleet import (
     ERROR,
     FORCE,
     HORIZONTAL,
+    LAW_TIME,
     LAWS,
     LOAD,
     SAMPLES,
     STEPS,
     TICKS,
+    TIME,
     TRAILED,
     UPRIGHT,
     VERTICAL,
@@ -234,7 +236,7 @@ def desire(k, t, p, w, flight, state, call):
         for q in range(4):
             state.frame[2, q] = state.frame[1, q]
         quaternion_rate(state.frame[0], w.cm[4], state.frame[1])
-    state.clock[1] = t
+    state.clock[LAW_TIME] = t
     state.count[LAWS] += 1
     finite = abs(state.force.sum()) < math.inf
     if finite and call.guard != 0:
@@ -249,7 +251,7 @@ def advance_frame(t, p, state):
     The frame turns with the true motion. The method of Adams and Bashforth is of second order.
     """
     if p.has_frame and state.count[LAWS] > 0:
-        dt, first = t - state.clock[1], state.count[LAWS] == 1
+        dt, first = t - state.clock[LAW_TIME], state.count[LAWS] == 1
         for q in range(4):
             before = state.frame[1, q] if first else state.frame[2, q]
             state.frame[0, q] += dt * (1.5 * state.frame[1, q] - 0.5 * before)
@@ -343,7 +345,9 @@ def write_samples(t, h, p, flight, state, call):
         for k in range(state.integral.shape[1]):
             call.integral[c, k] = state.integral[0, k]
         for q in range(4):
-            call.frame[c, q] = state.frame[0, q] + (t + x - state.clock[1]) * state.frame[1, q]
+            call.frame[c, q] = (
+                state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]
+            )
         normalise(call.frame[c])
         count[SAMPLES] = c + 1
 
@@ -435,7 +439,7 @@ def fly_ticks(p, w, flight, state, call):
         measure(count[TICKS], flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
-        t, step = clock[0], count[STEPS]
+        t, step = clock[TIME], count[STEPS]
         if t >= call.t_end - _SAME * flight.h:
             return FINISHED
         if room > 0 and count[TRAILED] >= room:
@@ -454,7 +458,7 @@ def fly_ticks(p, w, flight, state, call):
         write_samples(t, h, p, flight, state, call)
         if not advance_fleet(t, h, p, flight, state):
             return COLLAPSED
-        clock[0] = end
+        clock[TIME] = end
         if whole:
             count[STEPS] = step + 1
     return PAUSED

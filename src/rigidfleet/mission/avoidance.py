@@ -1,17 +1,17 @@
-"""Avoidance in flight: what vehicles can always brake with, what is guaranteed of whom, and checks of [avoidance]."""
+"""Avoidance in flight: what vehicles can always brake with, what is guaranteed of whom, and rules of [avoidance]."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.mission.disturbances import intensity
-from rigidfleet.mission.findings import FindingCollector
+from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Avoidance, Disturbances
-from rigidfleet.mission.vehicles import NOT_SAMPLED, VehicleModel, flies_vehicles, resolve
+from rigidfleet.mission.vehicles import NOT_SAMPLED, VehicleModel, resolve
 from rigidfleet.typing import Floats
 
 _TABLE = "avoidance"
@@ -129,42 +129,40 @@ def unproved(
     return ""
 
 
-def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
-    """Find the errors in [avoidance]."""
-    given = parts.get(_TABLE)
-    if given is None:
+def rules(m: Draft) -> Breaches:
+    """[avoidance] acts, knows what it needs to know, and leaves vehicles something to brake with."""
+    a, d = m.avoidance, m.disturbances
+    if a is None:
         return
-    if not flies_vehicles(collector):
-        collector.add((_TABLE,), *NOT_SAMPLED, None)
+    if not m.flies_vehicles:
+        yield Breach(_TABLE, *NOT_SAMPLED, None)
         return
-    if not (given.guard or given.barrier or given.reference == "flow"):
+    if not (a.guard or a.barrier or a.reference == "flow"):
         problem = "has neither guard nor barrier nor flow"
-        collector.add((_TABLE,), problem, "remove it, or set one of them")
-    if given.sensing_noise and given.sensing_range is None:
+        yield Breach(_TABLE, problem, "remove it, or set one of them")
+    if a.sensing_noise and a.sensing_range is None:
         remedy = "add the range within which obstacles that move are seen, or remove the noise"
-        collector.add((_TABLE, "sensing_noise"), "has no effect without sensing_range", remedy)
-    d: Disturbances | None = parts.get("disturbances")
+        yield Breach((_TABLE, "sensing_noise"), "has no effect without sensing_range", remedy)
     if d is not None and d.links is not None:
         problem = (
             "needs the states of all vehicles at once, which [disturbances.links] does not give"
         )
-        collector.add((_TABLE,), problem, "remove one of the two", None)
-    for k, thing in enumerate(parts.get("obstacles", ())):
+        yield Breach(_TABLE, problem, "remove one of the two", None)
+    for k, thing in enumerate(m.obstacles):
         if thing.kind == "heights":
             problem = "is no obstacle that [avoidance] knows: it needs convex ones"
-            collector.add(
-                ("obstacles", k), problem, "build it of boxes or hulls, or remove [avoidance]", None
-            )
-    if "agents" not in parts or collector.findings:
+            remedy = "build it of boxes or hulls, or remove [avoidance]"
+            yield Breach(("obstacles", k), problem, remedy, None)
+    if m.agents is None or m.findings:
         return
-    names, tables = parts["agents"].vehicle, parts["vehicles"]
-    models = [resolve(tables[name]) for name in names]
-    left = braking(models, parts.get("gravity", 9.81), d)
+    names = m.agents.vehicle
+    models = [resolve(m.vehicles[name]) for name in names]
+    left = braking(models, m.gravity, d)
     for name in dict.fromkeys(names):
         i, where = names.index(name), ("vehicles", name, "thrust_limit")
         if math.isinf(left[i]):
             problem = "is missing: without a limit there is no braking to reckon with"
-            collector.add(where, problem, "add the greatest thrust [N]")
+            yield Breach(where, problem, "add the greatest thrust [N]")
         elif left[i] <= 0.0:
             weight = models[i].thrust_limit - left[i] * models[i].mass
             problem = (
@@ -172,4 +170,4 @@ def check(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
                 f" {weight:.4g} N"
             )
             remedy = "raise the thrust, lower mass, wind or mass_error, or remove [avoidance]"
-            collector.add(where, problem, remedy, None)
+            yield Breach(where, problem, remedy, None)

@@ -1,6 +1,6 @@
 """Check a mission as a whole: first each table by itself, then conditions that involve several keys.
 
-A table is checked even if another one has errors, so that one run reports all errors. A check is skipped if it needs
+A table is checked even if another one has errors, so that one run reports all errors. A rule is skipped if it needs
 a key that has an error itself.
 """
 
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS
 from rigidfleet.errors import MissionError
 from rigidfleet.formation.graphs import count_within
 from rigidfleet.formation.shapes import SHAPES
@@ -20,35 +22,15 @@ from rigidfleet.mission import (
     bounds,
     disturbances,
     formations,
+    losses,
     obstacles,
     phases,
     vehicles,
 )
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import (
-    FindingCollector,
-    Keys,
-    Shared,
-    look_up,
-    model_of,
-    near_shape,
-)
-from rigidfleet.mission.obstacles import Box, Obstacle
-from rigidfleet.mission.schema import (
-    Agents,
-    Allocation,
-    Constraint,
-    Contents,
-    Disturbances,
-    Geofence,
-    Limits,
-    Lqr,
-    MissionHeader,
-    Regulator,
-    Start,
-    Tracking,
-    VehicleYaw,
-)
+from rigidfleet.mission.findings import Keys, Shared, look_up, model_of, near_shape
+from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
 #: Models of the single tables. Obstacles and phases are arrays of tables, whose kinds have models.
 _TABLES = {
@@ -56,6 +38,17 @@ _TABLES = {
     for key, field in Contents.model_fields.items()
     if (model := model_of(field.annotation)) is not None and key not in ("obstacles", "phases")
 }
+
+
+@cache
+def defaults() -> dict[str, Any]:
+    """What a mission has for tables that are not given: immutable, and the same for all missions."""
+    fields = Contents.model_fields.items()
+    return {
+        name: field.get_default(call_default_factory=True)
+        for name, field in fields
+        if not field.is_required()
+    }
 
 
 def check(data: Mapping[str, Any], origin: str, shared: Shared | None = None) -> dict[str, Any]:
@@ -68,114 +61,116 @@ def check(data: Mapping[str, Any], origin: str, shared: Shared | None = None) ->
     MissionError
         With a finding for each error.
     """
-    collector = FindingCollector(data, origin, shared)
-    _numbers(collector)
-    if collector.findings:  # the other checks would take long
-        raise MissionError(collector.findings)
-    parts = _tables(collector)
-    for judge in (_agents, _gains, _regulators, _tracking, _allocation, _limits, _yaw, _planned):
-        judge(collector, parts)
-    n = _count(data)
-    parts["obstacles"] = _obstacles(collector)
-    parts["formations"] = formations.check(collector, n)
-    if not collector.findings and n is not None:
-        _touching(collector, parts, n)
-    parts["phases"] = phases.check(collector, parts, n)
-    disturbances.check(collector, parts, n)
-    vehicles.check_flight(collector, parts)
-    if not collector.findings and n is not None and parts["agents"].fixed:
-        _fixed(collector, parts, n)
-    avoidance.check(collector, parts)
-    if collector.findings:
-        raise MissionError(collector.findings)
-    return parts
-
-
-def _numbers(collector: FindingCollector) -> None:
-    """Find counts beyond the bounds, before anything else is checked."""
-
-    def bounded(path: Keys, given: object, most: int, remedy: str) -> None:
-        if isinstance(given, list | dict) and len(given) > most:
-            collector.add(
-                path, f"has {len(given):,} entries; the maximum is {most:,}", remedy, None
-            )
-
-    for key, most, remedy in (
-        ("formations", bounds.FORMATIONS, "split them into several missions"),
-        ("phases", bounds.PHASES, "split them into several missions"),
-        ("obstacles", bounds.OBSTACLES, "merge those that touch, and remove those out of reach"),
+    m = Draft(data, origin, shared, defaults())
+    m.n = _count(data)
+    m.keep((), _sizes(m))
+    if m.findings:  # the other checks would take long
+        raise MissionError(m.findings)
+    _tables(m)
+    for path, rules in (
+        (("agents",), _agents),
+        (("constraint",), _gains),
+        (("lqr",), _regulators),
+        (("tracking",), _tracking),
+        (("allocation",), _allocation),
+        (("limits",), _limits),
+        (("yaw",), _yaw),
+        ((), _obstacles),
+        (("formations",), formations.rules),
+        ((), _touching),
+        ((), phases.rules),
+        (("disturbances",), disturbances.rules),
+        ((), losses.rules),
+        (("disturbances",), disturbances.sizes),
+        ((), vehicles.flight_rules),
+        (("agents", "fixed"), _fixed),
+        ((), avoidance.rules),
     ):
-        bounded((key,), collector.data.get(key), most, remedy)
-    agents = collector.data.get("agents")
-    for key, given in agents.items() if isinstance(agents, dict) else ():
-        bounded(("agents", key), given, bounds.AGENTS, "use fewer agents")
-    n, forms = _count(collector.data) or 0, collector.data.get("formations")
+        m.keep(path, rules(m))
+    if m.findings:
+        raise MissionError(m.findings)
+    return m.parts
+
+
+def _sizes(m: Draft) -> Breaches:
+    """Counts beyond the bounds, before anything else is checked."""
+    agents, forms = m.data.get("agents"), m.data.get("formations")
+    lists: list[tuple[Keys, int, str]] = [
+        (("formations",), bounds.FORMATIONS, "split them into several missions"),
+        (("phases",), bounds.PHASES, "split them into several missions"),
+        (("obstacles",), bounds.OBSTACLES, "merge those that touch, and remove those out of reach"),
+    ]
+    if isinstance(agents, dict):
+        lists += [(("agents", key), bounds.AGENTS, "use fewer agents") for key in agents]
+    for path, most, remedy in lists:
+        entries = look_up(m.data, path)
+        if isinstance(entries, list | dict) and len(entries) > most:
+            problem = f"has {len(entries):,} entries; the maximum is {most:,}"
+            yield Breach(path, problem, remedy, None)
+    n = m.n or 0
     if isinstance(forms, dict) and len(forms) > 1 and n * len(forms) > bounds.SLOTS:
         slots = n * len(forms)
         problem = f"{len(forms)} formations of {n:,} agents have {slots:,} slots; the maximum is {bounds.SLOTS:,}"
-        collector.add(("formations",), problem, "use fewer formations, or fewer agents", None)
-    assignment = collector.data.get("assignment", "given")
-    if assignment != "each" and "assignment_downwash" in collector.data:
-        path, remedy = ("assignment_downwash",), "use assignment = 'each', or remove this key"
-        collector.add(path, f"has no effect with assignment {assignment!r}", remedy)
+        yield Breach("formations", problem, "use fewer formations, or fewer agents", None)
+    assignment = m.data.get("assignment", "given")
+    if assignment != "each" and "assignment_downwash" in m.data:
+        problem = f"has no effect with assignment {assignment!r}"
+        yield Breach("assignment_downwash", problem, "use assignment = 'each', or remove this key")
     if assignment != "given" and n > bounds.ALL_PAIRS:
         problem = f"compares all agents with all slots, which takes too long for {n:,} agents"
         remedy = f"for more than {bounds.ALL_PAIRS:,} agents use 'given' and order the agents as their slots"
-        collector.add(("assignment",), problem, remedy)
+        yield Breach("assignment", problem, remedy)
 
 
-def _tables(collector: FindingCollector) -> dict[str, Any]:
+def _tables(m: Draft) -> None:
     """Validate the keys of the header and the tables; invalid ones are left out."""
-    for key in collector.data:
+    for key in m.data:
         if key not in Contents.model_fields:
-            collector.unknown((key,), Contents.model_fields)
-    own = {key: value for key, value in collector.data.items() if key in MissionHeader.model_fields}
-    header = collector.validate(MissionHeader, own, ())
-    parts = {key: getattr(header, key) for key in MissionHeader.model_fields} if header else {}
-    models = vehicles.check(collector)
-    parts["vehicles"] = models
+            m.unknown((key,), Contents.model_fields)
+    own = {key: value for key, value in m.data.items() if key in MissionHeader.model_fields}
+    if header := m.validate(MissionHeader, own, ()):
+        m.parts |= {key: getattr(header, key) for key in MissionHeader.model_fields}
+    vehicles.check(m)
     for key, kind in _TABLES.items():
-        if key in collector.data:
-            data = collector.data[key]
+        if key in m.data:
+            data = m.data[key]
             if key == "agents":
-                data = vehicles.equipped(collector, _placed(collector, data), models)
-            part = None if data is None else collector.validate(kind, data, (key,))
-            parts |= {key: part} if part is not None else {}
-    if "agents" not in collector.data:
-        collector.add(("agents",), "is missing", "add a table [agents] with mass and position")
-    return parts
+                data = vehicles.equipped(m, _placed(m, data))
+            part = None if data is None else m.validate(kind, data, (key,))
+            m.parts |= {} if part is None else {key: part}
+    if "agents" not in m.data:
+        m.add(("agents",), "is missing", "add a table [agents] with mass and position")
 
 
-def _placed(collector: FindingCollector, agents: Any) -> Any:
+def _placed(m: Draft, agents: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
-    if isinstance(agents, dict) and isinstance(agents.get("position"), str):
+    path, position = ("agents", "position"), look_up(agents, ("position",))
+    if isinstance(position, str):
         remedy = "load the mission from its file, or give the positions as points"
-        collector.add(("agents", "position"), NOT_A_FILE, remedy)
+        m.add(path, NOT_A_FILE, remedy)
         return None
-    if not (isinstance(agents, dict) and isinstance(agents.get("position"), dict)):
+    if not isinstance(position, dict):
         return agents
-    path = ("agents", "position")
-    start = collector.validate(Start, agents["position"], path)
-    if start is None or not collector.right((), *path[:1]):
+    start = m.validate(Start, position, path)
+    if start is None or not m.right((), "agents"):
         return None
     try:
         points = start.points()
-        if not np.abs(points).max() <= bounds.LENGTH.most:
-            problem = f"agents start farther than {bounds.LENGTH.most:g} m from the origin"
-            collector.add(path, problem, "reduce size, count or centre")
-            return None
-        return agents | {"position": points.tolist()}
     except ValueError as error:
         known = "" if start.shape in SHAPES else near_shape(start.shape)
         remedy = known or "change the shape, its size, or the number of agents"
-        collector.add((*path, "shape"), str(error), remedy)
+        m.add((*path, "shape"), str(error), remedy)
         return None
+    if not np.abs(points).max() <= bounds.LENGTH.most:
+        problem = f"agents start farther than {bounds.LENGTH.most:g} m from the origin"
+        m.add(path, problem, "reduce size, count or centre")
+        return None
+    return agents | {"position": points.tolist()}
 
 
 def _count(data: Mapping[str, Any]) -> int | None:
     """Number of agents; None if it is not known."""
-    agents = data.get("agents")
-    position = agents.get("position") if isinstance(agents, dict) else None
+    position = look_up(data, ("agents", "position"))
     if isinstance(position, dict):
         count = position.get("count")
         whole = isinstance(count, int) and not isinstance(count, bool)
@@ -183,61 +178,61 @@ def _count(data: Mapping[str, Any]) -> int | None:
     return len(position) if isinstance(position, list) and position else None
 
 
-def _agents(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    agents: Agents | None = parts.get("agents")
+def _agents(m: Draft) -> Breaches:
+    """One entry per agent, apart from each other, with numbers that go together."""
+    agents: Agents | None = m.agents
     if agents is None:
         return
     n = len(agents.position)
     for key in ("mass", "velocity", "radius", "thrust_limit"):
-        given = len(getattr(agents, key))
-        if given != n and collector.right(("agents",), key):
-            problem = f"has {given} entries for {n} agents"
-            collector.add(("agents", key), problem, f"give one entry per agent, {n} in all")
+        entries = len(getattr(agents, key))
+        if entries != n:
+            problem = f"has {entries} entries for {n} agents"
+            yield Breach(key, problem, f"give one entry per agent, {n} in all")
     # Without a formation, nothing divides by distances: the start may be one that others flew.
-    shaped = look_up(collector.data, ("formations",))
+    shaped = look_up(m.data, ("formations",))
     for i, j in formations.coincident(agents.position) if shaped else ():
         problem = f"agents {i + 1} and {j + 1} start at the same point"
-        collector.add(("agents", "position", j), problem, "move them apart", agents.position[j])
+        yield Breach(("position", j), problem, "move them apart", agents.position[j])
     if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):
         problem = f"the largest mass is more than {bounds.MASS_RATIO:g} times the smallest"
-        collector.add(("agents", "mass"), problem, "give all masses in kg")
-    above = [limit for limit in agents.thrust_limit if bounds.FORCE.most < limit < math.inf]
-    if above:
-        problem = f"must be <= {bounds.FORCE.most:g}"
-        collector.add(("agents", "thrust_limit"), problem, "omit it for no limit")
-    written = collector.data["agents"].get("thrust_limit", 0.0)
+        yield Breach("mass", problem, "give all masses in kg")
+    if any(bounds.FORCE.most < limit < math.inf for limit in agents.thrust_limit):
+        yield Breach("thrust_limit", f"must be <= {bounds.FORCE.most:g}", "omit it for no limit")
+    written = m.data["agents"].get("thrust_limit", 0.0)
     if math.inf in (written if isinstance(written, list) else [written]):
-        collector.add(("agents", "thrust_limit"), "is not finite", "omit it for no limit")
+        yield Breach("thrust_limit", "is not finite", "omit it for no limit")
     unlimited = all(math.isinf(limit) for limit in agents.thrust_limit)
-    if agents.saturate and unlimited and collector.right(("agents",), "thrust_limit"):
-        collector.add(
-            ("agents", "saturate"), "no limit to saturate at is given", "give thrust_limit [N]"
-        )
+    if agents.saturate and unlimited and m.right(("agents",), "thrust_limit"):
+        yield Breach("saturate", "no limit to saturate at is given", "give thrust_limit [N]")
 
 
-def _fixed(collector: FindingCollector, parts: dict[str, Any], n: int) -> None:
-    """Check that fixed agents exist, and that nothing is to move them or to change what they hold."""
-    agents, where = parts["agents"], ("agents", "fixed")
-    phases.members(collector, agents.fixed, n, where)
-    solver = parts.get("constraint", Constraint()).solver
-    d = parts.get("disturbances", Disturbances())
+def _fixed(m: Draft) -> Breaches:
+    """Fixed agents exist, and nothing is to move them or to change what they hold."""
+    if m.findings or not m.agents.fixed:
+        return
+    agents, d = m.agents, m.disturbances
+    yield from phases.members(m, agents.fixed)
+    lost = d is not None and (d.lost or (d.links and d.links.lost))
+    n, solver = len(agents.position), m.constraint.solver
     for wrong, problem, remedy in (
         (any(any(agents.velocity[i - 1]) for i in agents.fixed if i <= n), "starts with a velocity", "remove it"),
-        (agents.vehicle or d.lost or (d.links and d.links.lost), "needs points that are not lost", "remove these keys"),
+        (agents.vehicle or lost, "needs points that are not lost", "remove these keys"),
         (solver not in ("pinv", "spectral"), "needs another solver", "use constraint.solver = 'pinv'"),
-        (any(p.control != "open" for p in parts["phases"]), "cannot track slots", "use control = 'open' in all phases"),
+        (any(p.control != "open" for p in m.phases), "cannot track slots", "use control = 'open' in all phases"),
     ):  # fmt: skip
         if wrong:
-            collector.add(where, problem, remedy)
+            yield Breach((), problem, remedy)
 
 
-def _touching(collector: FindingCollector, parts: dict[str, Any], n: int) -> None:
-    """Find radii so large that a list of all touching pairs would fill memory."""
-    if n * (n - 1) // 2 <= bounds.TOUCHING:
+def _touching(m: Draft) -> Breaches:
+    """No radii so large that a list of all touching pairs would fill memory."""
+    n = m.n
+    if m.findings or n is None or n * (n - 1) // 2 <= bounds.TOUCHING:
         return
-    agents: Agents = parts["agents"]
+    agents: Agents = m.agents
     places = {"at the start": np.array(agents.position)}
-    for name, form in parts["formations"].items():
+    for name, form in m.formations.items():
         slots = form.slot_array(n)
         places |= {} if slots is None else {f"in '{name}'": slots}
     for where, points in places.items():
@@ -247,29 +242,28 @@ def _touching(collector: FindingCollector, parts: dict[str, Any], n: int) -> Non
                 f"with the largest radius, {pairs:,} pairs of agents touch {where};"
                 f" the maximum is {bounds.TOUCHING:,}"
             )
-            collector.add(
-                ("agents", "radius"), problem, "reduce the radius or increase the distances"
-            )
+            remedy = "reduce the radius or increase the distances"
+            yield Breach(("agents", "radius"), problem, remedy)
             return
 
 
-def _gains(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    c: Constraint = parts.get("constraint", Constraint())
+def _gains(m: Draft) -> Breaches:
+    """The feedback of constraints is stable."""
+    c = m.constraint
     if c.stabilisation == "none":
         return
-    if not collector.right(("constraint",), "stabilisation", "alpha", "beta", "gamma"):
+    if not m.right(("constraint",), "stabilisation", "alpha", "beta", "gamma"):
         return
     poles = "three poles at -p: alpha = 1.5 p, beta = sqrt(3) p, gamma = p^3"
     for key, needed in (("alpha", "> 0"), ("beta", "> 0"), ("gamma", ">= 0")):
         gain = getattr(c, key)
         if gain < 0 or (gain == 0 and key != "gamma"):
             remedy = f"use a stable gain ({poles}) or stabilisation = 'none' for no feedback"
-            collector.add(("constraint", key), f"is unstable, must be {needed}", remedy, gain)
+            yield Breach(key, f"is unstable, must be {needed}", remedy, gain)
     bound = 2 * c.alpha * c.beta**2
-    if bound <= c.gamma and collector.right(("constraint",), "alpha", "beta"):
+    if bound <= c.gamma and m.right(("constraint",), "alpha", "beta"):
         problem = f"is unstable, must be below 2 alpha beta^2 = {bound:.6g}"
-        remedy = f"lower gamma or raise alpha or beta ({poles})"
-        collector.add(("constraint", "gamma"), problem, remedy, c.gamma)
+        yield Breach("gamma", problem, f"lower gamma or raise alpha or beta ({poles})", c.gamma)
 
 
 #: Weights below this value count as zero: the Riccati solution does not depend on them.
@@ -278,107 +272,103 @@ _NO_WEIGHT = 1e-12
 _FREE = 1e-15
 
 
-def _regulators(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    lqr: Lqr = parts.get("lqr", Lqr())
-    for weights, path in ((lqr, ("lqr",)), (lqr.attitude, ("lqr", "attitude"))):
-        _regulator(collector, weights, *path)
-        if collector.right(("lqr",), "R") and collector.right(path, "R"):
-            inherited = look_up(collector.data, (*path, "R")) is None
-            _unbounded(collector, weights, ("lqr",) if inherited else path, ".".join(path))
-
-
-def _regulator(collector: FindingCollector, weights: Regulator, *path: str) -> None:
+def _regulators(m: Draft) -> Breaches:
+    """The regulators of the virtual body act, with gains that are bounded."""
     keys = ("horizon", "Q", "S")
-    if not (collector.right(("lqr",), *keys) and collector.right(path, *keys)):
-        return
-    if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
-        problem = f"an infinite horizon needs a weight of at least {_NO_WEIGHT:g} on the error"
-        collector.add((*path, "Q"), problem, "for example, give Q = [1.0, 1.0]", weights.Q)
-    if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
-        problem = "with Q and S zero the regulator does nothing"
-        collector.add((*path, "S"), problem, "for example, give S = [1e3, 1e2]", weights.S)
+    for weights, below in ((m.lqr, ()), (m.lqr.attitude, ("attitude",))):
+        path = ("lqr", *below)
+        if m.right(("lqr",), *keys) and m.right(path, *keys):
+            if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
+                problem = (
+                    f"an infinite horizon needs a weight of at least {_NO_WEIGHT:g} on the error"
+                )
+                remedy = "for example, give Q = [1.0, 1.0]"
+                yield Breach((*below, "Q"), problem, remedy, weights.Q)
+            if weights.horizon == "finite" and not any(weights.Q) and not any(weights.S):
+                problem = "with Q and S zero the regulator does nothing"
+                remedy = "for example, give S = [1e3, 1e2]"
+                yield Breach((*below, "S"), problem, remedy, weights.S)
+        if m.right(("lqr",), "R") and m.right(path, "R"):
+            inherited = look_up(m.data, (*path, "R")) is None
+            yield from _unbounded(weights, () if inherited else below, ".".join(path))
 
 
-def _unbounded(
-    collector: FindingCollector, weights: Regulator | Tracking, where: Keys, name: str
-) -> None:
+def _unbounded(weights: Regulator | Tracking, below: Keys, name: str) -> Breaches:
+    """R is large enough beside the other weights."""
     most = max(*weights.Q, *getattr(weights, "S", ()))
     if _FREE * most > weights.R:
         problem = f"is less than {_FREE:g} times the largest weight of {name}, {most:g}: the gains would be unbounded"
-        remedy = f"raise R or lower the weights of {name}"
-        collector.add((*where, "R"), problem, remedy, weights.R)
+        yield Breach((*below, "R"), problem, f"raise R or lower the weights of {name}", weights.R)
 
 
-def _tracking(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    tracking: Tracking = parts.get("tracking", Tracking())
-    if not collector.right(("tracking",), "Q"):
-        return
-    if tracking.Q[0] < _NO_WEIGHT:
+def _tracking(m: Draft) -> Breaches:
+    """Tracking acts, with gains that are bounded."""
+    if m.tracking.Q[0] < _NO_WEIGHT:
         problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
-        collector.add(("tracking", "Q"), problem, "for example, give Q = [4.0, 4.0]")
-    if collector.right(("tracking",), "R"):
-        _unbounded(collector, tracking, ("tracking",), "tracking")
+        yield Breach("Q", problem, "for example, give Q = [4.0, 4.0]")
+    if m.right(("tracking",), "Q"):
+        yield from _unbounded(m.tracking, (), "tracking")
 
 
-def _allocation(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    allocation: Allocation = parts.get("allocation", Allocation())
-    if (
-        allocation.method == "rigid"
-        and "torque_split" in allocation.model_fields_set
-        and collector.right(("allocation",), "method")
-    ):
+def _allocation(m: Draft) -> Breaches:
+    """The torque is divided by the method that divides it."""
+    a = m.allocation
+    idle = a.method == "rigid" and "torque_split" in a.model_fields_set
+    if idle and m.right(("allocation",), "method"):
         problem = "has no effect with method 'rigid'"
-        collector.add(("allocation", "torque_split"), problem, "remove it or use method = 'pinv'")
+        yield Breach("torque_split", problem, "remove it or use method = 'pinv'")
 
 
-def _limits(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    limits = parts.get("limits", Limits())
+def _limits(m: Draft) -> Breaches:
+    """Limits have an effect."""
+    limits = m.limits
     if limits.geofence is not None:
-        _ordered(collector, limits.geofence, ("limits", "geofence"))
+        yield from _ordered(limits.geofence, ("geofence",))
     if limits.separation_altitude is not None and limits.separation is None:
-        where, problem = ("limits", "separation_altitude"), "has no effect without separation"
-        collector.add(where, problem, "remove it or add separation")
+        problem = "has no effect without separation"
+        yield Breach("separation_altitude", problem, "remove it or add separation")
+    jerks = (q.name for q in MOTIONS if q.order == 3)
+    for key in (
+        jerks if m.flies_vehicles else (*jerks, "tilt_deg")
+    ):  # of vehicles, the verdict judges the tilt
+        if getattr(limits, key) is not None and not m.smooth:
+            problem = "has no effect: only the plan of a smooth mission keeps it"
+            yield Breach(key, problem, "remove it or add smoothness = 'jerk' at the top")
 
 
-def _yaw(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    yaw: VehicleYaw | None = parts.get("yaw")
-    if yaw is None or not collector.right(("yaw",), "kind", "yaw_deg", "point"):
+def _yaw(m: Draft) -> Breaches:
+    """The yaw of vehicles has what its kind needs, and no more."""
+    yaw = m.yaw
+    if not m.right(("yaw",), "kind", "yaw_deg", "point"):
         return
     if yaw.kind == "towards" and yaw.point is None:
-        collector.add(
-            ("yaw", "point"), "is missing", "add point: the point to look at, [x, y, z] [m]"
-        )
+        remedy = "add point: the point to look at, [x, y, z] [m]"
+        yield Breach("point", "is missing", remedy)
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
         if key in yaw.model_fields_set and yaw.kind != kind:
             problem = f"has no effect with kind '{yaw.kind}'"
-            collector.add(("yaw", key), problem, f"remove it or use kind = '{kind}'")
+            yield Breach(key, problem, f"remove it or use kind = '{kind}'")
 
 
-def _planned(collector: FindingCollector, parts: dict[str, Any]) -> None:
-    """Find limits of the plan in a mission whose plan keeps none."""
-    limits = parts.get("limits", Limits())
-    flown = vehicles.flies_vehicles(collector)  # the verdict judges their tilt
-    for key in ("jerk",) if flown else ("jerk", "tilt_deg"):
-        if getattr(limits, key) is not None and parts.get("smoothness") == "lqr":
-            problem = "has no effect: only the plan of a smooth mission keeps it"
-            collector.add(
-                ("limits", key), problem, "remove it or add smoothness = 'jerk' at the top"
-            )
-
-
-def _ordered(collector: FindingCollector, box: Box | Geofence, path: tuple[str | int, ...]) -> None:
+def _ordered(box: Any, below: Keys) -> Breaches:
+    """The lowest corner of a box is below the highest."""
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
         if low >= high:
             problem = f"min must be below max, but {axis} has {low:g} >= {high:g} m"
-            collector.add(path, problem, "swap them", None)
+            yield Breach(below, problem, "swap them", None)
 
 
-def _obstacles(collector: FindingCollector) -> tuple[Obstacle, ...]:
-    found = []
-    for k, data in enumerate(phases.tables(collector, "obstacles")):
-        kind = phases.kind(collector, data, ("obstacles", k), obstacles.KINDS)
-        obstacle = None if kind is None else obstacles.checked(collector, kind, data, k)
-        if isinstance(obstacle, Box):
-            _ordered(collector, obstacle, ("obstacles", k))
-        found += [obstacle] if obstacle is not None else []
-    return tuple(found)
+def _obstacles(m: Draft) -> Breaches:
+    """Each obstacle by itself."""
+    things = []
+    for k, data in enumerate(m.tables("obstacles")):
+        path = ("obstacles", k)
+        if (kind := m.kind(data, path, obstacles.KINDS)) is None:
+            continue
+        name = "ground" if kind is obstacles.Ground else f"{data['kind']} {k + 1}"
+        if (thing := m.validate(kind, data, path, {"name": name})) is not None:
+            m.keep(path, obstacles.rules(m, thing, path))
+            if isinstance(thing, obstacles.Box):
+                yield from _ordered(thing, path)
+            things.append(thing)
+    m.parts["obstacles"] = tuple(things)

@@ -27,7 +27,9 @@ _NONE: dict[str, Any] = {}
 #: Stands for any index of a list.
 _ANY = -1
 #: Values for required keys with errors, so that the rest of their table can still be checked.
-_STAND_IN: dict[str, Any] = {"mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": ""}
+_STAND_IN: dict[str, Any] = {
+    "mass": 1.0, "position": (0.0, 0.0, 0.0), "formation": "", "schema_version": 1, "name": "draft",
+}  # fmt: skip
 
 
 class Shared:
@@ -112,6 +114,27 @@ class FindingCollector:
     def right(self, path: Keys, *keys: str) -> bool:
         """Whether there is no finding so far at or below these keys of a table."""
         return not self._wrong or not any((*path, key) in self._wrong for key in keys)
+
+    def tables(self, key: str) -> Sequence[Any]:
+        """Return an array of tables; empty, with a finding, if it is something else."""
+        tables = self.data.get(key, [])
+        if isinstance(tables, list):
+            return tables
+        self.add((key,), "must be an array of tables", f"write [[{key}]] above each table")
+        return []
+
+    def kind(self, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
+        """Return the model for the `kind` of a table, or None with a finding."""
+        choice = f"use one of {', '.join(kinds)}"
+        if not isinstance(data, dict):
+            self.add(path, "must be a table", f"write [[{path[0]}]] above it")
+        elif "kind" not in data:
+            self.add((*path, "kind"), "is missing", choice)
+        elif not isinstance(data["kind"], str) or data["kind"] not in kinds:
+            self.add((*path, "kind"), "unknown kind", near(data["kind"], kinds) or choice)
+        else:
+            return kinds[data["kind"]]
+        return None
 
     def validate(
         self, kind: type[P], data: Any, path: Keys, defaults: Mapping[str, Any] = _NONE

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from itertools import combinations, islice
 
 import numpy as np
@@ -16,6 +16,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
+from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Formation
 
 #: Maximum number of contradictions among distances that are listed.
@@ -26,87 +27,9 @@ _DARK = "#000000"
 _MOST_CLIQUES = 5e6
 
 
-def check(collector: FindingCollector, n: int | None) -> dict[str, Formation]:
-    """Check the formations of `n` agents and return them by name, including those with findings."""
-    tables = collector.data.get("formations", {})
-    if not isinstance(tables, dict):
-        collector.add(
-            ("formations",), "must be a table", "write [formations.NAME] for each formation"
-        )
-        return {}
-    found = {}
-    for name, data in tables.items():
-        if isinstance(data, dict) and isinstance(data.get("slots"), str):
-            remedy = "load the mission from its file, or give the slots as points"
-            collector.add(("formations", name, "slots"), NOT_A_FILE, remedy)
-            continue
-        form = collector.validate(Formation, data, ("formations", name))
-        if form is not None:
-            if n is not None and (form.rest is not None or form.agents is not None):
-                form = _rested(collector, form, n, ("formations", name))
-            found[name] = form
-            _formation(collector, form, n, ("formations", name))
-    return found
-
-
-def _rested(collector: FindingCollector, form: Formation, n: int, path: Keys) -> Formation:
-    """A formation of fewer than n agents with slots for all: those that rest come last."""
-    slots = form.slots
-    if form.agents is not None:
-        if form.shape is None or form.rest is None:
-            without = "rest" if form.rest is None else "shape"
-            collector.add(
-                (*path, "agents"),
-                f"has no effect without {without}",
-                f"add {without}, or remove it",
-            )
-            return form
-        if form.agents > n:
-            collector.add((*path, "agents"), f"is more than the {n} agents", "give fewer")
-            return form
-        _shape(collector, form, form.shape, form.agents, path)
-        if not collector.right(path, "shape", "size"):
-            return form
-        made = form.slot_array(form.agents)
-        assert made is not None  # a shape has them
-        slots = tuple(map(tuple, made.tolist()))
-    if slots is None or form.distances is not None:
-        problem = "needs slots" if slots is None else "does not go with distances"
-        remedy = (
-            "give slots, or shape and agents; edges keep the lengths that they have in the slots"
-        )
-        collector.add((*path, "rest"), problem, remedy)
-        return form
-    waiting = n - len(slots)
-    if isinstance(form.rest, tuple):
-        if len(form.rest) != waiting:
-            problem = (
-                f"has {len(form.rest)} places for the {max(waiting, 0)} agents that have no slot"
-            )
-            collector.add((*path, "rest"), problem, "give a place to each, or 'sides'", None)
-            return form
-        places = form.rest
-    elif waiting < 1:
-        return form
-    elif len(slots) < 2:
-        collector.add(
-            (*path, "rest"), "needs two or more slots", "give the places as a list of points"
-        )
-        return form
-    else:
-        places = tuple(map(tuple, beside(slots, waiting).tolist()))
-    colour = form.colour
-    if colour is not None:
-        colour = ((colour,) * len(slots) if isinstance(colour, str) else colour) + (_DARK,) * len(
-            places
-        )
-    changed = {"slots": (*slots, *places), "shape": None, "size": None, "colour": colour}
-    return form.model_copy(update=changed)
-
-
-def sound(collector: FindingCollector, name: str) -> bool:
+def sound(m: FindingCollector, name: str) -> bool:
     """Whether a formation has no findings."""
-    return collector.right(("formations",), name)
+    return m.right(("formations",), name)
 
 
 #: Number of points whose distances are all compared one by one.
@@ -141,23 +64,40 @@ def most_edges(n: int) -> int:
     return max(bounds.EDGES, bounds.EDGES_EACH * n)
 
 
-def _formation(collector: FindingCollector, form: Formation, n: int | None, path: Keys) -> None:
-    right = collector.right(path, "shape", "size", "slots", "distances")
+def rules(m: Draft) -> Breaches:
+    """Each formation by itself; all are parts of the mission, including those with findings."""
+    m.parts["formations"] = {}
+    tables = m.data.get("formations", {})
+    if not isinstance(tables, dict):
+        yield Breach((), "must be a table", "write [formations.NAME] for each formation")
+        return
+    for name, data in tables.items():
+        if isinstance(data, dict) and isinstance(data.get("slots"), str):
+            remedy = "load the mission from its file, or give the slots as points"
+            yield Breach((name, "slots"), NOT_A_FILE, remedy)
+            continue
+        path = ("formations", name)
+        if (form := m.validate(Formation, data, path)) is not None:
+            m.formations[name] = form
+            m.keep(path, _formation(m, form, name))
+
+
+def _formation(m: Draft, form: Formation, name: str) -> Breaches:
+    """A formation has slots or distances for all agents, and nothing without effect."""
+    path, n = ("formations", name), m.n
+    if n is not None and (form.rest is not None or form.agents is not None):
+        m.formations[name] = form = yield from _rested(m, form, n, path)
+    right = m.right(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
-        collector.add(
-            (*path, "slots"), "a shape has its own slots", "give either shape and size or slots"
-        )
+        yield Breach("slots", "a shape has its own slots", "give either shape and size or slots")
     if right and form.shape is None and form.size is not None:
-        collector.add(
-            (*path, "size"), "there is no shape of this size", "give shape or remove size"
-        )
+        yield Breach("size", "there is no shape of this size", "give shape or remove size")
     if right and form.shape is form.slots is form.distances is None:
         problem = "has neither shape nor slots nor distances"
-        collector.add(
-            path, problem, f"give shape and size; shapes: {', '.join(shapes.SHAPES)}", None
-        )
+        remedy = f"give shape and size; shapes: {', '.join(shapes.SHAPES)}"
+        yield Breach((), problem, remedy, None)
     if form.shape is not None:
-        _shape(collector, form, form.shape, n, path)
+        yield from _shape(m, form, form.shape, n, path)
     if n is None:
         return
     edges = n * (n - 1) // 2 if form.edges == "complete" else len(form.edges)
@@ -166,84 +106,127 @@ def _formation(collector: FindingCollector, form: Formation, n: int | None, path
     if edges > most:
         problem = f"{n:,} agents have {edges:,} edges; the maximum is {most:,}"
         remedy = "use 'neighbours' or a list of pairs; a few more than 3 N - 6 edges hold a shape"
-        value = "complete" if form.edges == "complete" else None
-        collector.add((*path, "edges"), problem, remedy, value)
+        yield Breach("edges", problem, remedy, "complete" if form.edges == "complete" else None)
     if form.slots is not None:
         if len(form.slots) != n:
-            problem = f"has {len(form.slots)} slots for {n} agents"
             fewer = ", or rest = 'sides' for the others" if len(form.slots) < n else ""
             remedy = f"give one slot per agent, {n} in all{fewer}"
-            collector.add((*path, "slots"), problem, remedy, None)
+            yield Breach("slots", f"has {len(form.slots)} slots for {n} agents", remedy, None)
         for i, j in coincident(form.slots):
-            collector.add(
-                (*path, "slots", j), f"is the same point as slot {i + 1}", "move the slots apart"
-            )
+            yield Breach(("slots", j), f"is the same point as slot {i + 1}", "move the slots apart")
     if form.tolerance is not None and "tolerance_share" in form.model_fields_set:
         problem = "has no effect beside tolerance, which is in metres"
-        collector.add((*path, "tolerance_share"), problem, "remove one of them")
+        yield Breach("tolerance_share", problem, "remove one of them")
     if isinstance(form.colour, tuple) and len(form.colour) != n:
         problem = f"has {len(form.colour)} colours for {n} agents"
-        collector.add((*path, "colour"), problem, "give one colour, or one per slot", None)
-    if collector.right(path, "edges"):
-        _edges(collector, form, n, (*path, "edges"))
-    if form.distances is not None and collector.right(path, "edges", "distances"):
-        _distances(collector, form, form.distances, n, (*path, "distances"))
-    if (form.dimension or collector.data.get("dimension")) == 2 and sound(collector, str(path[1])):
+        yield Breach("colour", problem, "give one colour, or one per slot", None)
+    if m.right(path, "edges"):
+        yield from _edges(m, form, n, path)
+    if form.distances is not None and m.right(path, "edges", "distances"):
+        yield from _distances(form, form.distances, n)
+    if (form.dimension or m.data.get("dimension")) == 2 and sound(m, name):
         slots = form.slot_array(n)
         if slots is not None and distance_geometry.dimension(slots) > 2:
             problem = "the slots do not lie in a plane, but the dimension is 2"
-            collector.add((*path, "dimension"), problem, "use 3, or move the slots into a plane")
+            yield Breach("dimension", problem, "use 3, or move the slots into a plane")
 
 
-def _shape(
-    collector: FindingCollector, form: Formation, shape: str, n: int | None, path: Keys
-) -> None:
+def _rested(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
+    """A formation of fewer than n agents gets slots for all: those that rest come last."""
+    slots = form.slots
+    if form.agents is not None:
+        if form.shape is None or form.rest is None:
+            without = "rest" if form.rest is None else "shape"
+            remedy = f"add {without}, or remove it"
+            yield Breach("agents", f"has no effect without {without}", remedy)
+            return form
+        if form.agents > n:
+            yield Breach("agents", f"is more than the {n} agents", "give fewer")
+            return form
+        yield from _shape(m, form, form.shape, form.agents, path)
+        if not m.right(path, "shape", "size"):
+            return form
+        made = form.slot_array(form.agents)
+        assert made is not None  # a shape has them
+        slots = tuple(map(tuple, made.tolist()))
+    if slots is None or form.distances is not None:
+        problem = "needs slots" if slots is None else "does not go with distances"
+        remedy = (
+            "give slots, or shape and agents; edges keep the lengths that they have in the slots"
+        )
+        yield Breach("rest", problem, remedy)
+        return form
+    waiting = n - len(slots)
+    if isinstance(form.rest, tuple):
+        places = form.rest
+        if len(places) != waiting:
+            problem = f"has {len(places)} places for the {max(waiting, 0)} agents that have no slot"
+            yield Breach("rest", problem, "give a place to each, or 'sides'", None)
+            return form
+    elif waiting < 1:
+        return form
+    elif len(slots) < 2:
+        yield Breach("rest", "needs two or more slots", "give the places as a list of points")
+        return form
+    else:
+        places = tuple(map(tuple, beside(slots, waiting).tolist()))
+    colour = form.colour
+    if colour is not None:
+        lit = (colour,) * len(slots) if isinstance(colour, str) else colour
+        colour = lit + (_DARK,) * len(places)
+    changed = {"slots": (*slots, *places), "shape": None, "size": None, "colour": colour}
+    return form.model_copy(update=changed)
+
+
+def _shape(m: Draft, form: Formation, shape: str, n: int | None, path: Keys) -> Breaches:
+    """A shape has a name, a size, and suits the number of agents."""
     if shape not in shapes.SHAPES:
-        collector.add((*path, "shape"), "unknown shape", near_shape(shape))
+        yield Breach("shape", "unknown shape", near_shape(shape))
     elif form.size is None:
-        if collector.right(path, "size"):
-            collector.add((*path, "size"), "is missing", "add size, the edge length [m]")
+        if m.right(path, "size"):
+            yield Breach("size", "is missing", "add size, the edge length [m]")
     elif n is not None:
         try:
             slots = form.slot_array(n)
         except ValueError as error:
-            remedy = "change the shape, its size or the number of agents"
-            collector.add((*path, "shape"), str(error), remedy)
+            yield Breach("shape", str(error), "change the shape, its size or the number of agents")
             return
         assert slots is not None  # a shape has them
         far = float(np.abs(slots).max())
         if far > bounds.LENGTH.most:
             problem = f"the slots of {n:,} agents extend to {far:.3g} m; the maximum is {bounds.LENGTH.most:g} m"
-            collector.add((*path, "size"), problem, "reduce the size")
+            yield Breach("size", problem, "reduce the size")
 
 
-def _edges(collector: FindingCollector, form: Formation, n: int, path: Keys) -> None:
+def _edges(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
+    """Edges join different agents, each pair once."""
     if isinstance(form.edges, str):
-        _graph(collector, form, n, path)
+        yield from _graph(m, form, n, path)
         return
     seen: dict[tuple[int, ...], int] = {}
     for k, edge in enumerate(form.edges):
         first = seen.setdefault(tuple(sorted(edge)), k)
         if not all(1 <= agent <= n for agent in edge):
-            collector.add(
-                (*path, k), f"has an agent outside 1 to {n}", "correct it; agents count from 1"
-            )
+            problem = f"has an agent outside 1 to {n}"
+            yield Breach(("edges", k), problem, "correct it; agents count from 1")
         elif edge[0] == edge[1]:
-            collector.add((*path, k), "joins an agent to itself", "join two different agents")
+            yield Breach(("edges", k), "joins an agent to itself", "join two different agents")
         elif first != k:
-            collector.add((*path, k), f"repeats edge {first + 1}", "remove it and its distance")
+            yield Breach(("edges", k), f"repeats edge {first + 1}", "remove it and its distance")
 
 
-def _graph(collector: FindingCollector, form: Formation, n: int, path: Keys) -> None:
-    """Check a named graph. All except 'complete' are derived from the slots."""
-    above = path[:-1]
+def _graph(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
+    """A named graph can be derived from the slots; all except 'complete' are."""
     if form.edges != "neighbours" and "reach" in form.model_fields_set:
-        collector.add((*above, "reach"), f"has no effect with edges '{form.edges}'", "remove it")
-    if form.edges == "complete" or not collector.right(above, "shape", "size", "slots"):
+        yield Breach("reach", f"has no effect with edges '{form.edges}'", "remove it")
+    if form.edges == "complete":
         return
-    if form.distances is not None or form.shape is form.slots is None:
+    right = m.right(path, "shape", "size", "slots")
+    if form.distances is not None or (right and form.shape is form.slots is None):
         remedy = "list the pairs, or give shape and size and omit distances"
-        collector.add(path, "needs slots, and takes its distances from them", remedy)
+        yield Breach("edges", "needs slots, and takes its distances from them", remedy)
+        return
+    if not right:
         return
     slots = form.slot_array(n)
     assert slots is not None  # there are a shape or slots
@@ -251,48 +234,45 @@ def _graph(collector: FindingCollector, form: Formation, n: int, path: Keys) -> 
         many = graphs.count_neighbours(slots, form.reach)
         if many > most_edges(n):
             problem = f"joins {many:,} pairs of {n:,} agents; the maximum is {most_edges(n):,}"
-            collector.add(
-                (*above, "reach"), problem, "reduce it; 1.9 includes second neighbours", form.reach
-            )
+            remedy = "reduce it; 1.9 includes second neighbours"
+            yield Breach("reach", problem, remedy, form.reach)
         return
     try:
         graphs.spans_space(slots)
     except ValueError as error:
-        collector.add(path, str(error), "use 'neighbours' or give a list of pairs")
+        yield Breach("edges", str(error), "use 'neighbours' or give a list of pairs")
 
 
-def _distances(
-    collector: FindingCollector, form: Formation, lengths: Sequence[float], n: int, path: Keys
-) -> None:
+def _distances(form: Formation, lengths: Sequence[float], n: int) -> Breaches:
+    """There is a distance for each edge, and points with these distances exist."""
     edges = form.edge_array(n)
     if len(lengths) != len(edges):
         problem = f"has {len(lengths)} entries for {len(edges)} edges"
         order = "12, 13, ..., 23, ..." if form.edges == "complete" else "that of edges"
-        collector.add(path, problem, f"give one per edge, in the order {order}", None)
+        yield Breach("distances", problem, f"give one per edge, in the order {order}", None)
         return
     # The common neighbours of both ends of an edge are at most the neighbours of either end.
     degree = np.bincount(edges.ravel(), minlength=n)
     cliques = (degree[edges].min(axis=1, initial=n).astype(float) ** 2).sum()
-    found = distance_geometry.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
+    violations = distance_geometry.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
     between = "" if n < 10 else "-"
     names = [
         f"d{between.join(str(i + 1) for i in e)} = {d:g}"
         for e, d in zip(edges, lengths, strict=True)
     ]
-    for v in islice(found, _SHOWN):
-        given = ", ".join(names[k] for k in v.edges)
+    for v in islice(violations, _SHOWN):
+        sides = ", ".join(names[k] for k in v.edges)
+        problem = f"{agent_names(v.agents)} form no tetrahedron (Cayley-Menger < 0): {sides} m"
+        remedy = "change one of the six (a flat shape needs 7 digits: 5.656854) or give a shape"
         if len(v.agents) == 3:
-            problem = f"{agent_names(v.agents)} form no triangle: {given} m"
+            problem = f"{agent_names(v.agents)} form no triangle: {sides} m"
             remedy = f"shorten the longest by at least {v.excess:.4g} m or lengthen the others"
-        else:
-            problem = f"{agent_names(v.agents)} form no tetrahedron (Cayley-Menger < 0): {given} m"
-            remedy = "change one of the six (a flat shape needs 7 digits: 5.656854) or give a shape"
-        collector.add(path, problem, remedy, None)
-    if len(found) > _SHOWN:
-        problem = f"{len(found) - _SHOWN} more triangles or tetrahedra are impossible"
-        collector.add(path, problem, "correct the ones above first", None)
-    if not found:
+        yield Breach("distances", problem, remedy, None)
+    if len(violations) > _SHOWN:
+        problem = f"{len(violations) - _SHOWN} more triangles or tetrahedra are impossible"
+        yield Breach("distances", problem, "correct the ones above first", None)
+    if not violations:
         try:
             distance_geometry.slots_from_distances(n, edges, lengths)
         except ValueError as error:
-            collector.add(path, str(error), "change them or give shape and size", None)
+            yield Breach("distances", str(error), "change them or give shape and size", None)

@@ -131,6 +131,16 @@ class AnyPhase(Part):
         return False
 
     @property
+    def place(self) -> Vector | None:
+        """Centre of mass to rest at [m], of a phase that comes to rest; None for where it is."""
+        return None
+
+    @property
+    def points(self) -> tuple[Through, ...]:
+        """Points to pass on the way."""
+        return ()
+
+    @property
     def vertical(self) -> Vertical | None:
         """The phase if it leads vehicles straight up or down, else None."""
         return self if isinstance(self, Vertical) else None
@@ -149,6 +159,12 @@ class AnyPhase(Part):
     def automatic(self) -> list[str]:
         """Keys whose times follow from the limits (`rigidfleet.planning.timing`)."""
         return [key for key in TIMES if self.__dict__.get(key) == AUTO]
+
+    @property
+    def time_key(self) -> str:
+        """The key that sets the time of its motion."""
+        own = self.__dict__
+        return "blend" if "blend" in own else "duration" if own.get("travel") is None else "travel"
 
     @property
     def least_time(self) -> float:
@@ -216,6 +232,11 @@ class Shaping(AnyPhase):
     def meets(self) -> tuple[str, ...]:
         """Position and velocity, if a place is commanded."""
         return () if self.position is None else ("position", "velocity")
+
+    @property
+    def place(self) -> Vector | None:
+        """The position, if it is commanded."""
+        return self.position
 
     @property
     def aligned(self) -> bool:
@@ -340,6 +361,11 @@ class Fly(Steering):
     )
 
     @property
+    def points(self) -> tuple[Through, ...]:
+        """The points of `through`."""
+        return self.through
+
+    @property
     def meets(self) -> tuple[str, ...]:
         """Position and velocity (unless it is free), and the attitude if one is commanded."""
         velocity = () if self.velocity == "free" else ("velocity",)
@@ -435,6 +461,11 @@ class Vertical(Arriving):
         return self.stagger is None
 
     @property
+    def level(self) -> float | None:
+        """Height of all vehicles above the ground on arrival [m]; None to come down to it."""
+        return None
+
+    @property
     def each(self) -> bool:
         """Whether each vehicle has a way of its own, so that the shape may change."""
         return bool(self.agents) or self.stagger is not None
@@ -452,6 +483,11 @@ class Takeoff(Vertical):
     height: Length = Field(
         description="height of the vehicles' centres above the ground on arrival [m]"
     )
+
+    @property
+    def level(self) -> float | None:
+        """The height."""
+        return self.height
 
     @property
     def each(self) -> bool:

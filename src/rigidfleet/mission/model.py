@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Mapping
-from functools import cache, cached_property, wraps
+from functools import cached_property, wraps
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -23,11 +23,12 @@ from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import scaled, told_apart
-from rigidfleet.mission.check import check
+from rigidfleet.mission.check import check, defaults
 from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.files import digests
 from rigidfleet.mission.findings import Shared
 from rigidfleet.mission.kinds import Establish, Phase
+from rigidfleet.mission.obstacles import Ground, is_ground
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents
 from rigidfleet.mission.text import parse_toml, unread
@@ -78,17 +79,6 @@ def _once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
         return made if made is None or made.dtype.kind == "i" else made.copy()
 
     return wrapper
-
-
-@cache
-def _defaults() -> dict[str, Any]:
-    """What a mission has for tables that are not given: immutable, and the same for all missions."""
-    fields = Contents.model_fields.items()
-    return {
-        name: field.get_default(call_default_factory=True)
-        for name, field in fields
-        if not field.is_required()
-    }
 
 
 class Mission(Contents, Shown):
@@ -153,7 +143,7 @@ class Mission(Contents, Shown):
             parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
         n = len(parts["agents"].position)
         parts["formations"] = scaled(parts["formations"], parts["phases"], n)
-        mission = cls.model_construct(set(parts), **_defaults() | parts)
+        mission = cls.model_construct(set(parts), **defaults() | parts)
         mission._text, mission._origin = text, origin
         return mission
 
@@ -476,13 +466,13 @@ class Mission(Contents, Shown):
     @cached_property
     def ground(self) -> float:
         """Height of the highest `ground` [m]; minus infinity if there is none."""
-        return max((o.height for o in self.obstacles if o.kind == "ground"), default=-np.inf)
+        return max((o.height for o in self.obstacles if isinstance(o, Ground)), default=-np.inf)
 
     @cached_property
     def roofs(self) -> Solids:
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
-        things = (o for o in self.obstacles if o.kind in ("box", "heights") and not o.zone)
-        return joined([o.solid for o in things if not o.solid.moves])
+        things = (o for o in self.obstacles if is_ground(o) and not isinstance(o, Ground))
+        return joined([o.solid for o in things])
 
     def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.

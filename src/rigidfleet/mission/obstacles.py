@@ -15,6 +15,7 @@ from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import FILL, NOT_A_FILE, without_data
 from rigidfleet.mission.findings import FindingCollector, Keys
+from rigidfleet.mission.rules import Breach, Breaches
 from rigidfleet.mission.values import (
     Angle,
     Coordinate,
@@ -261,66 +262,67 @@ KINDS: dict[str, type[Part]] = {
 }  # fmt: skip
 
 
-def checked(collector: FindingCollector, kind: type[Part], data: Any, k: int) -> Obstacle | None:
-    """Obstacle number k (from 0) of a kind; None, with findings, if it is not valid."""
-    path: Keys = ("obstacles", k)
-    name = "ground" if kind is Ground else f"{data['kind']} {k + 1}"
-    found: Any = collector.validate(kind, data, path, {"name": name})
-    if isinstance(found, Heights):
-        _heights(collector, found, path)
-    elif isinstance(found, Moving):
-        _motion(collector, found, path)
-    if isinstance(found, Cylinder) and math.dist(*found.ends) < bounds.LENGTH.least:
-        problem = "has both ends at the same place"
-        collector.add((*path, "ends"), problem, "give the centres of its two ends")
-    if isinstance(found, Hull) and collector.right(path, "points", "waypoints", "times"):
+def is_ground(thing: Obstacle) -> bool:
+    """Whether an obstacle counts as ground: a ground, and terrain and boxes that are no zones and at rest."""
+    firm = isinstance(thing, Heights | Box) and not thing.zone and not len(thing.motion[1])
+    return firm or isinstance(thing, Ground)
+
+
+def rules(m: FindingCollector, thing: Any, path: Keys) -> Breaches:
+    """What an obstacle at a path needs besides its keys."""
+    if isinstance(thing, Heights):
+        yield from _heights(m, thing, path)
+    elif isinstance(thing, Moving):
+        yield from _motion(m, thing, path)
+    if isinstance(thing, Cylinder) and math.dist(*thing.ends) < bounds.LENGTH.least:
+        yield Breach("ends", "has both ends at the same place", "give the centres of its two ends")
+    if isinstance(thing, Hull) and m.right(path, "points", "waypoints", "times"):
         try:
-            found.solid  # noqa: B018
+            thing.solid  # noqa: B018
         except ValueError as error:
             remedy = "add points beside the plane, or use a thin box"
-            collector.add((*path, "points"), str(error), remedy, None)
-    return found
+            yield Breach("points", str(error), remedy, None)
 
 
-def _motion(collector: FindingCollector, thing: Moving, path: Keys) -> None:
+def _motion(m: FindingCollector, thing: Moving, path: Keys) -> Breaches:
+    """An obstacle appears before it vanishes, and has a time for each waypoint."""
     ways, times = thing.waypoints, thing.times
     if not thing.there[0] < thing.there[1]:
         problem = f"is not after {thing.there[0]:g} s, when the obstacle appears"
-        collector.add((*path, "vanishes"), problem, "let it vanish after it has appeared")
+        yield Breach("vanishes", problem, "let it vanish after it has appeared")
     elif thing.velocity is not None and ways is not None:
-        collector.add((*path, "velocity"), "has no effect with waypoints", "remove one of them")
+        yield Breach("velocity", "has no effect with waypoints", "remove one of them")
     elif ways is None or times is None:
         for one, other in ("waypoints", "times"), ("times", "waypoints"):
-            if getattr(thing, one) is not None and collector.right(path, other):
-                collector.add((*path, other), f"is missing: {one} need it", f"add {other}")
+            if getattr(thing, one) is not None and m.right(path, other):
+                yield Breach(other, f"is missing: {one} need it", f"add {other}")
     elif len(ways) != len(times) or len(ways) < 2:
         problem = f"has {len(times)} entries for {len(ways)} waypoints"
-        remedy = "give one time for each waypoint, two or more"
-        collector.add((*path, "times"), problem, remedy, None)
+        yield Breach("times", problem, "give one time for each waypoint, two or more", None)
     elif min(b - a for a, b in pairwise(times)) < bounds.TIME.least:
-        collector.add((*path, "times"), "must increase", "order the waypoints by time")
+        yield Breach("times", "must increase", "order the waypoints by time")
 
 
-def _heights(collector: FindingCollector, thing: Heights, path: Keys) -> None:
+def _heights(m: FindingCollector, thing: Heights, path: Keys) -> Breaches:
+    """A height map has heights, on a grid, above its base."""
     if thing.file is not None:
-        remedy = "load the mission from its file, or give heights"
-        collector.add((*path, "file"), NOT_A_FILE, remedy)
+        yield Breach("file", NOT_A_FILE, "load the mission from its file, or give heights")
         return
     if thing.heights is None:
-        if collector.right(path, "heights"):
-            collector.add((*path, "heights"), "is missing", "add heights, or a file with them")
+        if m.right(path, "heights"):
+            yield Breach("heights", "is missing", "add heights, or a file with them")
         return
     rows = {len(row) for row in thing.heights}
     count = len(thing.heights) * max(rows, default=0)
     if len(rows) > 1 or len(thing.heights) < 2 or min(rows) < 2:
         problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
         remedy = "give two rows or more, all of the same length, two or more"
-        collector.add((*path, "heights"), problem, remedy, None)
+        yield Breach("heights", problem, remedy, None)
     elif why := without_data(thing.heights):
-        collector.add((*path, "heights"), why, FILL, None)
+        yield Breach("heights", why, FILL, None)
     elif count > bounds.HEIGHTS:
         problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"
-        collector.add((*path, "heights"), problem, "use a coarser grid", None)
+        yield Breach("heights", problem, "use a coarser grid", None)
     elif thing.base is not None and thing.base > (lowest := min(map(min, thing.heights))):
         problem = f"lies above the lowest height, {lowest:g} m"
-        collector.add((*path, "base"), problem, "give a base at or below all heights")
+        yield Breach("base", problem, "give a base at or below all heights")

@@ -561,6 +561,12 @@ class Limits(Part):
         None,
         description="maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission",
     )
+    horizontal_jerk: Jerk | None = Field(
+        None, description="maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`"
+    )
+    vertical_jerk: Jerk | None = Field(
+        None, description="maximum jerk of the reference up and down [m/s^3]; kept like `jerk`"
+    )
     tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = Field(
         None,
         description="maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "

@@ -8,12 +8,12 @@ motors with a first-order lag, drag of the rotors and of the body.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from rigidfleet.mission.findings import FindingCollector, near
-from rigidfleet.mission.schema import Autopilot, Vehicle
+from rigidfleet.mission.findings import look_up, near
+from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.schema import Vehicle
 
 _GRAVITY = 9.81
 #: Least gravity in which quadrotors fly [m/s^2].
@@ -167,8 +167,8 @@ for _numbers in MODELS.values():
         f"{_CHOSEN}; PX4 allows as much by default (MPC_TILTMAX_AIR)",
     )
 
-#: Keys that only a point has.
-_OF_POINTS = ("thrust_limit", "drag")
+#: Keys that only a point has, and those of a quadrotor in their place.
+_OF_POINTS = {"thrust_limit": "thrust_coefficient", "drag": "rotor_drag"}
 
 
 def resolve(vehicle: Vehicle) -> VehicleModel:
@@ -186,111 +186,103 @@ def resolve(vehicle: Vehicle) -> VehicleModel:
     return replace(found, thrust_limit=limit)
 
 
-def check(collector: FindingCollector) -> dict[str, Vehicle]:
+def check(m: Draft) -> None:
     """Validate the tables [vehicles.NAME]; invalid ones are left out."""
-    tables = collector.data.get("vehicles", {})
+    m.parts["vehicles"] = {}
+    tables = m.data.get("vehicles", {})
     if not isinstance(tables, dict):
-        collector.add(("vehicles",), "is not a table", "write tables [vehicles.NAME]")
-        return {}
-    found = {}
+        m.add(("vehicles",), "is not a table", "write tables [vehicles.NAME]")
+        return
     for name, data in tables.items():
         path = ("vehicles", name)
         if not isinstance(data, dict):
-            collector.add(path, "is not a table", f"write a table [vehicles.{name}]")
-            continue
-        vehicle = collector.validate(Vehicle, data, path)
-        if vehicle is not None and _sound(collector, vehicle, path):
-            found[name] = vehicle
-    return found
+            m.add(path, "is not a table", f"write a table [vehicles.{name}]")
+        elif (vehicle := m.validate(Vehicle, data, path)) is not None:
+            before = len(m.findings)
+            m.keep(path, _model(vehicle))
+            if len(m.findings) == before:
+                m.vehicles[name] = vehicle
 
 
-def _sound(collector: FindingCollector, vehicle: Vehicle, path: tuple[str, ...]) -> bool:
-    """Whether the keys of a table suit its model, and its vehicle can hover."""
-    before = len(collector.findings)
+def _model(vehicle: Vehicle) -> Breaches:
+    """The keys of a table suit its model, and its vehicle can hover."""
     if vehicle.model == "point":
         for key in Vehicle.model_fields:
             if key not in ("model", "mass", *_OF_POINTS) and getattr(vehicle, key) is not None:
-                collector.add(
-                    (*path, key), "has no effect on a point", "remove it, or name a quadrotor"
-                )
+                problem = "has no effect on a point"
+                yield Breach(key, problem, "remove it, or name a quadrotor")
         if vehicle.mass is None:
-            collector.add(path, "a point needs a mass", "add mass [kg]")
-        return len(collector.findings) == before
-    for key, other in zip(_OF_POINTS, ("thrust_coefficient", "rotor_drag"), strict=True):
-        if getattr(vehicle, key) is not None:
-            remedy = f"remove it; a quadrotor has {other}"
-            collector.add((*path, key), "is for points alone", remedy)
-    if len(collector.findings) > before:
-        return False
-    found = resolve(vehicle)
-    low, high = found.rotor_speed
+            yield Breach((), "a point needs a mass", "add mass [kg]")
+        return
+    wrong = [key for key in _OF_POINTS if getattr(vehicle, key) is not None]
+    for key in wrong:
+        remedy = f"remove it; a quadrotor has {_OF_POINTS[key]}"
+        yield Breach(key, "is for points alone", remedy)
+    if wrong:
+        return
+    x = resolve(vehicle)
+    low, high = x.rotor_speed
     if low >= high:
-        collector.add(
-            (*path, "rotor_speed"), "the least speed is not below the greatest", "swap them"
-        )
-    elif found.thrust_limit <= found.mass * _GRAVITY:
+        yield Breach("rotor_speed", "the least speed is not below the greatest", "swap them")
+    elif x.thrust_limit <= x.mass * _GRAVITY:
         problem = (
-            f"cannot hover: its four rotors give {found.thrust_limit:.3g} N, its weight is "
-            f"{found.mass * _GRAVITY:.3g} N"
+            f"cannot hover: its four rotors give {x.thrust_limit:.3g} N, its weight is "
+            f"{x.mass * _GRAVITY:.3g} N"
         )
-        collector.add(
-            path, problem, "reduce mass, or raise thrust_coefficient or rotor_speed", None
-        )
-    elif low >= found.hover_speed:
-        problem = f"the least speed is above the speed in hover, {found.hover_speed:.4g} rad/s"
-        collector.add((*path, "rotor_speed"), problem, "reduce it", list(found.rotor_speed))
-    k_R, k_omega = found.attitude_gains
-    slowest = max(found.motor_time)
+        yield Breach((), problem, "reduce mass, or raise thrust_coefficient or rotor_speed", None)
+    elif low >= x.hover_speed:
+        problem = f"the least speed is above the speed in hover, {x.hover_speed:.4g} rad/s"
+        yield Breach("rotor_speed", problem, "reduce it", list(x.rotor_speed))
+    k_R, k_omega = x.attitude_gains
+    slowest = max(x.motor_time)
     # Routh's criterion of tau s^3 + s^2 + k_omega s + k_R.
     if k_omega <= slowest * k_R:
         problem = (
             f"is unstable with motors of {slowest:g} s: k_omega must exceed {slowest * k_R:.4g} /s"
         )
         remedy = "raise k_omega, lower k_R, or take quicker motors"
-        collector.add((*path, "attitude_gains"), problem, remedy, list(found.attitude_gains))
-    return len(collector.findings) == before
+        yield Breach("attitude_gains", problem, remedy, list(x.attitude_gains))
 
 
-def equipped(collector: FindingCollector, agents: Any, vehicles: Mapping[str, Vehicle]) -> Any:
+def equipped(m: Draft, agents: Any) -> Any:
     """The table [agents], with masses and thrust limits of its vehicles; None if they cannot be known."""
     if not isinstance(agents, dict) or "vehicle" not in agents:
-        if vehicles and isinstance(agents, dict):
-            names = " or ".join(f"'{name}'" for name in list(vehicles)[:3])
+        if m.vehicles and isinstance(agents, dict):
+            names = " or ".join(f"'{name}'" for name in list(m.vehicles)[:3])
             problem = "no agent flies any of the vehicles"
-            collector.add(("vehicles",), problem, f"add vehicle = {names} to [agents]", None)
+            m.add(("vehicles",), problem, f"add vehicle = {names} to [agents]", None)
         return agents
-    given, tables = agents["vehicle"], collector.data.get("vehicles", {})
+    written, tables = agents["vehicle"], m.data.get("vehicles", {})
     n = len(agents["position"]) if isinstance(agents.get("position"), list) else 0
-    names = [given] * n if isinstance(given, str) else given
+    names = [written] * n if isinstance(written, str) else written
     where = ("agents", "vehicle")
     if not (isinstance(names, list) and names and all(isinstance(name, str) for name in names)):
-        collector.add(where, "is not a name or a list of names", 'write vehicle = "NAME"')
+        m.add(where, "is not a name or a list of names", 'write vehicle = "NAME"')
         return None
     if len(names) != n:
-        collector.add(
-            where, f"has {len(names)} entries for {n} agents", f"give one name, or {n}", None
-        )
+        problem = f"has {len(names)} entries for {n} agents"
+        m.add(where, problem, f"give one name, or {n}", None)
         return None
     known = tables if isinstance(tables, dict) else {}
     for name in dict.fromkeys(names):
         if name not in known:
             remedy = near(name, known) or f"add a table [vehicles.{name}]"
-            collector.add(where, f"there is no vehicle '{name}'", remedy, name)
+            m.add(where, f"there is no vehicle '{name}'", remedy, name)
             return None
-    for name in dict.fromkeys(known):
+    for name in known:
         if name not in names:
-            collector.add(("vehicles", name), "no agent flies it", "remove it", None)
+            m.add(("vehicles", name), "no agent flies it", "remove it", None)
     for key, where_else in (("mass", "mass"), ("thrust_limit", "its rotors")):
         if key in agents:
             problem = f"is given twice: the vehicle has {where_else}"
             remedy = "remove it here; change the vehicle in [vehicles.NAME]"
-            collector.add(("agents", key), problem, remedy)
+            m.add(("agents", key), problem, remedy)
     if "saturate" in agents:
         problem = "has no effect: vehicles never give more than they can"
-        collector.add(("agents", "saturate"), problem, "remove it")
-    if not set(names) <= set(vehicles):
+        m.add(("agents", "saturate"), problem, "remove it")
+    if not set(names) <= set(m.vehicles):
         return None  # has errors of its own
-    models = {name: resolve(vehicles[name]) for name in set(names)}
+    models = {name: resolve(m.vehicles[name]) for name in set(names)}
     own = {
         "vehicle": names,
         "mass": [models[name].mass for name in names],
@@ -306,42 +298,34 @@ NOT_SAMPLED = (
 )
 
 
-def flies_vehicles(collector: FindingCollector) -> bool:
-    """Whether the agents of a mission are to fly vehicles."""
-    agents = collector.data.get("agents")
-    return isinstance(agents, dict) and "vehicle" in agents
-
-
-def check_flight(collector: FindingCollector, parts: Mapping[str, Any]) -> None:
-    """Find what vehicles cannot have beside them, and rates of the autopilot that do not go together."""
-    autopilot: Autopilot = parts.get("autopilot", Autopilot())
-    if not flies_vehicles(collector):
-        tracking = parts.get("tracking")
-        for key in ("integral", "drag_feedforward") if tracking is not None else ():
-            if getattr(tracking, key):
-                collector.add(("tracking", key), *NOT_SAMPLED)
-        if "autopilot" in collector.data:
+def flight_rules(m: Draft) -> Breaches:
+    """Vehicles have nothing beside them that they cannot have, and rates that go together."""
+    if not m.flies_vehicles:
+        for key in ("integral", "drag_feedforward"):
+            if getattr(m.tracking, key):
+                yield Breach(("tracking", key), *NOT_SAMPLED)
+        if "autopilot" in m.data:
             problem = "has no effect on point masses that give any force at once"
-            collector.add(("autopilot",), problem, "remove it, or give the agents a vehicle", None)
+            yield Breach("autopilot", problem, "remove it, or give the agents a vehicle", None)
         return
-    ratio = autopilot.rate / autopilot.formation_rate
+    rate = m.autopilot.rate
+    ratio = rate / m.autopilot.formation_rate
     if abs(ratio - round(ratio)) > 1e-9 or ratio < 1.0:
-        problem = f"is not a whole part of rate, {autopilot.rate:g} Hz"
-        low = autopilot.rate / max(1, math.ceil(ratio))
-        collector.add(("autopilot", "formation_rate"), problem, f"use {low:g} Hz, for example")
-    rotors = any(vehicle.model != "point" for vehicle in parts.get("vehicles", {}).values())
-    if rotors and parts.get("gravity", _GRAVITY) < _LEAST_GRAVITY:
+        remedy = f"use {rate / max(1, math.ceil(ratio)):g} Hz, for example"
+        problem = f"is not a whole part of rate, {rate:g} Hz"
+        yield Breach(("autopilot", "formation_rate"), problem, remedy)
+    rotors = any(vehicle.model != "point" for vehicle in m.vehicles.values())
+    if rotors and m.gravity < _LEAST_GRAVITY:
         problem = (
             f"must be >= {_LEAST_GRAVITY:g}: the attitude of a quadrotor follows from its thrust"
         )
-        collector.add(("gravity",), problem, "raise it, or fly points")
-    if parts.get("formulation") == "body":
+        yield Breach("gravity", problem, "raise it, or fly points")
+    if m.formulation == "body":
         problem = "formulation = 'body' is that of point masses"
-        collector.add(("formulation",), problem, "use formulation = 'inertial' with vehicles")
-    disturbances = collector.data.get("disturbances", {})
-    if isinstance(disturbances, dict) and "drag" in disturbances:
+        yield Breach("formulation", problem, "use formulation = 'inertial' with vehicles")
+    if look_up(m.data, ("disturbances", "drag"), None) is not None:
         problem = "is given twice: the vehicles have a drag of their own"
         remedy = (
             "remove it here; change rotor_drag and body_drag (of a point: drag) in [vehicles.NAME]"
         )
-        collector.add(("disturbances", "drag"), problem, remedy)
+        yield Breach(("disturbances", "drag"), problem, remedy)

@@ -74,8 +74,8 @@ def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Fl
 
 def pace(planned: PlannedPhase) -> Floats:
     """Bounds (K - 1, N) [m/s] of the speeds between the samples of a planned phase."""
-    leg, time = planned.leg, planned.time
-    return greatest_speeds(leg.reference, leg.motion, time[:-1], time[1:])
+    time = planned.time
+    return greatest_speeds(*planned.leg.paths, time[:-1], time[1:])
 
 
 class Closest(NamedTuple):
@@ -111,7 +111,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
     ``speed`` is the `pace` of the phase. Where the room between two samples might not do, the plan is evaluated in the
     middle, and so on.
     """
-    leg, solid = planned.leg, thing.solid
+    (reference, motion), solid = planned.leg.paths, thing.solid
     met: Obstacle | _Thing = thing
     time, position = planned.time, planned.position
     if np.isfinite(solid.there).any():
@@ -148,7 +148,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         done += len(rows) * len(columns)
         half = 0.5 * spans.length
         middle, who = spans.first + half, spans.who
-        r = slot_derivatives(of_agents(leg.reference, who), leg.motion, middle, 1)[:, 0]
+        r = slot_derivatives(of_agents(reference, who), motion, middle, 1)[:, 0]
         between, _ = proximity.obstacle_clearances(r, radius[who], [met], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
@@ -173,12 +173,12 @@ def _while_there(
     planned: PlannedPhase, since: float, until: float, speed: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Times (K,) of a phase from one time to another [s], positions (K, N, 3), and speeds (K - 1, N) between them."""
-    leg, time = planned.leg, planned.time
+    time = planned.time
     ends = np.array([max(since, time[0]), min(until, time[-1])])
     if ends[0] > ends[1]:
         return time[:0], planned.position[:0], speed[:0]
     within = (time > ends[0]) & (time < ends[1])
-    first, last = slot_derivatives(leg.reference, leg.motion, ends, 1)[:, :1]
+    first, last = slot_derivatives(*planned.leg.paths, ends, 1)[:, :1]
     at = np.concatenate([ends[:1], time[within], ends[1:]])
     span = piece_at(time, at[:-1])
     return at, np.concatenate([first, planned.position[within], last]), speed[span]

@@ -1,7 +1,7 @@
-"""Goal and trajectory of the virtual body for each kind of phase: all that planning knows about kinds.
+"""Where each kind of phase leads: goal and trajectory of the virtual body, and ways of the slots about it.
 
-A kind of phase that neither stays nor flies by the regulators of [lqr] has a function in `_COURSES`, and a class of
-trajectories in `rigidfleet.planning.body_trajectories`.
+This is all that planning knows about kinds. A kind of phase that does not stay has a function in `_COURSES`, and if it
+does not fly by the regulators of [lqr] either, a class of trajectories in `rigidfleet.planning.body_trajectories`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from rigidfleet.mission.kinds import (
     Orbit,
     Reshape,
     Steering,
-    Takeoff,
+    Turn,
     Vertical,
     seconds,
 )
@@ -53,12 +53,28 @@ _LED, _FADED = (0.1, 0.1, math.radians(5.0)), 1.0
 _LEVEL = 1e-9
 
 
+class Lift(NamedTuple):
+    """Ways of the slots (N, 3) about the CM, body axes [m], and the time they take [s]; if they are bent, how.
+
+    ``knots`` and ``ways`` are those of `Reference`; ``keeps`` says whether the phase's formation is reached by them.
+    """
+
+    dp: Floats
+    time: float
+    knots: Floats = NO_KNOTS
+    ways: Floats = NO_WAYS
+    keeps: bool = False
+
+
 class Course(NamedTuple):
-    """Goal and trajectory of the virtual body in a phase."""
+    """Goal and trajectory of the virtual body in a phase, and ways of its slots."""
 
     goal: Pose | None  # pose to reach; None if no frame is attached yet
     arrival: float  # time to reach it [s]
     trajectory: BodyTrajectory | None  # trajectory to it; None if there is none
+    lift: Lift | None = (
+        None  # what is added to the slots; None if they keep the shape, or blend to another
+    )
 
 
 def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:
@@ -71,21 +87,42 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     arrival = t_end if phase.settle is None else min(t_end, now.t + _REST_WITHIN)
     if now.goal is None:
         return Course(None, t_end, None)
-    r = now.goal.r if (place := getattr(phase, "position", None)) is None else np.array(place)
+    r = now.goal.r if phase.place is None else np.array(phase.place)
     goal = changed(now.goal, r=r, v=np.zeros(3), omega=np.zeros(3))
     return _led(mission, phase, now, goal, arrival, t_end)
 
 
-def _steer(mission: Mission, phase: Steering, now: PhaseState, t_end: float) -> Course:
-    """Go to a waypoint or an attitude, within ``travel`` or by the end."""
+def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
+    """Stay, or go to the phase's own place; slots may go on bent ways."""
+    rest = _stay(mission, phase, now, t_end)
+    if phase.control_points is None:
+        return rest
+    control, blend = np.array(phase.control_points), seconds(phase.blend)
+    knots, ways = Piecewise.b_spline(control, blend)
+    return rest._replace(lift=Lift(control[-1] - control[0], blend, now.t + knots, ways, keeps=True))  # fmt: skip
+
+
+def _fly(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
+    """Go to a waypoint, and perhaps an attitude."""
+    velocity = np.zeros(3) if phase.free else np.array(phase.velocity)
+    return _steer(mission, phase, now, t_end, np.array(phase.position), velocity)
+
+
+def _turn(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
+    """Turn to an attitude on the spot."""
+    assert now.goal is not None  # a steering phase has a goal
+    return _steer(mission, phase, now, t_end, now.goal.r, np.zeros(3))
+
+
+def _steer(
+    mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
+) -> Course:
+    """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
     assert now.goal is not None  # a steering phase has a goal
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
     T = now.goal.T if angles is None else _attitude(angles)
     named = now.goal.named or angles is not None
-    r, v = now.goal.r, np.zeros(3)
-    if isinstance(phase, Fly):
-        r, v = np.array(phase.position), v if phase.free else np.array(phase.velocity)
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
     return _led(mission, phase, now, goal, arrival, t_end)
 
@@ -122,38 +159,35 @@ def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Cou
 
 
 def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) -> Course:
-    """Go straight up or down by the mean of what the vehicles do, within ``travel`` or by the end."""
+    """Go straight up or down by the mean of what the vehicles do, within ``travel`` or by the end.
+
+    Where each vehicle has a way of its own, the slots follow the same septic from rest to rest: together, each goes
+    straight up or down by its own way, and one that stays, stays.
+    """
     assert now.pose is not None
     assert now.goal is not None
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
-    up, v = np.zeros(3), np.zeros(3)
+    up, v, lift = np.zeros(3), np.zeros(3), None
     if phase.each:
-        up[2] = mission.fleet.mass @ rises(mission, phase, now) / mission.fleet.mass.sum()
+        rise, masses = _rises(mission, phase, now), mission.fleet.mass
+        up[2] = masses @ rise / masses.sum()
+        if np.ptp(rise) >= _LEVEL:
+            travel = min(phase.travel or math.inf, t_end - now.t)
+            lift = Lift(np.outer(rise - up[2], now.goal.T[:, 2]), travel)
     else:
         up[2] = -max(0.0, height(mission, now))
         v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
     goal = changed(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
-    return Course(goal, arrival, SmoothTrajectory(now.pose, goal, now.t, arrival, ()))
+    return Course(goal, arrival, SmoothTrajectory(now.pose, goal, now.t, arrival, ()), lift)
 
 
 def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
-    """Follow the trajectories of the virtual body, or the mean of the vehicles' own."""
-    assert now.goal is not None
-    trajectory, _ = _followed(mission, phase, now, t_end)
-    arrival = float(min(t_end, trajectory.found.knots[-1]))
-    end = pose_at(trajectory.found, arrival)
-    named = now.goal.named and not phase.turns_away
-    return Course(changed(end, named=named), arrival, trajectory)
-
-
-def _followed(
-    mission: Mission, phase: Follow, now: PhaseState, t_end: float
-) -> tuple[GivenTrajectory, Lift | None]:
-    """The way of the virtual body, and of the slots about it if each vehicle has a way of its own.
+    """Follow the trajectory of the virtual body, or the mean of the vehicles' own, about which the slots then move.
 
     What the first point of a file differs from the place where the vehicles are fades over `_FADED`.
     """
     assert now.pose is not None
+    assert now.goal is not None
     assert now.slots is not None
     pose, slots = now.pose, now.slots
     way = phase.pieces
@@ -181,7 +215,10 @@ def _followed(
         end = own.at(own.time[-1:])[0]
         lift = Lift(end - slots, length, now.t + own.time, np.ascontiguousarray(own.pieces))
     cm = Piecewise(knots, body).start_from(begin, fade)
-    return GivenTrajectory(as_motion(now.t + cm.time, cm.pieces, T1)), lift
+    motion = as_motion(now.t + cm.time, cm.pieces, T1)
+    arrival = float(min(t_end, motion.knots[-1]))
+    goal = changed(pose_at(motion, arrival), named=now.goal.named and not phase.turns_away)
+    return Course(goal, arrival, GivenTrajectory(motion), lift)
 
 
 def _whole_turns(yaw: float, near: float) -> float:
@@ -189,13 +226,23 @@ def _whole_turns(yaw: float, near: float) -> float:
     return 2.0 * math.pi * round((near - yaw) / (2.0 * math.pi))
 
 
-def misled(mission: Mission, phase: Phase, now: PhaseState) -> str:
+def misled(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    if isinstance(phase, Reshape) and phase.control_points is not None:
-        first = np.array(phase.control_points[0])
-        far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
-        return "" if far < _LED[0] else "begins in other slots than the phase before has led to"
-    if not isinstance(phase, Follow) or now.pose is None or now.slots is None:
+    return _MISLED[phase.kind](phase, now) if phase.kind in _MISLED else ""
+
+
+def _misled_slots(phase: Reshape, now: PhaseState) -> str:
+    """What keeps a change of shape from following its bent ways, if it has any."""
+    if phase.control_points is None:
+        return ""
+    first = np.array(phase.control_points[0])
+    far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
+    return "" if far < _LED[0] else "begins in other slots than the phase before has led to"
+
+
+def _misled_vehicles(phase: Follow, now: PhaseState) -> str:
+    """What keeps the virtual body, or each vehicle, from following its trajectory."""
+    if now.pose is None or now.slots is None:
         return ""
     pose = now.pose
     knots, pieces = phase.pieces
@@ -226,53 +273,16 @@ def misled(mission: Mission, phase: Phase, now: PhaseState) -> str:
     return ""
 
 
-def lifted(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Lift | None:
-    """What a phase adds to the slots that leads vehicles each on a way of its own; None if it keeps the shape.
-
-    Bent ways are given by the phase. Where a phase leads vehicles straight up or down, the virtual body goes by the
-    mean (`_vertical`), from rest to rest on the same septic: together, each vehicle goes straight up or down by its own
-    way, and one that stays, stays.
-    """
-    if isinstance(phase, Follow):
-        return _followed(mission, phase, now, t_end)[1]
-    if isinstance(phase, Reshape) and phase.control_points is not None:
-        control = np.array(phase.control_points)
-        knots, ways = Piecewise.b_spline(control, seconds(phase.blend))
-        return Lift(control[-1] - control[0], seconds(phase.blend), now.t + knots, ways, keeps=True)
-    vertical = phase.vertical
-    if vertical is None or not vertical.each:
-        return None
-    assert now.goal is not None
-    up, masses = rises(mission, vertical, now), mission.fleet.mass
-    if np.ptp(up) < _LEVEL:
-        return None
-    travel = t_end - now.t if vertical.travel is None else min(vertical.travel, t_end - now.t)
-    return Lift(np.outer(up - masses @ up / masses.sum(), now.goal.T[:, 2]), travel)
-
-
-class Lift(NamedTuple):
-    """Ways of the slots (N, 3) about the CM, body axes [m], and the time they take [s]; if they are bent, how.
-
-    ``knots`` and ``ways`` are those of `Reference`; ``keeps`` says whether the phase's formation is reached by them.
-    """
-
-    dp: Floats
-    time: float
-    knots: Floats = NO_KNOTS
-    ways: Floats = NO_WAYS
-    keeps: bool = False
-
-
-def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
+def _rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
     assert now.goal is not None
     assert now.slots is not None
     n = mission.n_agents
     place, ground = now.goal.r[2] + now.slots @ now.goal.T[:, 2], _grounds(mission, now)
-    if isinstance(phase, Takeoff):
-        up = ground.max() + phase.height - place
-    else:
+    if phase.level is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
+    else:
+        up = ground.max() + phase.level - place
     goes = np.ones(n, dtype=np.bool_) if not phase.agents else np.zeros(n, dtype=np.bool_)
     goes[np.array(phase.agents, dtype=np.int64) - 1] = True
     return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
@@ -322,9 +332,8 @@ def _led(
         laws = regulators(mission, phase)
         leg = RegulatedTrajectory(laws, mission.tracking, now.pose, goal, now.t, arrival, t_end)
         return Course(goal, arrival, leg)
-    through = phase.through if isinstance(phase, Fly) else ()
     end = changed(goal, v=np.full(3, np.nan)) if phase.free else goal
-    way = SmoothTrajectory(now.pose, end, now.t, arrival, through)
+    way = SmoothTrajectory(now.pose, end, now.t, arrival, phase.points)
     if phase.free:
         goal = changed(goal, v=pose_at(way.motion(), arrival).v)
     return Course(goal, arrival, way)
@@ -336,13 +345,19 @@ def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:
     return laws.model_copy(update={"S": (laws.S[0], 0.0)}) if phase.free else laws
 
 
-#: Function of each kind of phase that moves the virtual body; in all others, it comes to rest at the previous goal.
+#: Function of each kind of phase that leads somewhere; in all others, the virtual body comes to rest.
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "brake": _brake,
-    "fly": _steer,
+    "fly": _fly,
     "follow": _follow,
     "land": _vertical,
     "orbit": _orbit,
+    "reshape": _reshape,
     "takeoff": _vertical,
-    "turn": _steer,
+    "turn": _turn,
+}
+#: Function of each kind of phase that may follow given ways, which says what keeps it from that.
+_MISLED: dict[str, Callable[[Any, PhaseState], str]] = {
+    "follow": _misled_vehicles,
+    "reshape": _misled_slots,
 }

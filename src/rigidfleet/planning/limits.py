@@ -9,10 +9,12 @@ tests compare them with dense samples.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
@@ -32,12 +34,11 @@ _BLOCK = 500_000
 
 
 class Limit(NamedTuple):
-    """A limit of each agent: its key, unit, value (N,), and the quantity (K, N) that it bounds."""
+    """A limit of each agent: what is limited, its greatest value (N,), and how it follows from slots, as (K, N)."""
 
-    name: str
-    unit: str
+    of: Quantity
     most: Floats
-    quantity: Callable[[Floats, Ints], Floats]
+    values: Callable[[Floats, Ints], Floats]
 
 
 class Reached(NamedTuple):
@@ -55,56 +56,43 @@ class Reached(NamedTuple):
 
 
 def limits_of(
-    mission: Mission, given: Limits | None = None, reserve: Floats | None = None
+    mission: Mission, limits: Limits | None = None, reserve: Floats | None = None
 ) -> list[Limit]:
-    """The limits that a mission sets to its references, or those ``given`` in place of `limits`.
+    """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
     With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.reserves`).
     """
-    given, n = given or mission.limits, mission.n_agents
+    limits, n = limits or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
 
     def more(order: int, x: Floats, who: Ints) -> Floats | float:
         if reserve is None or order + 1 >= x.shape[1]:
-            return 0.0  # no flight is judged by its jerk
+            return 0.0  # the jerk that counts is that of the slots
         return reserve[who] * np.linalg.norm(x[:, order + 1], axis=-1).max(axis=0)
 
-    def of(order: int, way: str = "") -> Callable[[Floats, Ints], Floats]:
-        return lambda x, who: SIZES[way](x[:, order]) + more(order, x, who)
+    def motion(q: Quantity, x: Floats, who: Ints) -> Floats:
+        return SIZES[q.way](x[:, q.order]) + more(q.order, x, who)
 
     def lifted(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
         air = 0.0 if reserve is None else air_force(mission, -x[:, 1], who) / mass[who, None]
         return x[:, 2] + up - air
 
-    def tilt(x: Floats, who: Ints) -> Floats:
+    def tilt(_: Quantity, x: Floats, who: Ints) -> Floats:
         f, off = lifted(x, who), more(2, x, who)
         return np.rad2deg(np.arctan2(SIZES["horizontal"](f) + off, f[..., 2] - off))
 
-    def thrust(x: Floats, who: Ints) -> Floats:
+    def thrust(_: Quantity, x: Floats, who: Ints) -> Floats:
         return mass[who] * (SIZES[""](lifted(x, who)) + more(2, x, who))
 
-    found = [
-        Limit(name, unit, np.full(n, most), quantity)
-        for name, unit, most, quantity in (
-            ("speed", "m/s", given.speed, of(1)),
-            ("acceleration", "m/s^2", given.acceleration, of(2)),
-            ("horizontal speed", "m/s", given.horizontal_speed, of(1, "horizontal")),
-            ("vertical speed", "m/s", given.vertical_speed, of(1, "vertical")),
-            (
-                "horizontal acceleration",
-                "m/s^2",
-                given.horizontal_acceleration,
-                of(2, "horizontal"),
-            ),
-            ("vertical acceleration", "m/s^2", given.vertical_acceleration, of(2, "vertical")),
-            ("jerk", "m/s^3", given.jerk, of(3)),
-            ("tilt", "deg", given.tilt_deg, tilt),
-        )
-        if most is not None
-    ]
-    limit = mission.fleet.thrust_limit
-    return [*found, Limit("thrust", "N", limit, thrust)] if np.isfinite(limit).any() else found
+    ways, found = {"tilt": tilt, "thrust": thrust}, []
+    for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
+        table, _, key = q.key.partition(".")
+        most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)
+        if most is not None and np.isfinite(most).any():
+            most = np.broadcast_to(np.asarray(most, dtype=float), n)
+            found.append(Limit(q, most, partial(ways.get(q.way, motion), q)))
+    return found
 
 
 def reached(
@@ -156,7 +144,7 @@ def _highest(
     fine: bool,
 ) -> Reached:
     """The greatest share of a limit, refined about the highest samples x (K, 4, N, 3) at times (K,)."""
-    shares = limit.quantity(x, who) / limit.most[who]
+    shares = limit.values(x, who) / limit.most[who]
     agents = shares.argmax(axis=1)
     top = shares[np.arange(len(time)), agents]
     k = int(top.argmax())
@@ -170,7 +158,7 @@ def _highest(
         for _ in range(_TIMES):
             near = np.linspace(low, high, _FINE)
             y = slot_derivatives(of_agents(reference, agent), motion, near, 4)
-            values = (limit.quantity(y, agent) / limit.most[agent])[:, 0]
+            values = (limit.values(y, agent) / limit.most[agent])[:, 0]
             j = int(values.argmax())
             best = max(best, (values[j], near[j], int(agent[0])))
             low, high = near[max(j - 1, 0)], near[min(j + 1, _FINE - 1)]

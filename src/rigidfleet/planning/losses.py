@@ -16,9 +16,9 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
 from rigidfleet.planning.courses import height
+from rigidfleet.planning.legs import depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import limits_of, reached
-from rigidfleet.planning.preview import Leg, leg, phase_spans
-from rigidfleet.planning.reference import PhaseState, changed, pose_at
+from rigidfleet.planning.reference import PhaseState
 
 #: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
 #: and acceleration of the descent, unless `limits` asks for less. A motion that is faster when it begins may go on so.
@@ -49,7 +49,7 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
     def then(make: Callable[[float], Phase], least: float = _SHORTEST) -> None:
         nonlocal now
         phases.append(make(_shortest(mission, now, make, least)))
-        now = changed(_planned(mission, phases[-1], now).after, blend=None)
+        now = leg_of(mission, phases[-1], now).after
 
     then(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
     if d.on_loss == "hold":
@@ -77,26 +77,6 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
     return phases
 
 
-def state_at(found: Leg, t: float, lost: np.ndarray | None) -> PhaseState:
-    """The planned state at a time [s] within a leg in which slots are tracked."""
-    before, reference = found.before, found.reference
-    pose = pose_at(found.motion, t)
-    blending = t < reference.t0 + reference.T_b
-    goal = found.after.goal
-    if found.phase.goal_moves and goal is not None:
-        goal = changed(pose, named=goal.named)
-    return changed(
-        before, t=t, pose=pose, goal=goal, slots=found.after.slots, formation=found.after.formation,
-        blend=reference if blending else None, lost=lost,
-    )  # fmt: skip
-
-
-def _planned(mission: Mission, phase: Phase, now: PhaseState) -> Leg:
-    found = leg(mission, phase, now)
-    assert found is not None  # slots are tracked
-    return found
-
-
 def _shortest(
     mission: Mission, now: PhaseState, make: Callable[[float], Phase], least: float
 ) -> float:
@@ -113,13 +93,14 @@ def _shortest(
         return np.array([x.share for x in reached(limits, reference, motion, now.t, end)])
 
     best, time = (math.inf, least), least
+    departure = depart(mission, make(time), now)
     allowed: np.ndarray | None = None
     for _ in range(_TRIES):
-        found = _planned(mission, make(time), now)
+        leg = leg_from(mission, make(time), departure)
         if allowed is None:
-            begun = shares(found.reference, found.motion, now.t + 1e-9 * max(1.0, now.t))
+            begun = shares(leg.reference, leg.motion, now.t + 1e-9 * max(1.0, now.t))
             allowed = np.maximum(begun, 1.0)
-        worst = float((shares(found.reference, found.motion, found.end) / allowed).max())
+        worst = float((shares(leg.reference, leg.motion, leg.end) / allowed).max())
         if worst <= _KEPT:
             return time
         best = min(best, (worst, time))

@@ -1,7 +1,7 @@
-"""Make the plan of a phase from the mission and the state at the switch.
+"""The plan that flies a phase: its leg, and the law, gains and weights for the kernel.
 
 A phase becomes a `Problem`: time functions (blends, piecewise quintics), gain tables and weights, which the
-kernel only evaluates. A `PhaseState` holds what the next phase inherits.
+kernel only evaluates.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
     BODY,
-    CONSTANT,
     OPEN,
     RIGID,
     SHAPE,
     SOLVERS,
     SPLITS,
-    SQUARED,
     TRACKING,
     ConstraintLaw,
     Control,
@@ -44,24 +42,15 @@ from rigidfleet.kernel.problem import (
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission import Mission, Phase, Regulator, Settle, bounds
-from rigidfleet.mission.kinds import seconds
+from rigidfleet.mission import Mission, Phase, Regulator, bounds
 from rigidfleet.mission.schema import Constraint, IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import passed
-from rigidfleet.planning.certificate import Certificate, certified
-from rigidfleet.planning.courses import course, lifted, regulators
+from rigidfleet.planning.certificate import Certificate
+from rigidfleet.planning.courses import regulators
 from rigidfleet.planning.disturbances import held_in_place, without
-from rigidfleet.planning.reference import (
-    PhaseState,
-    Pose,
-    align_slots,
-    attach,
-    changed,
-    pose_at,
-    reference_kind,
-    slots_before,
-)
+from rigidfleet.planning.legs import Leg
+from rigidfleet.planning.reference import PhaseState, Pose, changed, extended, pose_at
 from rigidfleet.planning.tolerances import (
     absolute_tolerances,
     tolerance_of_velocity,
@@ -71,7 +60,6 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: Time from which on a phase's end is another moment than its arrival [s].
 _LATER = 1e-6
-_KINDS = {"shape": SHAPE, "squares": SQUARED, "step": CONSTANT}
 #: Greatest error of any pair, as a share of the shortest distance, at which a formation counts as held.
 _NEAR = 0.1
 #: Difference of two lengths that is ignored [m].
@@ -85,21 +73,12 @@ _FLOOR = 3e-2
 
 
 @dataclass
-class PhasePlan:
-    """A phase, ready to fly. It holds all that a flight needs, so that no mission is required."""
+class PhasePlan(Leg):
+    """A leg, ready to fly. It holds all that a flight needs, so that no mission is required."""
 
-    phase: Phase
-    start: float  # [s]
-    t_end: float  # [s] at the latest
     problem: Problem
     edges: Ints  # (m, 2), from 0
-    slots: Floats | None  # (N, 3) at the end, about the CM, body axes [m]
-    formation: str | None
-    knows_slots: bool  # whether the formation has slots, not only distances
     distances: Floats  # (m,) at the end [m]
-    goal: Pose | None
-    arrival: float  # time at which the goal is reached [s]
-    frame: Floats | None  # attitude (3, 3) of the mean-axis frame at the start
     attached: bool  # whether the slots carry the body frame
     lies: bool  # whether the mission prescribes the attitude of the established formation
     method: solvers.Method  # method that solves for the multipliers
@@ -107,22 +86,15 @@ class PhasePlan:
     integrator: IntegratorOptions  # options of the integration
     damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
-    masses: Floats  # (N,) assumed by the laws, lost vehicles included [kg]
-    radius: Floats  # (N,) [m]
-    before: PhaseState  # the state that the phase starts from
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
     loses: bool  # whether vehicles or links are lost at any time of the mission
-    blend: Reference  # of all edges, before any is released
-    through: tuple[dict[str, Any], ...] = ()  # points to pass on the way (`passed`)
-    smooth: bool = False  # whether the next phase needs acceleration and jerk of the reference
+    through: tuple[dict[str, Any], ...]  # points to pass on the way (`passed`)
 
     @cached_property
     def certificate(self) -> Certificate | None:
-        """The least separation of the planned paths, proved; None if agents track no slots."""
-        if len(self.radius) > bounds.ALL_PAIRS:  # takes longer than their flight
-            return None
-        reference = self.problem.reference
-        return certified(self.phase, reference, self.radius, self.before.lost)
+        """The least separation of the planned paths, proved; None if agents track no slots, or are too many."""
+        # Beyond, it takes longer than their flight.
+        return super().certificate if len(self.radius) <= bounds.ALL_PAIRS else None
 
     @property
     def large(self) -> bool:
@@ -221,40 +193,28 @@ class PhasePlan:
     def reached(self, t: float, y: Floats, w: Workspace) -> PhaseState:
         """The state that the next phase starts from, after an evaluation at time t [s] and state y (n,) in ``w``."""
         n, m = len(self.before.r), len(self.edges)
-        frame, pose, goal = self.before.frame, None, self.goal
+        frame, pose = self.before.frame, None
         if self.frame is not None:
             q = y[6 * n + m : 6 * n + m + 4]
             frame = att.dcm_from_quaternion(q / np.linalg.norm(q))
         if self.problem.control.kind == TRACKING:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
             pose = pose_at(self.problem.motion, t) if self.smooth else pose
-        if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
-            goal = changed(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
         return changed(
-            self.before,
-            t=t,
-            r=w.r.copy(),
-            v=w.v.copy(),
+            self.handed_on(t, w.r.copy(), w.v.copy(), frame, pose),
             integral=self.before.integral.updated(self.edges, y[6 * n : 6 * n + m]),
             reference=self.before.reference.updated(self.edges, self.distances),
-            frame=frame,
-            formation=self.formation,
-            slots=self.slots,
-            pose=pose,
-            goal=goal,
-            blend=self.blend if t < self.blend.t0 + self.blend.T_b else None,
         )
 
 
 def plan_phase(
     mission: Mission,
-    phase: Phase,
-    now: PhaseState,
+    leg: Leg,
     *,
     disturbance: Disturbance | None = None,
     external: External | None = None,
 ) -> PhasePlan:
-    """Prepare a phase that starts at ``now.t``.
+    """Add to a leg what flies it: the law and its gains, the graph of edges, and what disturbs them.
 
     Parameters
     ----------
@@ -266,54 +226,31 @@ def plan_phase(
     StoppedError
         The phase has no time left, or would take hours to simulate.
     """
-    t_end = _end(phase, now.t)
+    phase, shaping, now, name = leg.phase, leg.phase.shaping, leg.departure.now, leg.formation
+    _check_time(phase, leg.start)
     _check_size(mission, phase)
-    before_switch, masses = now, mission.fleet.mass.copy()
-    shaping = phase.shaping
-    name = shaping.formation if shaping is not None else now.formation
-    target = mission.slots_about_cm(name)
-    frame, now, turned = attach(mission, phase, now, masses, target)
-    lift = lifted(mission, phase, now, t_end)
-    if lift is not None and not lift.keeps:
-        name = target = None  # no formation outlasts it
+    masses = mission.fleet.mass.copy()
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
         d1 = now.reference.of(edges, d1)
-    d0 = now.reference.of(edges, lambda: distance_geometry.distances(now.r, edges))
-    # Slots are blended if the reference is a shape; if it is distances, slots matter only when tracked.
-    left = masses if now.lost is None else np.where(now.lost, 0.0, masses)
-    before = slots_before(mission, now, left)
-    after = target if shaping is not None and target is not None else before
-    kind, T_b = CONSTANT, 0.0
-    if shaping is not None:
-        T_b = 0.0 if shaping.reference == "step" else seconds(shaping.blend)
-        kind = _KINDS[reference_kind(mission, shaping, before, target)]
-    elif phase.control == "tracking" and _agree(d1, before, edges):
-        kind = SHAPE
-    dp, turn = np.zeros(before.shape), np.zeros(3)
-    if shaping is not None:
-        dp, turn = align_slots(before, after, left, turned)
-    if lift is not None:
-        kind, dp, T_b, after = SHAPE, lift.dp, lift.time, before + lift.dp
-    bent = () if lift is None else (lift.knots, lift.ways)
-    reference = Reference(kind, now.t, T_b, d0, d1, before, dp, turn, *bent)
-    if shaping is None and now.blend is not None:
-        reference = now.blend
-
-    goal, arrival, trajectory = course(mission, phase, now, t_end)
+    reference = leg.reference
+    if shaping is not None or now.blend is None:
+        d0 = now.reference.of(edges, lambda: distance_geometry.distances(now.r, edges))
+        # Distances are those of the slots where these have the lengths commanded.
+        agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
+        reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
     motion, feedback = _REST, _NO_FEEDBACK
     if phase.control == "tracking":
-        assert trajectory is not None  # attached above
-        motion = trajectory.motion()
+        motion = leg.motion
     elif phase.control == "body":
-        assert goal is not None
-        feedback = _feedback(mission, phase, goal, now.t, arrival)
+        assert leg.goal is not None
+        feedback = _feedback(mission, phase, leg.goal, leg.start, leg.arrival)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
     held = _held(mission, name, now) if method == "dense" else None
     problem = Problem(
         body_formulation=mission.formulation == "body",
-        has_frame=frame is not None,
+        has_frame=leg.frame is not None,
         vehicles=_vehicles(
             masses, mission.fleet.thrust_limit, mission.agents.saturate, mission.gravity
         ),
@@ -332,18 +269,13 @@ def plan_phase(
     )  # fmt: skip
     if mission.agents.fixed:
         problem = held_in_place(problem, np.array(mission.agents.fixed) - 1)
-    slots = after
-    if phase.control == "open" and kind != SHAPE:
-        slots = target if shaping is not None else now.slots
-    plan = PhasePlan(
-        phase, now.t, t_end, problem, edges, slots, name, target is not None, d1, goal, arrival, frame,
-        attached=before_switch.slots is not None or phase.control != "open",
+    plan = extended(
+        PhasePlan, leg, reference=reference, masses=masses, problem=problem, edges=edges, distances=d1,
+        attached=leg.before.slots is not None or phase.control != "open",
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
-        damping=partial(mission.damping, held), lost_at=mission.lost_at, masses=masses,
-        radius=mission.fleet.radius, before=before_switch, links_lost=mission.links_lost,
-        loses=mission.first_loss < math.inf, blend=reference, through=passed(trajectory),
-        smooth=mission.smooth or mission.on_loss != "continue",
+        damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
+        loses=mission.first_loss < math.inf, through=passed(leg.trajectory),
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
@@ -370,16 +302,13 @@ def _bounded(external: External, motion: Motion, reference: Reference) -> Extern
     return external if longest == most else external._replace(max_step=0.5 * longest)
 
 
-def _end(phase: Phase, start: float) -> float:
-    """Time [s] at which a phase ends, at the latest."""
-    if phase.until is not None:
-        if phase.until <= start:
-            raise StoppedError(
-                f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
-                f" {start:.2f} s. Give it a duration instead of until"
-            )
-        return phase.until
-    return start + seconds(phase.duration or (phase.settle or Settle()).timeout)
+def _check_time(phase: Phase, start: float) -> None:
+    """Refuse a phase that is to end before it starts [s]."""
+    if phase.until is not None and phase.until <= start:
+        raise StoppedError(
+            f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
+            f" {start:.2f} s. Give it a duration instead of until"
+        )
 
 
 def _check_size(mission: Mission, phase: Phase) -> None:

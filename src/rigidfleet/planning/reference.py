@@ -16,8 +16,7 @@ from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
 from rigidfleet.math import rigid_body, series
-from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
-from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Shaping
 from rigidfleet.planning.derivatives import body_series
 from rigidfleet.typing import Bools, Floats, Ints
@@ -69,14 +68,16 @@ State = TypeVar("State")
 #: The rates of a pose that has none, which all such poses share.
 _ZERO = np.zeros(3)
 _ZERO.flags.writeable = False
-#: No rotation.
-_SAME = np.eye(3)
-_SAME.flags.writeable = False
 
 
 def changed(state: State, **fields: Any) -> State:
     """A shallow copy of a pose, a state or a plan with other fields; `dataclasses.replace` takes five times as long."""
-    new = object.__new__(type(state))
+    return extended(type(state), state, **fields)
+
+
+def extended(kind: type[State], state: Any, **fields: Any) -> State:
+    """A pose, state or plan of a kind, with the fields of another one and further ones."""
+    new = object.__new__(kind)
     new.__dict__.update(state.__dict__, **fields)
     return new
 
@@ -130,90 +131,9 @@ class PhaseState:
     blend: Reference | None = None  # change of shape under way, if a loss has ended its phase
 
 
-def attach(
-    mission: Mission, phase: Phase, now: PhaseState, masses: Floats, target: Floats | None
-) -> tuple[Floats | None, PhaseState, Floats]:
-    """Attach the body frame if a phase needs one, and return the rotation of the desired slots in it.
-
-    Slots fitted to the agents (Kabsch) give the attitude, the matrix of Eq. (23). Before any formation is established,
-    the agents' own positions are the slots, in the axes of the formations' definition. An established formation takes
-    its own axes: those of its prescribed attitude, or, if its attitude is free, the nearest ones. Lost vehicles do not
-    count in the fit; the virtual body keeps their slots.
-
-    Returns
-    -------
-    frame : the frame to integrate, if any
-    now : the state, with the frame attached
-    turn : (3, 3) rotation in which the desired slots are blended (`align_slots`): the one for which they were
-        assigned, or else the one that brings them nearest to the slots before
-    """
-    masses = masses if now.lost is None else np.where(now.lost, 0.0, masses)
-    shaping, establishing = phase.shaping, phase.establishing
-    frame, given = now.frame, None
-    if shaping is not None:
-        given = mission.assigned_turn(now.formation, shaping.formation)
-        given = given if shaping.aligned else np.eye(3)
-    if phase.control == "open":
-        if mission.formulation == "body" and frame is None:
-            frame = np.eye(3)
-        return frame, now, _turn(given, slots_before(mission, now, masses), target, masses)
-    if phase.control == "tracking" and now.pose is not None:
-        pose = now.pose  # the reference continues without a jump
-    else:
-        x, fit = about_cm(now.r, masses), now.slots
-        near = frame if frame is not None else now.pose.T if now.pose is not None else np.eye(3)
-        if fit is not None:
-            T = rigid_body.kabsch(x, fit, masses, near=near.T).T
-        else:
-            T = near if mission.body_frame is not None else mission.drawn_attitude
-        pose = Pose(masses @ now.r / masses.sum(), masses @ now.v / masses.sum(), T, np.zeros(3))
-        if now.v.any():
-            pose.omega = T @ mean_axis_rates(x[None], about_cm(now.v, masses)[None], masses)[0]
-        if now.lost is not None and fit is not None:
-            centre = masses @ fit / masses.sum()  # of the remaining agents, from the body's origin
-            pose.r = pose.r - T.T @ centre
-            pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
-    slots = now.slots if now.slots is not None else about_cm(now.r, masses) @ pose.T.T
-    goal = now.goal or changed(pose, v=np.zeros(3), omega=np.zeros(3))
-    turn = _SAME
-    if establishing is not None and target is not None:
-        # The new axes in the old ones: `axes` maps vectors from new to old.
-        free = mission.free_attitude(phase)
-        if free:
-            axes = _turn(given, slots, target, masses)
-        else:
-            asked = mission.establish_attitude(establishing, goal.T if goal.named else None)
-            steady = now.pose is not None and goal.named and np.array_equal(goal.T, asked)
-            axes = np.eye(3) if steady else pose.T @ asked.T
-        slots = slots @ axes
-        pose = pose.in_axes(axes)
-        goal = changed(goal, T=pose.T if free else asked, named=not free)
-        if free:  # in the axes that fit best, nothing is left to turn
-            given = np.eye(3)
-        elif given is not None:
-            given = axes.T @ given
-    if shaping is not None:
-        turn = _turn(given, slots, target, masses)
-    if phase.control == "body" or (mission.formulation == "body" and frame is None):
-        frame = pose.T
-    return frame, changed(now, pose=pose, slots=slots, goal=goal), turn
-
-
-def slots_before(mission: Mission, now: PhaseState, masses: Floats) -> Floats:
-    """Slots (N, 3) [m] that a phase begins with; without any, the agents' positions in the formations' axes."""
-    if now.slots is not None:
-        return now.slots
-    return about_cm(now.r, masses) @ mission.drawn_attitude.T
-
-
-def _turn(given: Floats | None, before: Floats, after: Floats | None, masses: Floats) -> Floats:
-    if after is None:
-        return np.eye(3)
-    return _fitted(before, after, masses) if given is None else given
-
-
 @kept
-def _fitted(before: Floats, after: Floats, masses: Floats) -> Floats:
+def fitted(before: Floats, after: Floats, masses: Floats) -> Floats:
+    """The rotation (3, 3) that brings slots (N, 3) nearest to those before: Kabsch, weighted by mass."""
     return rigid_body.kabsch(before, after, masses)
 
 
@@ -264,7 +184,7 @@ def align_slots(
     straight blend then has no angular momentum in its own frame, and moves the agents least. During the blend the
     slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
-    R = _fitted(before, after, masses) if turn is None else turn
+    R = fitted(before, after, masses) if turn is None else turn
     return _aligned(before, after, R)
 
 

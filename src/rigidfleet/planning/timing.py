@@ -12,15 +12,14 @@ from typing import Any
 
 from rigidfleet._common.progress import report
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.mission import Fly, Mission, Phase
-from rigidfleet.mission.kinds import Orbit, Shaping, Steering, Vertical
+from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
-from rigidfleet.planning.body_trajectories import SmoothTrajectory
-from rigidfleet.planning.courses import course, misled
+from rigidfleet.planning.body_trajectories import passed
+from rigidfleet.planning.courses import misled
+from rigidfleet.planning.legs import Departure, Leg, at_start, depart, leg_from
 from rigidfleet.planning.limits import Limit, Reached, limits_of, reached
-from rigidfleet.planning.preview import Leg, at_start, leg
-from rigidfleet.planning.reference import PhaseState, attach
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transitions import expanded
 from rigidfleet.planning.vehicles import reserves
 
@@ -31,10 +30,6 @@ _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
 _CLOSE, _STEP, _NEARLY, _NEAR = 1.006, 4.0, 1.002, 1.005
 #: A time that is more than twice as long has to lower the greatest share of a limit at least to this part of it.
 _STALLED = 0.98
-#: Root of each share that falls in proportion to the time, for ways from rest to rest.
-_POWERS = {"jerk": 1 / 3, "tilt": 1 / 2, "thrust": 1 / 2}
-_POWERS |= {f"{way}speed": 1.0 for way in ("", "horizontal ", "vertical ")}
-_POWERS |= {f"{way}acceleration": 1 / 2 for way in ("", "horizontal ", "vertical ")}
 #: What automatic times have in reserve, and the unit to which they are rounded up [s].
 _MARGIN, _UNIT = 1.005, 1e-3
 #: Excess over a limit that is ignored.
@@ -51,7 +46,7 @@ def spelled_out(mission: Mission) -> Mission:
     MissionError
         No transition keeps the separation, or no way is found.
     """
-    return ways.found(expanded(mission, with_times), with_times)
+    return ways.found(expanded(mission, timed_leg), timed_leg)
 
 
 def timed(mission: Mission) -> Mission:
@@ -78,85 +73,81 @@ def timed(mission: Mission) -> Mission:
     now = at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 1]):
         report(f"timing '{phase.name}'")
-        explicit = with_times(mission, phase, now, k)
-        if explicit is not phase:
-            changed = explicit.model_dump(mode="json", include={*phase.automatic, "through"})
+        leg = timed_leg(mission, phase, now, k)
+        if leg.phase is not phase:
+            changed = leg.phase.model_dump(mode="json", include={*phase.automatic, "through"})
             tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
-        found = leg(mission, explicit, now)
-        if found is None:
+        if not leg.known:
             raise _unknown(mission, k, mission.phases[last])
-        now = found.after
+        now = leg.after
     return mission.with_phases(tables)
 
 
-def with_times(mission: Mission, phase: Phase, now: PhaseState, number: int) -> Phase:
-    """A phase with its automatic times replaced by the least ones, from a state at its start.
+def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> Leg:
+    """The leg of a phase from a state at its start, with the least times in place of its automatic ones.
 
     Raises
     ------
     MissionError
         No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
-    if phase.led or phase.bent:
-        masses = mission.fleet.mass
-        _, begun, _ = attach(mission, phase, now, masses, mission.slots_about_cm(now.formation))
-        if problem := misled(mission, phase, begun):
-            key = "file" if phase.led else "formation"
-            remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
-            path = f"phases[{number + 1}].{key}"
-            raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
+    departure = depart(mission, phase, now)
+    if problem := misled(phase, departure.now):
+        key = "file" if phase.led else "formation"
+        remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
+        path = f"phases[{number + 1}].{key}"
+        raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
     if not phase.automatic:
-        return phase
-    phase = _shared_out(mission, phase, now)
+        return leg_from(mission, phase, departure)
+    phase = _shared_out(mission, phase, departure)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
         shortest, vary = phase.shaping.least_time, _lasting
     else:
         shortest, vary = _SHORTEST, _moving
-    time, worst = _least(mission, lambda t: vary(phase, t), now, shortest)
+    time, worst = _least(mission, lambda t: vary(phase, t), departure, shortest)
     if time is None:
         key = phase.automatic[0]
         problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
-        remedy = f"raise limits.{worst.limit.name.replace(' ', '_')}, or change the way"
+        remedy = f"raise {worst.limit.of.key}, or change the way"
         path = f"phases[{number + 1}].{key}"
         raise MissionError([Finding(mission.origin, path, AUTO, problem, remedy)])
     if time > shortest:
         time = math.ceil(time * _MARGIN / _UNIT - 1e-9) * _UNIT
-    return vary(phase, round(time, 6))
+    return leg_from(mission, vary(phase, round(time, 6)), departure)
 
 
-def least_time(mission: Mission, found: Leg) -> tuple[str, float | None]:
+def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
     """The key of a phase that sets the time of its motion, and its least value [s]; None if no time is enough.
 
     The least time keeps all limits of the mission, and is found to within 1 %.
     """
-    phase, length = found.phase, found.end - found.begin
-    phase = phase.model_copy(update={"until": None, "settle": None, "duration": length})
-    phase = _shared_out(mission, phase, found.before)
-    time, _ = _least(mission, lambda t: _moving(phase, t), found.before, _SHORTEST)
-    return _key(phase), time
+    length = {"until": None, "settle": None, "duration": leg.end - leg.start}
+    phase = _shared_out(mission, leg.phase.model_copy(update=length), leg.departure)
+    time, _ = _least(mission, lambda t: _moving(phase, t), leg.departure, _SHORTEST)
+    return phase.time_key, time
 
 
-def broken(mission: Mission, found: Leg) -> list[Reached]:
+def broken(mission: Mission, leg: Leg) -> list[Reached]:
     """Limits that the reference of a planned leg breaks, the worst first."""
-    if found.phase.control != "tracking":
+    if leg.phase.control != "tracking":
         return []
-    over = reached(limits_of(mission), found.reference, found.motion, found.begin, found.end)
+    over = reached(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end)
     return sorted((x for x in over if x.share > 1.0 + SLACK), key=lambda x: -x.share)
 
 
 def said(worst: Reached, phase: Phase) -> str:
     """What is reached of a limit, in words."""
-    limit = worst.limit
+    q, most = worst.limit.of, worst.limit.most[worst.agent]
     return (
-        f"agent {worst.agent + 1} would need {worst.value:.3g} {limit.unit} of {limit.name} at {worst.time:.2f} s in"
-        f" '{phase.name}' (limit {limit.most[worst.agent]:g} {limit.unit})"
+        f"agent {worst.agent + 1} would need {worst.value:.3g} {q.unit} of {q.called} at {worst.time:.2f} s in"
+        f" '{phase.name}' (limit {most:g} {q.unit})"
     )
 
 
 def _least(
     mission: Mission,
     vary: Callable[[float], Phase],
-    now: PhaseState,
+    departure: Departure,
     shortest: float,
     limits: list[Limit] | None = None,
 ) -> tuple[float | None, Reached]:
@@ -165,19 +156,18 @@ def _least(
     Vehicles leave a reserve of their limits, unless no time does: of a circle near a limit, for example.
     """
     if limits is None and (reserve := reserves(mission)).any():
-        found = _least(mission, vary, now, shortest, limits_of(mission, reserve=reserve))
+        found = _least(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
         if found[0] is not None:
             return found
     limits = limits_of(mission) if limits is None else limits
 
     def each(time: float, *, fine: bool = False) -> list[Reached]:
-        found = leg(mission, vary(time), now)
-        assert found is not None  # slots are tracked
-        return reached(limits, found.reference, found.motion, found.begin, found.end, fine=fine)
+        leg = leg_from(mission, vary(time), departure)
+        return reached(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
     def excess(time: float) -> float:
-        """Greatest share of a limit [-], as a power that falls in proportion to the time."""
-        return max(x.share ** _POWERS[x.limit.name] for x in each(time))
+        """Greatest share of a limit [-], as a power that falls in proportion to the time of ways from rest to rest."""
+        return max(x.share ** (1 / x.limit.of.order) for x in each(time))
 
     # At rest at both ends, every share falls with a power of the time: from a trial, the first guess is the solution.
     low, high, time = 0.0, math.inf, max(_TRIAL, shortest)
@@ -200,32 +190,21 @@ def _least(
     return high, worst
 
 
-def _key(phase: Phase) -> str:
-    """The key that sets the time of a phase's motion."""
-    if isinstance(phase, Shaping | Orbit):
-        return "blend"
-    return (
-        "travel"
-        if isinstance(phase, Steering | Vertical) and phase.travel is not None
-        else "duration"
-    )
-
-
 def _moving(phase: Phase, time: float) -> Phase:
     """A phase whose motion takes a time [s]; it does not end before."""
-    key = _key(phase)
-    told: dict[str, Any] = {key: time}
+    key = phase.time_key
+    times: dict[str, Any] = {key: time}
     if key != "duration":
         if phase.duration == AUTO:
-            told["duration"] = time
+            times["duration"] = time
         elif isinstance(phase.duration, float):
-            told["duration"] = max(phase.duration, time)
-    if isinstance(phase, Fly) and phase.through:
+            times["duration"] = max(phase.duration, time)
+    if phase.points:
         before = _arrival(phase)
-        told["through"] = tuple(
-            at.model_copy(update={"time": (at.time or 0.0) * time / before}) for at in phase.through
+        times["through"] = tuple(
+            at.model_copy(update={"time": (at.time or 0.0) * time / before}) for at in phase.points
         )
-    return phase.model_copy(update=told)
+    return phase.model_copy(update=times)
 
 
 def _lasting(phase: Phase, time: float) -> Phase:
@@ -237,29 +216,24 @@ def _lasting(phase: Phase, time: float) -> Phase:
 _TRIAL = 10.0
 
 
-def _arrival(phase: Fly) -> float:
+def _arrival(phase: Phase) -> float:
     """Time [s] from the start to the arrival; a trial if it is automatic."""
-    time = phase.duration if phase.travel is None else phase.travel
+    time = getattr(phase, phase.time_key)
     return time if isinstance(time, float) else _TRIAL
 
 
-def _shared_out(mission: Mission, phase: Phase, now: PhaseState) -> Phase:
+def _shared_out(mission: Mission, phase: Phase, departure: Departure) -> Phase:
     """A phase whose points to pass have times, in shares of the whole that then stay."""
-    if not isinstance(phase, Fly) or not phase.through:
+    if not phase.points:
         return phase
-    masses = mission.fleet.mass
-    _, now, _ = attach(mission, phase, now, masses, mission.slots_about_cm(now.formation))
-    end = now.t + _arrival(phase)
-    trajectory = course(mission, phase.model_copy(update=_until(phase)), now, end).trajectory
-    assert isinstance(trajectory, SmoothTrajectory)
-    times = trajectory.times()[1:-1].tolist()
-    through = zip(phase.through, times, strict=True)
-    shared = tuple(at.model_copy(update={"time": round(t, 6)}) for at, t in through)
-    return phase.model_copy(update={"through": shared})
-
-
-def _until(phase: Fly) -> dict[str, Any]:
-    return {} if phase.travel is None else {"travel": _arrival(phase)}
+    arriving = phase.model_copy(update={phase.time_key: _arrival(phase)})
+    points = passed(leg_from(mission, arriving, departure).trajectory)
+    start = departure.now.t
+    through = tuple(
+        at.model_copy(update={"time": round(point["time"] - start, 6)})
+        for at, point in zip(phase.points, points, strict=True)
+    )
+    return phase.model_copy(update={"through": through})
 
 
 def _unknown(mission: Mission, number: int, last: Phase) -> MissionError:

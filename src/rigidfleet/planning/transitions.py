@@ -19,10 +19,9 @@ from rigidfleet._common.progress import report
 from rigidfleet.formation.assignment import closest_approach, nearer_than
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
-from rigidfleet.mission.kinds import Go, Reshape, Vertical
+from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
-from rigidfleet.planning.preview import at_start, leg
-from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.transfers import transfer
 from rigidfleet.planning.ways import Timed, refused
 from rigidfleet.typing import Floats, Ints
@@ -44,7 +43,7 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
     bent ways has their control points.
 
     The result is an ordinary mission: it can be written, read and flown by itself. ``timed`` gives a phase its
-    automatic times (`timing.with_times`).
+    automatic times (`timing.timed_leg`).
 
     Raises
     ------
@@ -129,17 +128,15 @@ def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
     if its axes are along the world's. Infinite where that, or the place of the formation, is not known.
     """
     box = np.array([[-np.inf] * 3, [np.inf] * 3])
-    now: PhaseState | None = at_start(mission)
+    now = at_start(mission)
     for number, phase in enumerate(mission.phases[:phases]):
-        assert now is not None
-        found = (
-            None if isinstance(phase, Go) else leg(mission, timed(mission, phase, now, number), now)
-        )
-        now = None if found is None else found.after
-        if now is None:
+        if phase.replaced:
             return box
-    pose = None if now is None else now.goal
-    if pose is None:
+        leg = timed(mission, phase, now, number)
+        if not leg.known:
+            return box
+        now = leg.after
+    if (pose := now.goal) is None:
         return box
     radius, fence = float(mission.fleet.radius.max()), mission.limits.geofence
     lowest = np.array([-np.inf, -np.inf, mission.ground + radius])

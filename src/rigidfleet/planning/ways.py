@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -24,13 +24,14 @@ from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import closest, pace
 from rigidfleet.planning.lattice import Lattice, Layer, Network, Space, Way, staying
-from rigidfleet.planning.preview import at_start, ending, leg, planned_phase, samples_per_phase
+from rigidfleet.planning.legs import Leg, at_start, latest_end
+from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.solids.records import corners, extent
 from rigidfleet.typing import Floats
 
-#: A phase with its automatic times known, from the mission, the phase, the state at its start, and its number.
-Timed = Callable[[Mission, Phase, PhaseState, int], Phase]
+#: The leg of a phase with its automatic times known, from the mission, the phase, the state at its start, its number.
+Timed = Callable[[Mission, Phase, PhaseState, int], Leg]
 
 #: Greatest speed at the start of a way [m/s]: what regulators leave.
 _REST = 0.1
@@ -56,15 +57,14 @@ def found(mission: Mission, timed: Timed) -> Mission:
     MissionError
         There is no way, none was found that can be proved, or a phase cannot begin one.
     """
-    while (k := next((k for k, p in enumerate(mission.phases) if isinstance(p, Go)), None)) is not None:  # fmt: skip
-        phase, now = mission.phases[k], at_start(mission)
-        assert isinstance(phase, Go)
+    while (k := next((k for k, p in enumerate(mission.phases) if p.replaced), None)) is not None:  # fmt: skip
+        now, phase = at_start(mission), cast("Go", mission.phases[k])
         for number, before in enumerate(mission.phases[:k]):
-            planned = leg(mission, timed(mission, before, now, number), now)
-            if planned is None:
+            leg = timed(mission, before, now, number)
+            if not leg.known:
                 raise refused(mission, k, "kind", "go", "begins where distances alone have led",
                               "give the formation a shape or slots")  # fmt: skip
-            now = planned.after
+            now = leg.after
         mission = _Search(mission, k, phase, now, timed).expanded()
     return mission
 
@@ -236,7 +236,7 @@ class _Search:
         parts = list(self._parts(network, way))
         if not parts:
             parts = [("stay", {"kind": "fly", "position": self.end.tolist()}, 1.0)]
-        end = ending(self.mission, phase, self.now.t)
+        end = latest_end(phase, self.now.t)
         roots = np.sqrt([max(length, 1e-3) for *_, length in parts])
         lengths = (end - self.now.t) * roots / roots.sum() if phase.duration != AUTO else roots
         tables = []
@@ -281,15 +281,14 @@ class _Search:
         now, lacking = self.now, -math.inf
         self._worst = ""
         for number in range(k, k + len(tables)):
-            found = leg(tried, self.timed(tried, tried.phases[number], now, number), now)
-            assert found is not None  # slots are tracked
-            now = found.after
-            lacking = max(lacking, self._lacking(tried, found))
+            leg = self.timed(tried, tried.phases[number], now, number)
+            now = leg.after
+            lacking = max(lacking, self._lacking(tried, leg))
         return tried, lacking
 
-    def _lacking(self, mission: Mission, found: Any) -> float:
+    def _lacking(self, mission: Mission, leg: Leg) -> float:
         """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""
-        planned = planned_phase(found, max(samples_per_phase(mission), 11), mission.fleet.radius)
+        planned = planned_phase(leg, max(samples_per_phase(mission), FEWEST_SAMPLES))
         low, high = planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))
         speed, need, radius = pace(planned), self.phase.clearance, mission.fleet.radius
         least = math.inf

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.math import pid
 from rigidfleet.mission import Mission
-from rigidfleet.planning.preview import phase_spans
+from rigidfleet.planning.legs import phase_spans
 from rigidfleet.preflight.findings import FormationCheck, GainsCheck, Preflight, Remark
 
 

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.mission import Mission
-from rigidfleet.planning.losses import after_loss, state_at
-from rigidfleet.planning.preview import FEWEST_SAMPLES, Leg, leg, planned_phase, samples_per_phase
+from rigidfleet.planning.legs import Leg, leg_of
+from rigidfleet.planning.losses import after_loss
+from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
+from rigidfleet.planning.reference import changed
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import (
@@ -27,7 +29,7 @@ def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if mission.on_loss == "continue" or not np.isfinite(first):
         return
     legs = [planned.leg for planned in found.planned_phases]
-    at = next((x for x in legs if x.begin < first <= x.end), None)
+    at = next((x for x in legs if x.start < first <= x.end), None)
     if at is None:
         text = f"{mission.first_lost} may be lost after the planned paths, at {first:g} s: what follows is not checked"
         yield Remark("note", "loss", text)
@@ -43,9 +45,7 @@ def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
-    part = Preflight(
-        found.formations, found.gains, [planned_phase(x, most, mission.fleet.radius) for x in way]
-    )
+    part = Preflight(found.formations, found.gains, [planned_phase(x, most) for x in way])
     judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
     for judge in judges:
         yield from judge(mission, part)
@@ -55,13 +55,11 @@ def planned_way(mission: Mission, at: Leg) -> list[Leg]:
     """The planned legs after the first loss, which happens in the leg ``at``."""
     first = mission.first_loss
     lost = mission.lost_at <= first
-    now = state_at(at, first, lost if lost.any() else None)
+    now = changed(at.state_at(first), lost=lost if lost.any() else None)
     way = []
     for phase in after_loss(mission, now):
-        found = leg(mission, phase, now)
-        assert found is not None  # slots are tracked
-        way.append(found)
-        now = found.after
+        way.append(leg_of(mission, phase, now))
+        now = way[-1].after
     return way
 
 

@@ -18,7 +18,6 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.margins import shares
 from rigidfleet.mission import Mission
-from rigidfleet.mission.kinds import Fly
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import air_force, jets
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
@@ -153,7 +152,7 @@ def _broken(
     places = [("waypoint", arrival)] * (not stays)
     places += [("its place at the end", -1)] * (stays or (later and not phase.free))
     way = masses @ planned.position / masses.sum()
-    for n, at in enumerate(phase.through if isinstance(phase, Fly) else (), start=1):
+    for n, at in enumerate(phase.points, start=1):
         places.append(
             (f"point {n} on the way", int(np.linalg.norm(way - at.position, axis=1).argmin()))
         )

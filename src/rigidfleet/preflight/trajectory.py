@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.formation import distance_geometry
@@ -349,16 +350,16 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
 def _broken(mission: Mission, planned: PlannedPhase, hopeless: set[str]) -> Iterator[Remark]:
     """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
     over = timing.broken(mission, planned.leg)
-    if not over or over[0].limit.name in hopeless:
+    if not over or over[0].limit.of.called in hopeless:
         return
     key, least = timing.least_time(mission, planned.leg)
     if least is None:
         remedy = f"no {key} of this phase keeps all limits"
-        hopeless.add(over[0].limit.name)
+        hopeless.add(over[0].limit.of.called)
     else:
         remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
     yield Remark(
-        "fails", over[0].limit.name, f"{timing.said(over[0], planned.leg.phase)}; {remedy}"
+        "fails", over[0].limit.of.called, f"{timing.said(over[0], planned.leg.phase)}; {remedy}"
     )
 
 
@@ -366,14 +367,15 @@ def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed and acceleration of samples beyond their limits."""
     x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
     for limit in limits_of(mission):
-        if not limit.name.endswith(("speed", "acceleration")):
+        q, most = limit.of, float(limit.most[0])
+        if q not in MOTIONS or q.order > 2:
             continue
-        size, most = limit.quantity(x, np.arange(mission.n_agents)), float(limit.most[0])
-        of = f" of {limit.name}" if " " in limit.name else ""
+        size = limit.values(x, np.arange(mission.n_agents))
+        of = f" of {q.called}" if q.way else ""
         k, i = np.unravel_index(int(size.argmax()), size.shape)
         if size[k, i] > most * (1 + 1e-3):
             text = (
-                f"agent {i + 1} reaches {size[k, i]:.3g} {limit.unit}{of} at {planned.time[k]:.2f} s in"
-                f" '{planned.phase}' (limit {most:g} {limit.unit})"
+                f"agent {i + 1} reaches {size[k, i]:.3g} {q.unit}{of} at {planned.time[k]:.2f} s in"
+                f" '{planned.phase}' (limit {most:g} {q.unit})"
             )
-            yield Remark("fails" if planned.exact else "note", limit.name, text)
+            yield Remark("fails" if planned.exact else "note", q.called, text)

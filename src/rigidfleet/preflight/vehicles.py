@@ -51,9 +51,9 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     asked, angle, found = asked_yaw(mission), first_yaw(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
-        count = min(max(_SAMPLES, int((leg.end - leg.begin) / _STEP) + 1), _MOST)
-        time = np.linspace(leg.begin, leg.end, max(11, min(count, _PLACES // n)))
-        turn = turn_along(leg.reference, leg.motion, leg.begin, asked, angle)
+        count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
+        time = np.linspace(leg.start, leg.end, max(11, min(count, _PLACES // n)))
+        turn = turn_along(leg.reference, leg.motion, leg.start, asked, angle)
         slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, asked, turn)
         angle, yaw = turned[0, :, -1], turned.transpose(2, 0, 1)
         x = series.derivatives(slots).transpose(3, 0, 2, 1)
@@ -111,9 +111,9 @@ def _jump(mission: Mission, way: Sequence[PlannedPhase]) -> tuple[float, float, 
     """The greatest jump of the reference's acceleration [m/s^2], of the tilt [deg], its time [s], and the phase."""
     worst = None
     for before, after in pairwise(way):
-        if before.leg.end != after.leg.begin:
+        if before.leg.end != after.leg.start:
             continue
-        t = np.array([after.leg.begin])
+        t = np.array([after.leg.start])
         a, b = (
             slot_derivatives(leg.reference, leg.motion, t, 3)[0, 2]
             for leg in (before.leg, after.leg)

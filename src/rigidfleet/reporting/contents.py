@@ -13,6 +13,7 @@ import numpy as np
 
 from rigidfleet import plotting
 from rigidfleet._common.facts import Cell, Level, Row, Table, value
+from rigidfleet._common.quantities import QUANTITIES, quantity, shown
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
@@ -236,9 +237,8 @@ def _safety_table(
 ) -> Table:
     """A row for each quantity of any flight; beside the quantity, what is known of one flight, or a cell for each."""
     columns = [
-        {row.quantity: row for row in safety(*each) if row.worst is not None or row.limit is not None}
-        for each in zip(flights, verdicts, strict=True)
-    ]  # fmt: skip
+        {row.quantity: row for row in safety(*each)} for each in zip(flights, verdicts, strict=True)
+    ]
     names = {row.quantity: Cell(row.quantity, row.text) for c in columns for row in c.values()}
     if len(flights) == 1:
         rows = [
@@ -248,7 +248,7 @@ def _safety_table(
         heads = ("quantity", "limit", "worst", "margin", "when", "who")
         return Table(heads, rows, ("margin", "when", "who"))
     rows = [
-        Row((cell, *(_safety_cell(column.get(name)) for column in columns)))
+        Row((cell, *(_safety_cell(name, column.get(name)) for column in columns)))
         for name, cell in names.items()
     ]
     return Table(("quantity", *labels), rows, labels)
@@ -258,10 +258,14 @@ def _level(row: Safety) -> Level:
     return "" if row.limit is None else "ok" if row.passed else "fails"
 
 
+def _nothing(name: str) -> str:
+    return quantity(name.replace(" ", "_")).nothing or "nothing to measure"
+
+
 def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
     """Limit, worst value, margin, when and who."""
     if (worst := row.worst) is None:
-        return row.fact.bound, "nothing to measure", "", "", ""
+        return row.fact.bound, _nothing(row.quantity), "", "", ""
     left = ""
     if row.margin is not None:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
@@ -270,10 +274,10 @@ def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
     return row.fact.bound, value(worst.value, row.unit), margin, at, worst.who
 
 
-def _safety_cell(row: Safety | None) -> Cell:
+def _safety_cell(name: str, row: Safety | None) -> Cell:
     """The worst value of one of several flights, with its limit, whom and when."""
     if row is None:
-        return Cell("flown by points")
+        return Cell(_nothing(name))
     limit, worst, _, when, who = _safety_cells(row)
     small = ", ".join(str(x) for x in (limit, who, getattr(when, "text", "")) if x)
     return Cell(str(worst), small, level=_level(row))
@@ -287,10 +291,6 @@ def _numbers(
 ) -> Table:
     """Numbers of the flights side by side, with how much they differ from those of the first."""
 
-    def worst(name: str, _: Result, verdict: Verdict) -> float | None:
-        extreme = verdict.worst.get(name)
-        return None if extreme is None else extreme.value
-
     def misses(_: Result, verdict: Verdict) -> float | None:
         found = [p.waypoint.position for p in verdict.phases if p.waypoint is not None]
         return max((miss for miss in found if miss is not None), default=None)
@@ -299,28 +299,15 @@ def _numbers(
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
         ("greatest waypoint miss", "m", misses),
-        ("greatest distance from a slot", "m", lambda r, _: _greatest(overlay.slot_error(r))),
-        ("greatest constraint error", "m", partial(worst, "constraint")),
-        ("least distance between vehicles", "m", partial(worst, "separation")),
-        ("least distance to an obstacle", "m", partial(worst, "clearance")),
-        ("greatest speed", "m/s", partial(worst, "speed")),
-        ("greatest acceleration", "m/s²", partial(worst, "acceleration")),
-        ("greatest thrust", "N", partial(worst, "thrust")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
-        ("greatest constraint force", "N", partial(worst, "constraint_force")),
-        ("greatest share of a rotor's limit", "%", lambda _, v: _rotor_share(v)),
-        ("greatest tilt", "deg", partial(_checked, "tilt")),
-        ("greatest saturation of a phase", "%", partial(_checked, "saturation")),
+        *((q.text, shown(q.unit), partial(_checked, q.name)) for q in QUANTITIES.values()),
     ]
     rows = []
     for name, unit, measure in measures:
         found = [measure(*each) for each in zip(flights, verdicts, strict=True)]
         if all(x is None for x in found):
             continue
-        cells = [
-            Cell("–" if x is None else value(abs(x) if "error" in name else x), _change(found[0], x))
-            for x in found
-        ]  # fmt: skip
+        cells = [Cell("–" if x is None else value(x), _change(found[0], x)) for x in found]
         rows.append(Row((f"{name} [{unit}]" if unit else name, *cells)))
     return Table(("quantity", *labels), rows)
 
@@ -328,19 +315,6 @@ def _numbers(
 def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
     return next((check.worst for check in verdict.checks if check.check == name), None)
-
-
-def _rotor_share(verdict: Verdict) -> float | None:
-    """Force of the rotor nearest to its limit, as a share of it [%]."""
-    found = next((check for check in verdict.checks if check.check == "rotor_force"), None)
-    if found is None or found.worst is None or not found.limit:
-        return None
-    return 100 * found.worst / found.limit
-
-
-def _greatest(values: Any) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if len(known) else None
 
 
 def _mean(result: Result) -> float | None:

@@ -6,7 +6,7 @@ flight can be repeated from its result. NaN means "not active".
 """
 
 from rigidfleet.result.netcdf import LABELS, Variable
-from rigidfleet.result.phases import DIRECTIONS, PAD, Extremum, PhaseRecord
+from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
 from rigidfleet.result.result import (
     CLOSE,
     LATER,
@@ -20,7 +20,6 @@ from rigidfleet.result.result import (
 
 __all__ = [
     "CLOSE",
-    "DIRECTIONS",
     "LABELS",
     "LATER",
     "PAD",

@@ -48,10 +48,6 @@ class Planned(_Moment):
 
 #: A vehicle that stays within this distance of an obstacle below it from the start, or until the end, stands on it [m].
 PAD = 0.1
-#: Quantities of a direction, named as their limits.
-DIRECTIONS = tuple(
-    f"{way}_{what}" for what in ("speed", "acceleration") for way in ("horizontal", "vertical")
-)
 
 
 class Extremum(NamedTuple):
@@ -89,9 +85,9 @@ class PhaseRecord:
     extremes : worst values of the phase in continuous time, by name: separation, clearance, separation_below,
         separation_flying (with an agent at limits.separation_altitude or above), lost (distance
         of a lost vehicle to one that still flies), geofence (distance beyond it), lowest, highest [m];
-        speed [m/s]; acceleration [m/s^2]; where there is a limit by direction, `DIRECTIONS`; thrust, thrust_margin
-        (thrust minus its limit), constraint_force, tension [N]; constraint [m]; of vehicles also rotor_force [N] (of
-        the rotor nearest to its limit), tilt [rad],
+        speed [m/s]; acceleration [m/s^2]; where one by direction is limited, all of these by direction; thrust,
+        thrust_margin (thrust minus its limit), constraint_force, tension [N]; constraint [m]; of vehicles also
+        rotor_force [N] (of the rotor nearest to its limit), tilt [rad],
         tracking_error [m] and saturation (share of the phase). With [avoidance] also barrier and guard (greatest share
         of the phase in which they acted on a vehicle, and since when), clock (by how much the phase ended later because
         the formation waited [s], and since when) and body (share of the phase in which the formation deviated from its

@@ -19,6 +19,7 @@ import numpy as np
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.facts import Fact, Row, Sheet, Shown, Table, worst_values
 from rigidfleet._common.files import write_file
+from rigidfleet._common.quantities import quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -36,10 +37,8 @@ def _v(dims: str, units: str, text: str) -> Variable:
 _LABELLED = {dim: len(names) for dim, names in LABELS.items()}
 
 
-#: Quantities whose worst values are shown, with their units.
-_WORST = {
-    "separation": "m", "clearance": "m", "speed": "m/s", "thrust": "N", "rotor_force": "N", "tracking_error": "m",
-}  # fmt: skip
+#: Quantities whose worst values are shown.
+_WORST = ("separation", "clearance", "speed", "thrust", "rotor_force", "tracking_error")
 
 
 #: Names of fields, and a function that computes them when they are first asked for.
@@ -317,7 +316,7 @@ class Result(Shown):
                     alone = x.other not in rotors
                 else:
                     alone = not (-1 <= x.other < n and x.other != x.who)
-                    alone = alone and not name.startswith("clearance")
+                    alone = alone and quantity(name).who != "obstacle"
                 if alone or x.who not in agents:
                     raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
@@ -404,9 +403,9 @@ class Result(Shown):
         }
         rows = [Row(item) for item in about.items() if item[1] is not None]
         worst = [
-            Fact(quantity.replace("_", " "), x.value, unit, when=x.time)
-            for quantity, unit in _WORST.items()
-            if (x := self.extreme(quantity)) is not None and math.isfinite(x.value)
+            Fact(f"{q.sense} {q.called}", x.value, q.unit, when=x.time)
+            for q in map(quantity, _WORST)
+            if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
         contents = Table(("about", "result"), rows, ("result",), bare=True)
         return Sheet(name, title, [contents, worst_values("quantity", worst)])
@@ -523,9 +522,8 @@ class Result(Shown):
         Names are those of `PhaseRecord.extremes`.
         """
         every = [p.extremes[name] for p in self.phases if name in p.extremes]
-        sign = -1.0 if name in _LEAST or name.startswith("clearance") else 1.0
-        size = (lambda x: abs(x.value)) if name == "tension" else (lambda x: sign * x.value)
-        return max(every, key=size, default=None)
+        rank = quantity(name).rank
+        return max(every, key=lambda x: rank(x.value), default=None)
 
     def save(self, path: str | Path) -> None:
         """Write the result to a netCDF-4 file.
@@ -665,10 +663,6 @@ _CHECKED = {
     for name, v in VARIABLES.items()
 }
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
-#: Quantities whose minimum is the worst value. The same holds for all clearances.
-_LEAST = frozenset(
-    ("separation", "separation_below", "separation_flying", "lost", "lowest", "guarantee")
-)
 
 
 def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:

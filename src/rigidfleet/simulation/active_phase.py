@@ -111,7 +111,7 @@ class ActivePhase:
         if external is None:
             self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(self.state.y))
         if self.solver is not None:
-            self.state.clock[1] = first_step(plan, self.workspace, self.state)
+            self.state.clock[records.NEXT_STEP] = first_step(plan, self.workspace, self.state)
 
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
@@ -126,7 +126,7 @@ class ActivePhase:
     @property
     def t(self) -> float:
         """Mission time reached [s]."""
-        return float(self.state.clock[0])
+        return float(self.state.clock[records.TIME])
 
     @property
     def over(self) -> bool:
@@ -209,8 +209,9 @@ class ActivePhase:
     def lead(self, problem: Problem) -> None:
         """Continue with another problem of the same size, such as one with a different reference."""
         self.plan.problem = problem
-        self.counted[0] += self.state.count[0]
-        self.state.count[0] = 0  # a different law: its derivative is not known yet
+        self.counted[records.EVALUATIONS] += self.state.count[records.EVALUATIONS]
+        # A different law: its derivative is not known yet.
+        self.state.count[records.EVALUATIONS] = 0
 
     def evaluate(self) -> None:
         """Evaluate the law at the current state; forces and references are then in the workspace."""
@@ -236,7 +237,7 @@ class ActivePhase:
         force, which may not be ready for two threads, is asked by one.
         """
         self.extremes.wait()
-        if not self.state.count[4] or self.flown is None:
+        if not self.state.count[records.TRAILED] or self.flown is None:
             return
         work = self.workspace if self.solver is None else self.solver.aside.workspace
         if last or not self.aside:
@@ -247,7 +248,7 @@ class ActivePhase:
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
         self.check()
-        if not (self.state.count[0] or self.t > self.plan.start):
+        if not (self.state.count[records.EVALUATIONS] or self.t > self.plan.start):
             return self.plan.before
         self.evaluate()
         return self.plan.reached(self.t, self.state.y, self.workspace)
@@ -315,7 +316,7 @@ class ActivePhase:
 
     def count(self) -> None:
         """Add up the evaluations, steps and solves of the phase, or of its part up to a loss."""
-        self.counted += self.state.count[:3]
+        self.counted += self.state.count[: records.REJECTED + 1]
         if self.solver is not None:
             self.solves.append((self.plan.method, self.solver.counts))
 
@@ -339,13 +340,13 @@ class ActivePhase:
                 if self.external is not None:
                     self.external.check()
                 self.check()
-                full = state.count[4] == len(state.trail.clock)
+                full = state.count[records.TRAILED] == len(state.trail.clock)
                 if self.aside:
                     full = self.extremes.room(state) < 1
                 if status == records.PAUSED or full:
                     self.watch(last=False)
                 self.pause(self.t)
-                if status == records.PAUSED and self._stalled():
+                if status == records.PAUSED and self.stalled():
                     break
         finally:
             self.record(stretch)
@@ -360,7 +361,8 @@ class ActivePhase:
 
     def prepare(self, problem: Problem, times: Floats) -> Stretch:
         """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
-        fresh = self.state.count[0] == 0 or problem is not self.plan.problem
+        evaluations = self.state.count[records.EVALUATIONS]
+        fresh = evaluations == 0 or problem is not self.plan.problem
         if fresh:
             self.watch(last=True)
             self.flown = problem
@@ -368,21 +370,22 @@ class ActivePhase:
                 self.flown = solved_by(self.solver.aside, problem)
         self.begun = True
         samples = np.empty((len(times), len(self.state.y)))
-        self.state.count[3] = 0
+        self.state.count[records.SAMPLES] = 0
         return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
 
     def record(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare`."""
         state, (problem, times, samples, _, first) = self.state, stretch
-        done = int(state.count[3])
-        if state.count[0] and not state.count[1] and len(times) and times[0] <= first:
+        done = int(state.count[records.SAMPLES])
+        tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0
+        if tried and len(times) and times[0] <= first:
             samples[0], done = state.y, 1  # no step was possible: record the start alone
         if done:
             self._record(problem, times[:done], samples[:done])
 
-    def _stalled(self) -> bool:
+    def stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
-        steps = int(self.state.count[1] + self.state.count[2])
+        steps = int(self.state.count[records.ACCEPTED] + self.state.count[records.REJECTED])
         return steps > most_steps(self.t - self.plan.start)
 
     def _error(self) -> float:

@@ -11,7 +11,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
 from rigidfleet.mission.kinds import KINDS
 from rigidfleet.mission.losses import ON_LOSS
-from rigidfleet.planning.timing import with_times
+from rigidfleet.planning.timing import timed_leg
 from rigidfleet.planning.transitions import expanded
 from rigidfleet.result import PhaseRecord
 
@@ -67,7 +67,7 @@ def with_phase(
     data["phases"] = [*data["phases"], dict(table)]
     made = Mission.from_dict(data, "begin()")
     if not made.phases[-1].spelled:
-        spread = expanded(made, with_times)
+        spread = expanded(made, timed_leg)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
     _check_flown(made.phases[-1])

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.problem import Workspace
-from rigidfleet.kernel.records import IntegratorState
+from rigidfleet.kernel.records import ACCEPTED, NEXT_STEP, REJECTED, IntegratorState
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
@@ -39,11 +39,11 @@ def diagnose(at: Place, *, own_force: bool, collapsed: bool) -> str:
     def remedy() -> str:
         return _remedy(at, own_force=own_force, collapsed=collapsed)
 
-    count, h = at.state.count, float(at.state.clock[1])
+    count, h = at.state.count, float(at.state.clock[NEXT_STEP])
     if collapsed:
         what = f"the step size has fallen to {h:.1g} s"
     else:
-        what = f"{count[1] + count[2]} steps have been taken, the last of {h:.1g} s"
+        what = f"{count[ACCEPTED] + count[REJECTED]} steps have been taken, the last of {h:.1g} s"
     head = f"the flight cannot go on at t = {at.t:.3f} s, in phase '{at.plan.phase.name}': {what}"
     if not len(at.plan.edges):
         return f"{head}. {remedy()}"

@@ -18,6 +18,7 @@ from rigidfleet._common.arguments import numbers
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Mission, Phase, as_mission
+from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose
@@ -154,7 +155,7 @@ class _Flights:
     def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
         """Fly one phase and store its final states."""
         now, (count, n) = self.now, self.r.shape[:2]
-        plan = plan_phase(self.mission, phase, now)
+        plan = plan_phase(self.mission, leg_of(self.mission, phase, now))
         law = plan.problem.law._replace(mu=self.mission.damping(None))
         problem = plan.problem._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]

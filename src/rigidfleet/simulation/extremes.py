@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet._common.kept import kept
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -23,7 +24,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
 from rigidfleet.mission.model import Fleet
-from rigidfleet.result import DIRECTIONS, PAD, Extremum, PhaseRecord
+from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import joined
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -42,32 +43,12 @@ _TOUCH, _INSTANT = 1e-6, 1e-6
 _SHORTEST = 2.0**-20
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
 _ASKED = 2000
-#: Quantities that the monitor stores with the opposite sign.
-_GREATEST = frozenset(
-    ("geofence", "highest", "speed", "thrust", "thrust_margin", "acceleration", "constraint_force", "tension",
-     "constraint", *DIRECTIONS)
-)  # fmt: skip
-#: Quantities by name; the clearances at the start and the end belong to the whole flight.
-_NAMES = {
-    "separation": records.SEPARATION,
-    "lost": records.LOST,
-    "separation_below": records.SEPARATION_BELOW,
-    "separation_flying": records.SEPARATION_FLYING,
-    "clearance": records.CLEARANCE,
-    "geofence": records.GEOFENCE,
-    "lowest": records.LOWEST,
-    "highest": records.HIGHEST,
-    "speed": records.SPEED,
-    "thrust": records.THRUST,
-    "thrust_margin": records.THRUST_MARGIN,
-    "acceleration": records.ACCELERATION,
-    "constraint_force": records.CONSTRAINT_FORCE,
-    "tension": records.TENSION,
-    "constraint": records.CONSTRAINT,
-    **dict(zip(DIRECTIONS, range(records.HORIZONTAL_SPEED, records.QUANTITIES), strict=True)),
-}
+#: The monitor's number of each quantity that it finds; the clearances at the start and the end belong to the flight.
+_NAMES = {q.name: getattr(records, q.name.upper()) for q in QUANTITIES.values() if q.monitored}
+#: Quantities of a direction, which are searched for where one of them has a limit.
+_DIRECTIONS = [q for q in MOTIONS if q.monitored and q.way]
 #: What a monitor writes.
-_WRITTEN = "worst", "when", "who", "standing", "low", "flags"
+_WRITTEN = "worst", "when", "who", "standing", "low", "count"
 #: First contacts of a flight by name, each with the quantity that then falls below zero.
 _CONTACTS = {f"{name}_first": _NAMES[name] for name in ("separation", "lost", "clearance")}
 #: Extremes of a sampled flight by its column, the monitor's quantity, and its sign there.
@@ -80,7 +61,7 @@ _SAMPLED = (
 )
 _OF_FLIGHT = {"clearance_start": records.STANDING, "clearance_flight": records.FLYING}
 #: The quantities of a phase, each with its name, its index, and the sign with which it is stored.
-_STORED = [(name, k, -1.0 if name in _GREATEST else 1.0) for name, k in _NAMES.items()]
+_STORED = [(name, k, 1.0 if QUANTITIES[name].at_least else -1.0) for name, k in _NAMES.items()]
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
@@ -127,7 +108,7 @@ class CurveWatch:
         self.reach = -math.inf if lowest is None or self.n <= _FEW else limits.separation or 0.0
         self.stacks = self.n <= _FEW or limits.separation_below is not None
         #: Whether there are limits by direction: only then is what they limit searched for.
-        self.directed = any(getattr(limits, name) is not None for name in DIRECTIONS)
+        self.directed = any(getattr(limits, q.name) is not None for q in _DIRECTIONS)
         count = records.QUANTITIES
         self.none = np.full(count, np.inf)
         self.none[records.SEPARATION_FLYING] = abs(self.reach)
@@ -175,9 +156,9 @@ class CurveWatch:
         trail = state.trail._replace(clock=clock, points=points)
         if "monitor" not in vars(self):
             self._begin_monitor(points.shape[2], 0, 0)
-        self.take_path(
-            problem, work, state._replace(trail=trail, count=np.array([0, 0, 0, 0, len(clock), 0]))
-        )
+        count = np.zeros_like(state.count)
+        count[records.TRAILED] = len(clock)
+        self.take_path(problem, work, state._replace(trail=trail, count=count))
 
     def only(self, left: Bools) -> None:
         """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
@@ -195,14 +176,13 @@ class CurveWatch:
 
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
-        steps = int(state.count[4])
+        steps = int(state.count[records.TRAILED])
         self._take_solids(problem, state, np.arange(steps))
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
             return
-        self.monitor.monitor.flags[:3] = 0, steps, 0
-        self.monitor(problem, work, state)
+        self.monitor.distances(problem, state, 0, steps)
         self._find_contacts(problem, work, state, _rows(state, np.arange(steps)))
 
     def _find_contacts(
@@ -216,14 +196,14 @@ class CurveWatch:
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
             deepest = partial(self._deepest, kind, problem, work, state)
-            clock, points = state.trail.clock[rows], state.trail.points[rows]
-            while clock[-1].sum() - clock[0, 0] > _INSTANT:
-                if len(clock) == 1:
-                    clock, points = _halves(*clock[0], points[0])
-                half = len(clock) // 2
-                part = slice(half) if deepest(clock[:half], points[:half]) else slice(half, None)
-                clock, points = clock[part], points[part]
-            if (found := deepest(clock, points)) is not None:
+            steps, points = state.trail.clock[rows], state.trail.points[rows]
+            while steps[-1].sum() - steps[0, 0] > _INSTANT:
+                if len(steps) == 1:
+                    steps, points = _halves(*steps[0], points[0])
+                half = len(steps) // 2
+                part = slice(half) if deepest(steps[:half], points[:half]) else slice(half, None)
+                steps, points = steps[part], points[part]
+            if (found := deepest(steps, points)) is not None:
                 self.touched[name] = found
 
     def _deepest(
@@ -236,9 +216,9 @@ class CurveWatch:
         before = [array.copy() for array in arrays]
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
-        arrays[-1][:] = 0, len(steps[0]), 0, 0, records.ANY_STEP, records.ANY_STEP
+        arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
         self._take_solids(problem, state, np.arange(len(steps[0])))
-        self.monitor(problem, work, state)
+        self.monitor.distances(problem, state, 0, len(steps[0]))
         found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
@@ -254,7 +234,7 @@ class CurveWatch:
         laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
         watched = obstacles.monitor_of(self.monitor.monitor)
         for row in _rows(state, steps):
-            obstacles.watch(trail.points[row], trail.clock[row], laid, self.solids, watched)
+            obstacles.watch(trail.points[row], *trail.clock[row], laid, self.solids, watched)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -325,9 +305,7 @@ class CurveWatch:
             t, h, points = pieces.pop()
             trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
             piece = state._replace(trail=trail)
-            flags = self.monitor.monitor.flags
-            flags[:3] = 0, 1, 3
-            self.monitor(problem, work, piece)
+            self.monitor.bound_moves(problem, piece)
             moved = self.monitor.monitor.moves.copy()
             if not self.stacks:
                 moved[1] = 0.0
@@ -340,8 +318,7 @@ class CurveWatch:
                     continue
                 self._list(problem, points[0], float(moved.max()))
             self.moved += moved
-            self.monitor.monitor.flags[:3] = 0, 1, 0
-            self.monitor(problem, work, piece)
+            self.monitor.distances(problem, piece, 0, 1)
             self._find_contacts(problem, work, piece, np.zeros(1, dtype=np.int64))
 
     def _list(self, problem: Problem, y: Floats, moves: float) -> None:
@@ -387,7 +364,7 @@ class CurveWatch:
         self.spare, self.moved[:] = spare, 0.0
         before = self.monitor.monitor
         self.monitor = native.Watch(
-            before._replace(pairs=self.pairs, columns=self.columns, flags=before.flags.copy())
+            before._replace(pairs=self.pairs, columns=self.columns, count=before.count.copy())
         )
 
 
@@ -410,7 +387,7 @@ class Extremes(CurveWatch):
         self._take_obstacles(obstacles)
         if self.size is not None:
             found = self.monitor.monitor
-            self.monitor = native.Watch(found._replace(boxes=self.boxes, flags=found.flags.copy()))
+            self.monitor = native.Watch(found._replace(boxes=self.boxes, count=found.count.copy()))
 
     @property
     def reusable(self) -> bool:
@@ -426,8 +403,7 @@ class Extremes(CurveWatch):
         self.standing[:] = self.stood
         self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
         if self.size is not None:
-            flags = self.monitor.monitor.flags
-            flags[:], flags[records.LISTED :] = 0, records.ANY_STEP
+            self.monitor.monitor.count[:] = 0, records.ANY_STEP, records.ANY_STEP
 
     def begin(
         self,
@@ -507,23 +483,22 @@ class Extremes(CurveWatch):
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        flags, steps = self.monitor.monitor.flags, int(state.count[4])
-        new: Ints = np.arange(int(flags[3]), steps)
-        listed = int(flags[records.LISTED])
+        count, steps = self.monitor.monitor.count, int(state.count[records.TRAILED])
+        new: Ints = np.arange(int(count[records.STAYED]), steps)
+        listed = int(count[records.LISTED_DISTANCES])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
         self._take_solids(problem, state, new)
-        flags[:3] = flags[3], steps, 2 if last else 1
         if self.n > _FEW:
             for step in new:
                 self._step(problem, work, state, step)
-            flags = self.monitor.monitor.flags
-            flags[:3] = steps, steps, 2 if last else 1
-        self.monitor(problem, work, state)
+        else:
+            self.monitor.distances(problem, state, steps - len(new), steps)
+        self.monitor.forces(problem, work, state, last=last)
         self._find_contacts(problem, work, state, rows)
 
     def room(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
-        half, steps = self._half(state), int(state.count[4])
+        half, steps = self._half(state), int(state.count[records.TRAILED])
         if self._touching is not None:
             if not steps:
                 return half
@@ -538,7 +513,8 @@ class Extremes(CurveWatch):
         """
         taken, count = state._replace(count=state.count.copy()), state.count
         # The last step stays, until its neighbour is known.
-        count[4:] = 1, (count[5] + count[4] - 1) % len(state.trail.clock)
+        row = _rows(state, count[records.TRAILED] - 1)
+        count[records.TRAILED], count[records.FIRST_ROW] = 1, row
         self._taking = self._beside().submit(self._take_aside, problem, work, taken)
 
     def _take_aside(self, *given: Any) -> None:
@@ -588,7 +564,7 @@ class Extremes(CurveWatch):
             )
         share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
         i = int(share.argmax())
-        found["saturation"] = Extremum(float(share[i]), float(state.clock[0]), i, -1)
+        found["saturation"] = Extremum(float(share[i]), float(state.clock[fleet.TIME]), i, -1)
         self.of_vehicles = found
 
     def _avoided(self) -> dict[str, Extremum]:
@@ -641,4 +617,4 @@ def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
 
 def _rows(state: records.IntegratorState, steps: ArrayLike) -> Ints:
     """Rows (S,) of the trail that hold some of the steps in it (S,), which are numbered from 0."""
-    return (state.count[5] + np.asarray(steps)) % len(state.trail.clock)
+    return (state.count[records.FIRST_ROW] + np.asarray(steps)) % len(state.trail.clock)

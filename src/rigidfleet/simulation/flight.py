@@ -19,11 +19,11 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
+from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.preview import at_start
 from rigidfleet.planning.reference import PhaseState, Pose, changed
-from rigidfleet.planning.timing import with_times
+from rigidfleet.planning.timing import timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
@@ -332,22 +332,11 @@ class Flight:
         self._leave(changed=True)
         if self.mission.on_loss == "continue" or not self._given(phase):
             self._now.blend = None
-        try:
-            phase = with_times(self.mission, phase, self._now, len(self._asked))
-        except MissionError as error:
-            if by_hand:
-                raise
-            self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
-            return False
         if self._asked:
             self._report(phase, planning=True)
         try:
-            if self._now is self._begins and self._now.lost is None:
-                plan = self._prepared.first_plan(phase, self._now, self._disturbance, self._push)
-            else:
-                plan = plan_phase(
-                    self.mission, phase, self._now, disturbance=self._disturbance, external=self._push
-                )  # fmt: skip
+            plan = self._planned(phase)
+            phase = plan.phase
             self._check_frame(plan)
             make = ActivePhase
             if self._vehicles is not None:
@@ -356,6 +345,11 @@ class Flight:
                 len(self.phases), plan, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip
+        except MissionError as error:
+            if by_hand:
+                raise
+            self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
+            return False
         except StoppedError as stop:
             self.ending = str(stop)
             return False
@@ -555,6 +549,14 @@ class Flight:
         return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
+
+    def _planned(self, phase: Phase) -> PhasePlan:
+        """The plan of a phase from the state now, with its times known."""
+        now, disturbance, push = self._now, self._disturbance, self._push
+        if now is self._begins and now.lost is None:
+            return self._prepared.first_plan(phase, now, disturbance, push)
+        leg = timed_leg(self.mission, phase, now, len(self._asked))
+        return plan_phase(self.mission, leg, disturbance=disturbance, external=push)
 
     @property
     def _now(self) -> PhaseState:

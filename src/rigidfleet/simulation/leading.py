@@ -234,8 +234,8 @@ class Leader:
         plan = self.plan
         plan.t_end, plan.arrival = moved(plan.t_end), moved(plan.arrival)
         plan.through = tuple(at | {"time": moved(at["time"])} for at in plan.through)
-        if begun < plan.blend.t0 + plan.blend.T_b:
-            plan.blend = plan.blend._replace(t0=plan.blend.t0 + lost)
+        if begun < (blend := plan.reference).t0 + blend.T_b:
+            plan.reference = blend._replace(t0=blend.t0 + lost)
 
     def _late(self, problem: Problem) -> Problem:
         """The plan's problem, later by the delay of the clock."""

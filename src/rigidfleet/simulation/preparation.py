@@ -10,7 +10,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, changed
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import timed, timed_leg
 from rigidfleet.simulation.extremes import Extremes
 
 #: Number of missions whose preparation is kept, and their greatest number of agents.
@@ -22,7 +22,7 @@ class Preparation:
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
-        self._plans: dict[tuple[int, External], PhasePlan] = {}
+        self._plans: dict[tuple[int, External], tuple[Phase, PhasePlan]] = {}
         self._idle: list[Extremes] = []
 
     @cached_property
@@ -59,18 +59,17 @@ class Preparation:
 
         Raises
         ------
-        StoppedError
-            As `plan_phase` does.
+        MissionError, StoppedError
+            As `timed_leg` and `plan_phase` do.
         """
         key = id(phase), external
         found = self._plans.get(key)
-        if found is None or found.phase is not phase:
-            found = plan_phase(self.mission, phase, now, disturbance=given, external=external)
-            _ = found.certificate, found.tolerances  # once for all flights
-            self._plans = {key: found}
-        plan = changed(found)
-        plan.before = changed(found.before)
-        return plan
+        if found is None or found[0] is not phase:
+            leg = timed_leg(self.mission, phase, now, 0)
+            plan = plan_phase(self.mission, leg, disturbance=given, external=external)
+            _ = plan.certificate, plan.tolerances  # once for all flights
+            self._plans = {key: (found := (phase, plan))}
+        return changed(found[1], before=changed(found[1].before))
 
 
 _prepared: OrderedDict[int, tuple[Mission, Preparation]] = OrderedDict()

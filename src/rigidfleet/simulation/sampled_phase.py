@@ -224,9 +224,9 @@ class SampledPhase(ActivePhase):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
             within = (abs(self.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
-            self.state.count[4] = rows if within.all() else int(within.argmin())
+            self.state.count[records.TRAILED] = rows if within.all() else int(within.argmin())
             self.extremes.take_path(self.flown, self.workspace, self.state)
-            self.sampled.count[fleet.TRAILED] = self.state.count[4] = 0
+            self.sampled.count[fleet.TRAILED] = self.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
@@ -252,7 +252,7 @@ class SampledPhase(ActivePhase):
                 status = fly_ticks(problem, self.workspace, self.flight, sampled, call, given)
                 self._follow()
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
-                    self.state.clock[0] = t_end
+                    self.state.clock[records.TIME] = t_end
                 if self.external is not None:
                     self.external.check()
                 self.check()
@@ -308,9 +308,9 @@ class SampledPhase(ActivePhase):
         y[6 * n : 6 * n + m] = sampled.integral[0]
         if self.plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
-        state.clock[0] = sampled.clock[0]
-        state.count[0] = 4 * sampled.count[fleet.STEPS]
-        state.count[1] = sampled.count[fleet.STEPS]
+        state.clock[records.TIME] = sampled.clock[fleet.TIME]
+        state.count[records.EVALUATIONS] = 4 * sampled.count[fleet.STEPS]
+        state.count[records.ACCEPTED] = sampled.count[fleet.STEPS]
 
     def _led(self, times: Floats) -> Led:
         """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""

@@ -89,7 +89,7 @@ def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState)
     step would cost a large formation more.
     """
     problem: Problem = plan.problem
-    t, y = float(state.clock[0]), state.y
+    t, y = float(state.clock[records.TIME]), state.y
     scale = plan.tolerances + state.rtol * np.abs(y)
 
     def size(x: Floats) -> float:
@@ -103,5 +103,5 @@ def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState)
     native.closed_loop(t + h, y + h * slope, later, problem, work)
     steepest = max(first, size(later - slope) / h)
     if not 0.0 < steepest < math.inf:
-        return float(state.clock[1])
+        return float(state.clock[records.NEXT_STEP])
     return min(100.0 * h, (0.01 / steepest) ** 0.2, longest)

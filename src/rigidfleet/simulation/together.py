@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, TypeVar
 
 from rigidfleet.kernel import records
 from rigidfleet.mission import Mission
-from rigidfleet.planning.tolerances import most_steps
 from rigidfleet.result import Result
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.flight import Flight, simulate
@@ -121,7 +120,7 @@ def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
         if status == records.PAUSED:
             for phase in active:
                 phase.watch(last=False)
-            if sum(active[0].state.count[1:3]) > most_steps(active[0].t - active[0].plan.start):
+            if active[0].stalled():
                 return False
     for phase, stretch in zip(active, stretches, strict=True):
         phase.record(stretch)

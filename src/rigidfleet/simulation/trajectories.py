@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
@@ -57,7 +58,7 @@ NAMES = {
     7: "polynomials of degree 7",
 }
 #: Limits of a mission that positions over time do not show.
-UNJUDGED = ("jerk", "tilt_deg", "saturation", "tracking_error", "separation_allowance")
+UNJUDGED = {q.key.removeprefix("limits.") for q in QUANTITIES.values() if not q.monitored}
 #: What of a mission trajectories are judged by, beside radii and masses.
 _JUDGING = "schema_version", "name", "title", "limits", "obstacles", "gravity", "geodetic_origin"
 #: Name of the only phase.

@@ -25,7 +25,6 @@ from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_t
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, Shared, unknown_key
 from rigidfleet.mission.loading import as_mission
-from rigidfleet.mission.phases import kind, tables
 from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part
 from rigidfleet.sweep import controllers, keypaths
@@ -399,7 +398,7 @@ def _checked(
     whole = None if mission is None else keypaths.whole_document(mission)
     variations: list[Variation] = []
     lacked: list[tuple[int, SweepColumn]] = []
-    for k, entry in enumerate(tables(collector, "vary")):
+    for k, entry in enumerate(collector.tables("vary")):
         if k in wrong:
             collector.add(("vary", k), wrong[k].problem, wrong[k].remedy)
             continue
@@ -438,7 +437,7 @@ def _checked(
 def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:
     """Check a variation by itself; None if it has errors."""
     before = len(collector.findings)
-    model = kind(collector, entry, ("vary", k), KINDS)
+    model = collector.kind(entry, ("vary", k), KINDS)
     found = None if model is None else collector.validate(model, entry, ("vary", k))
     if found is not None and len(collector.findings) == before and (problem := found.wrong()):
         key, *words = problem

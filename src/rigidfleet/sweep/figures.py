@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.plotting import contents, write_files
 from rigidfleet.plotting import style as st
@@ -325,22 +326,14 @@ def _axis_label(table: Table, name: str) -> str:
 
 def _limits(table: Table) -> dict[str, float]:
     """Limits of the mission for metrics, unless they vary."""
-    limits, agents = table.sweep.mission.limits, table.sweep.mission.agents
-    found = {
-        "speed": limits.speed,
-        "acceleration": limits.acceleration,
-        "separation": limits.separation_always,
-        "separation_flying": limits.separation,
-        "separation_below": limits.separation_below,
-        "thrust": min(agents.thrust_limit),
-        "clearance": 0.0 if table.sweep.mission.obstacles else None,
-    }
     moved = {key for column in table.sweep.columns for key in column.keys[:2]}
-    moved |= {"thrust"} if "thrust_limit" in moved else set()
+    limits = {q.name: q.limit_of(table.sweep.mission) for q in QUANTITIES.values() if q.metric}
     return {
-        name: v
-        for name, v in found.items()
-        if v is not None and math.isfinite(v) and name not in moved
+        name: float(np.min(limit)) / (100.0 if QUANTITIES[name].unit == "%" else 1.0)
+        for name, limit in limits.items()
+        if limit is not None
+        and np.isfinite(limit).any()
+        and not moved & {name, QUANTITIES[name].key.rpartition(".")[2]}
     }
 
 

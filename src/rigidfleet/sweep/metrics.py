@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigidfleet._common.quantities import QUANTITIES, shown
 from rigidfleet.math import proximity
-from rigidfleet.result import DIRECTIONS
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -30,6 +30,11 @@ class Metric:
     text: str
 
 
+#: Units as files of arrays have them.
+_NOTATION = {
+    "m/s": "m s-1", "m/s^2": "m s-2", "m/s^3": "m s-3", "deg/s": "deg s-1", "%": "1", "": "1",
+}  # fmt: skip
+
 METRICS: dict[str, Metric] = {
     "shape_end": Metric("m", "shape error at the end: largest error of all pair distances"),
     "shape": Metric("m", "largest shape error at the end of a phase"),
@@ -42,54 +47,32 @@ METRICS: dict[str, Metric] = {
     "shape_tracked": Metric("m", "largest shape error with slots in flight, at samples"),
     "shape_tracked_rms": Metric("m", "root mean square of these errors over time"),
     "shape_forces": Metric("m", "largest shape error by constraint forces alone, at samples"),
-    "tracking_error": Metric("m", "largest distance of a vehicle from its slot, at samples"),
     "tracking_rms": Metric("m", "root mean square over time of the largest of these distances"),
     "constraint_end": Metric("m", "largest constraint error |c| = |L - d| at the end"),
-    "constraint": Metric(
-        "m", "largest constraint error |c| = |L - d|: edge length minus reference"
-    ),
     "handed": Metric("1", "1: right-handed at the end of every phase; 0: mirrored"),
     "flip": Metric("deg", "largest angle of a plane or line from its intended direction"),
     "waypoint_position": Metric("m", "largest position error at a waypoint or stay"),
     "waypoint_velocity": Metric("m s-1", "largest velocity error at a waypoint or stay"),
     "waypoint_attitude": Metric("deg", "largest attitude error at a waypoint or stay"),
     "waypoint_rates": Metric("deg s-1", "largest error of body rates at a waypoint or stay"),
-    "separation": Metric("m", "minimum separation of two agents: centre distance minus radii"),
-    "separation_below": Metric("m", "minimum height above another agent minus radii"),
-    "separation_flying": Metric("m", "minimum separation from limits.separation_altitude on"),
-    "clearance": Metric("m", "minimum clearance to an obstacle: distance minus radius"),
-    "geofence": Metric("m", "maximum distance outside the geofence; negative inside"),
-    "thrust": Metric("N", "thrust closest to or farthest beyond its limit; peak if there is none"),
+    **{
+        q.name: Metric(_NOTATION.get(q.unit, q.unit), q.text)
+        for q in QUANTITIES.values()
+        if q.metric
+    },
     "rotor_share": Metric(
         "1", "rotor force closest to its limit, as a share of it; only of vehicles with rotors"
     ),
-    "saturation": Metric(
-        "1", "largest share of a phase in which a vehicle is asked for more than its rotors give"
-    ),
-    "tilt": Metric("deg", "maximum tilt of a vehicle with rotors"),
-    "speed": Metric("m s-1", "maximum speed"),
-    "acceleration": Metric("m s-2", "maximum acceleration"),
-    "horizontal_speed": Metric("m s-1", "maximum speed over the ground, if it has a limit"),
-    "vertical_speed": Metric("m s-1", "maximum speed up and down, if it has a limit"),
-    "horizontal_acceleration": Metric("m s-2", "maximum horizontal acceleration, if limited"),
-    "vertical_acceleration": Metric("m s-2", "maximum acceleration up and down, if limited"),
-    "constraint_force": Metric("N", "maximum constraint force on an agent"),
-    "tension": Metric("N", "tension of largest magnitude in an edge; negative: compression"),
-    "singular_value": Metric("1", "smallest singular value of the constraint Jacobian"),
     "flown": Metric("s", "mission time at the end"),
     "steps": Metric("1", "steps of the integrator"),
     "evaluations": Metric("1", "evaluations of the right-hand side"),
 }
 
 
-#: Metrics that are the worst values of checks.
-_OF_CHECKS = "separation_below", "separation_flying", "geofence", "thrust", "tilt", *DIRECTIONS
-
-
 def readable(unit: str) -> str:
     """A unit for display: m/s² for m s-2."""
-    words = {"1": "-", "m s-1": "m/s", "m s-2": "m/s²", "deg s-1": "deg/s"}
-    return words.get(unit, unit)
+    words = {code: unit for unit, code in _NOTATION.items()} | {"1": "-"}
+    return shown(words.get(unit, unit))
 
 
 def measure(result: Result, verdict: Verdict) -> dict[str, float]:
@@ -111,16 +94,13 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
         found[f"waypoint_{name}"] = _greatest(misses)
-    worst = {name: extreme.value for name, extreme in verdict.worst.items()}
-    for f in verdict.checks:
-        if f.worst is None:
-            continue
-        if f.check in _OF_CHECKS:
-            worst[f.check] = f.worst
-        elif f.check == "rotor_force" and f.limit is not None:
-            worst["rotor_share"] = f.worst / f.limit
-        elif f.check == "saturation":
-            worst["saturation"] = f.worst / 100.0
+    worst = {f.check: f.worst for f in verdict.checks if f.worst is not None}
+    if (rotor := next((f for f in verdict.checks if f.check == "rotor_force"), None)) is not None:
+        worst["rotor_share"] = (rotor.worst or 0.0) / (rotor.limit or math.inf)
+    if "saturation" in worst:
+        worst["saturation"] /= 100.0
+    # Of clearances, those of vehicles that stand on an obstacle count, too.
+    worst |= {name: e.value for name, e in verdict.worst.items() if name != "thrust"}
     return {name: float((worst | found).get(name, math.nan)) for name in METRICS}
 
 

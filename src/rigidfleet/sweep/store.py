@@ -109,10 +109,11 @@ class Store:
             )
             for row in rows
         ]  # fmt: skip
-        marks = ", ".join("?" * (len(_COLUMNS) + 1))
+        columns = ("run", *_COLUMNS)
+        names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
         with _explained(self.path), self.db:
             self.db.execute("BEGIN IMMEDIATE")
-            self.db.executemany(f"INSERT OR REPLACE INTO runs VALUES ({marks})", entries)
+            self.db.executemany(f"INSERT OR REPLACE INTO runs ({names}) VALUES ({marks})", entries)
 
     def there(self) -> Bools:
         """Mask (runs,) of the finished runs."""
@@ -132,9 +133,9 @@ class Store:
             _readable(self.db, self.path.parent)
             self.db.execute(f"PRAGMA user_version = {_FORMAT}")
             self.db.execute("CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT)")
-            columns = ", ".join(f'"{name}" {_KINDS.get(name, "REAL")}' for name in _COLUMNS)
-            schema = f"run INTEGER PRIMARY KEY, {columns}"
-            self.db.execute(f"CREATE TABLE IF NOT EXISTS runs ({schema})")
+            self.db.execute("CREATE TABLE IF NOT EXISTS runs (run INTEGER PRIMARY KEY)")
+            for name in sorted(set(_COLUMNS) - _stored(self.db), key=_COLUMNS.index):
+                self.db.execute(f'ALTER TABLE runs ADD "{name}" {_KINDS.get(name, "REAL")}')
             there = dict(self.db.execute("SELECT key, value FROM sweep"))
             if there and there.get("identity") != identity:
                 raise ResultError(f"{self.path.parent}: {_difference(there, identity)}")
@@ -145,6 +146,11 @@ class Store:
                 )
             entries = {"identity": identity, "sweep": sweep.json()}
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
+
+
+def _stored(db: sqlite3.Connection) -> set[str]:
+    """Columns of a store: one that an earlier version wrote may lack metrics."""
+    return {name for _, name, *_ in db.execute("PRAGMA table_info(runs)")}
 
 
 def is_store(folder: Path) -> bool:
@@ -175,8 +181,9 @@ def read(folder: str | Path) -> Table:
     """
     folder = Path(folder)
     sweep = read_sweep(folder)
-    names = ", ".join(f'"{name}"' for name in _COLUMNS)
     with _reading(folder) as db:
+        known = _stored(db)
+        names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
         rows = db.execute(f"SELECT run, {names} FROM runs ORDER BY run").fetchall()
     run, passed, reason, detail, wall, codes, *metrics = list(zip(*rows, strict=True)) or [
         () for _ in ("run", *_COLUMNS)

@@ -35,9 +35,15 @@ from rigidfleet.kernel.problem import (
 )
 from rigidfleet.kernel.records import (
     ATOL,
+    EVALUATIONS,
     FINISHED,
+    FIRST_ROW,
+    LAST_ERROR,
     LEAST_ERROR,
+    NEXT_STEP,
     NO_TRAIL,
+    TIME,
+    TRAILED,
     IntegratorState,
     Monitor,
     Trail,
@@ -69,11 +75,11 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
             state.y[q] = starts[g, q]
         for k in range(before.shape[1]):
             p.before[k] = before[g, k]
-        state.clock[0], state.clock[1], state.clock[2] = t0, step, LEAST_ERROR
-        for q in range(4):
+        state.clock[TIME], state.clock[NEXT_STEP], state.clock[LAST_ERROR] = t0, step, LEAST_ERROR
+        for q in range(TRAILED):
             state.count[q] = 0
         status[g] = integrate(p, p, state, t_end, fresh, unsampled, ends[:0], max_steps)
-        evaluations[g] = state.count[0]
+        evaluations[g] = state.count[EVALUATIONS]
         for q in range(starts.shape[1]):
             ends[g, q] = state.y[q]
 
@@ -201,7 +207,7 @@ class Vector:
             state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
         ):
             self._allocate(problems)
-        tables = self._tables.between(float(states[0].clock[0]), t_end)
+        tables = self._tables.between(float(states[0].clock[TIME]), t_end)
         ready = unrolled_together(problems, tables)
         lane_bounds.begin(self._search, monitors)
         places = np.array([x.ctypes.data for x in samples])
@@ -210,7 +216,7 @@ class Vector:
         K, n = self._K, len(first.y)
         unpack(K)[: lane_steps.STAGES] = 0.0
         unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
-        clock = np.array([first.clock[0], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
+        clock = np.array([first.clock[TIME], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
         y, count = packed([state.y for state in states]), np.zeros_like(first.count)
         self._state = IntegratorState(y, K, clock, count, first.rtol, self._length)
         self._fresh = True
@@ -231,8 +237,8 @@ class Vector:
         States and samples are then known, and the steps that monitors have to search.
         """
         state = self._state
-        state.count[4:] = self._states[0].count[4:]
-        before = int(state.count[4])
+        state.count[TRAILED:] = self._states[0].count[TRAILED:]
+        before = int(state.count[TRAILED])
         status = fly_on(
             self._problem, state, self._t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
@@ -241,9 +247,9 @@ class Vector:
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
-        steps = range(before, int(state.count[4]))
+        steps = range(before, int(state.count[TRAILED]))
         if steps:
-            search, first = self._problem.search, int(state.count[5])
+            search, first = self._problem.search, int(state.count[FIRST_ROW])
             lane_bounds.list_steps(search, first, steps, self._monitors)
         return int(status)
 
@@ -300,7 +306,11 @@ def fly_all(
     def begin() -> Callable[..., None]:
         K = np.zeros((lane_steps.ROWS, n, WIDTH))
         K[lane_steps.ATOL] = atol[:, None]
-        y, clock, counts = pack(np.zeros((n, WIDTH))), np.zeros(3), np.zeros(6, dtype=np.int64)
+        y, clock, counts = (
+            pack(np.zeros((n, WIDTH))),
+            np.zeros(3),
+            np.zeros(FIRST_ROW + 1, dtype=np.int64),
+        )
         state = IntegratorState(y, pack(K), clock, counts, rtol, NO_TRAIL)
         own = ready._replace(
             before=empty(ready.before.shape), known=empty(ready.known.shape), time=ready.time.copy(),
@@ -348,7 +358,7 @@ def _fly_alone(
                 d0[:] = before[k]
                 state = integrator(start, times[0], rtol=rtol, atol=atol, step=_FIRST_STEP)
                 status[k] = native.integrate(own, w, state, times[1], True, *unsampled, max_steps)
-                ends[k], evaluations[k] = state.y, state.count[0]
+                ends[k], evaluations[k] = state.y, state.count[EVALUATIONS]
 
         return work
 

@@ -46,7 +46,7 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
     """Object code of the C functions that `native` calls, `objects.ENTRIES`.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
-    record, and monitor (as `monitor.watch` does). The ``second`` process, if there is one, makes what is `apart`.
+    record, and monitor. The ``second`` process, if there is one, makes what is `apart`.
     """
     problem, workspace, integrator, segment, record, *_ = _pointers()
 
@@ -65,11 +65,12 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
         return 0
 
     keep_extents()
-    functions = zip((integrate_segment, record_segment), objects.ENTRIES, strict=False)
-    modules = [_module(function, name) for function, name in functions]
+    names = list(objects.ENTRIES)
+    functions = zip((integrate_segment, record_segment), names, strict=False)
+    modules = [_module(function, name, objects.ENTRIES[name]) for function, name in functions]
     text, symbol, _ = modules[0]
     codes = [_object(*module) for module in modules]
-    three = _object(text, symbol, objects.ENTRIES[-1], sizes=THREE)
+    three = _object(text, symbol, names[-1], sizes=THREE)
     made = None if second is None else objects.separated(second.communicate()[0])
     return [*codes, *(made or apart()), three]
 
@@ -80,8 +81,17 @@ def apart() -> list[bytes]:
         _pointers()
     )
 
-    def watch_trail(p, w, state, found):
-        return monitor.watch(problem(p), workspace(w), integrator(state), watching(found))
+    def bound_moves(p, state, watch):
+        monitor.bound_moves(problem(p), integrator(state), watching(watch))
+        return 0
+
+    def watch_distances(first, end, p, state, watch):
+        monitor.watch_distances(first, end, problem(p), integrator(state), watching(watch))
+        return 0
+
+    def watch_forces(last, p, w, state, watch):
+        monitor.watch_forces(last, problem(p), workspace(w), integrator(state), watching(watch))
+        return 0
 
     def called(function, of):
         def call(address):
@@ -94,17 +104,19 @@ def apart() -> list[bytes]:
         return gathering.gather(of, count, asked, words)
 
     functions = (
-        (watch_trail, 4),
-        (called(measurement.measure, measured), 1),
-        (called(measurement.spectrum, spectrum), 1),
-        (called(nearest.nearest_boxes, boxes), 1),
-        (called(recursion.follow, recursing), 1),
-        (gather, 4),
+        bound_moves,
+        watch_distances,
+        watch_forces,
+        called(measurement.measure, measured),
+        called(measurement.spectrum, spectrum),
+        called(nearest.nearest_boxes, boxes),
+        called(recursion.follow, recursing),
+        gather,
     )
-    entries = zip(functions, objects.ENTRIES[2:-1], strict=True)
+    entries = zip(functions, list(objects.ENTRIES.items())[2:-1], strict=True)
     return [
         _object(*_module(function, name, words), loops=name == "rigidfleet_nearest")
-        for (function, words), name in entries
+        for function, (name, words) in entries
     ]
 
 
@@ -122,8 +134,8 @@ def sampled_code() -> list[bytes]:
     def evaluate(f, call):
         return quadrotor.evaluate(flight(f), evaluation(call))
 
-    entries = zip((fly, evaluate), (5, 2), objects.SAMPLED_ENTRIES, strict=True)
-    modules = [_module(function, name, arguments) for function, arguments, name in entries]
+    entries = zip((fly, evaluate), objects.SAMPLED_ENTRIES.items(), strict=True)
+    modules = [_module(function, *entry) for function, entry in entries]
     return [_object(*module, hot=_HOT_SAMPLED) for module in modules]
 
 

@@ -34,7 +34,7 @@ from rigidfleet.kernel.records import (
     CONSTRAINT_FORCE,
     HIGHEST,
     HORIZONTAL_SPEED,
-    LISTED,
+    LISTED_DISTANCES,
     LOWEST,
     SEPARATION,
     SPEED,
@@ -278,7 +278,7 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
         distances, forces = count[lane].tolist()
         monitor.listed[0, :distances] = found[lane, 0, :distances]
         monitor.listed[1, :forces] = found[lane, 1, :forces]
-        monitor.flags[LISTED:] = distances, forces
+        monitor.count[LISTED_DISTANCES:] = distances, forces
 
 
 def _landing(monitor: Monitor) -> bool:

@@ -24,6 +24,7 @@ from rigidfleet.kernel.compiler.simd import spread
 from rigidfleet.kernel.dopri5 import step_to_knot
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.engine.lane_bounds import begin_forces, bound_forces, bound_step
+from rigidfleet.kernel.records import EVALUATIONS, FIRST_ROW, SAMPLES, TIME, TRAILED
 from rigidfleet.kernel.vectors import filled, rough_inverse
 
 #: Number of stages; rows of `IntegratorState.K` after them: the last ones are the state halfway, and its derivative.
@@ -235,7 +236,7 @@ def keep_step(t, h, p, w, state):
     """
     k, found, rows = state.K, p.search, state.trail.clock.shape[0]
     coordinates = _coordinates(k, p)
-    row = (state.count[5] + state.count[4]) % rows
+    row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
     before, after = (row + rows - 1) % rows, (row + 1) % rows
     for g in range(found.gauge.shape[1]):
         found.gauge[after, g] = p.gauge[g]
@@ -243,7 +244,7 @@ def keep_step(t, h, p, w, state):
     _to_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
-    state.count[0] += 1
+    state.count[EVALUATIONS] += 1
     for g in range(found.gauge.shape[1]):
         found.gauge[row, g] = p.gauge[g]
     found.clock[row, 0], found.clock[row, 1] = t, 0.5 * h
@@ -258,7 +259,7 @@ def keep_step(t, h, p, w, state):
     bound_forces(t + 0.5 * h, found, row, before)
     bound_step(found, after)
     bound_forces(t + h, found, after, row)
-    state.count[4] += 2
+    state.count[TRAILED] += 2
 
 
 @compiled
@@ -266,7 +267,7 @@ def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
     for g in range(p.search.gauge.shape[1]):
         spread(p.gauge[g], p.search.trails[2], g)
-    begin_forces(state.clock[0], p.gauge, p.search)
+    begin_forces(state.clock[TIME], p.gauge, p.search)
 
 
 @compiled
@@ -274,10 +275,10 @@ def keep_samples(t, h, t_new, times, samples, p, state):
     """As `dopri5.keep_samples`, for each flight into its own samples, from the rows of a step that is kept."""
     found, count = p.search, state.count
     n, rows = state.K.shape[1], state.trail.clock.shape[0]
-    while count[3] < times.shape[0] and times[count[3]] <= t_new:
-        x = 2.0 * (times[count[3]] - t) / h
+    while count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
+        x = 2.0 * (times[count[SAMPLES]] - t) / h
         half = 1 if x > 1.0 else 0
-        points = found.points[(count[5] + count[4] - 2 + half) % rows]
+        points = found.points[(count[FIRST_ROW] + count[TRAILED] - 2 + half) % rows]
         x -= half
         z = 1.0 - x
         for q in range(n):
@@ -285,8 +286,8 @@ def keep_samples(t, h, t_new, times, samples, p, state):
                 (z * z) * points[0, q] + (4.0 * x * z) * points[1, q] + (6.0 * x * x) * points[2, q]
             )
             value += (x * x * x) * ((4.0 * z) * points[3, q] + x * points[4, q])
-            spread(value, p.samples, n * count[3] + q)
-        count[3] += 1
+            spread(value, p.samples, n * count[SAMPLES] + q)
+        count[SAMPLES] += 1
 
 
 #: What differs from `dopri5.integrate`, beside the right-hand side and `keep_step`, which calls it.

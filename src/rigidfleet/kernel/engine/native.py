@@ -15,7 +15,6 @@ import sys
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -114,7 +113,7 @@ def record_into(
 
 
 class Watch:
-    """A callable that finds the extremes of the steps in trails, see `rigidfleet.kernel.monitor.watch`."""
+    """Finds the extremes of the steps in trails, see `rigidfleet.kernel.monitor`."""
 
     def __init__(self, monitor: Monitor) -> None:
         # The recorder evaluates the law, at the monitor's own time and state.
@@ -126,9 +125,21 @@ class Watch:
         )
         self._packed = pack(self.monitor)
 
-    def __call__(self, problem: Problem, workspace: Workspace, state: IntegratorState) -> int:
-        """Monitor the steps; return what `rigidfleet.kernel.monitor.watch` returns."""
-        return _call(_code().watch, packed(problem), packed(workspace), packed(state), self._packed)
+    def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
+        """Bound how far distances change over the first step, into ``monitor.moves``."""
+        _call(_code().bound_moves, packed(problem), packed(state), self._packed)
+
+    def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
+        """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
+        of = packed(problem).address, packed(state).address, self._packed.address
+        _code().watch_distances(first, end, *of)
+
+    def forces(
+        self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
+    ) -> None:
+        """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
+        of = [packed(x).address for x in (problem, workspace, state)]
+        _code().watch_forces(int(last), *of, self._packed.address)
 
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
@@ -188,7 +199,9 @@ def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> 
 class _Code(NamedTuple):
     integrate: Any
     record: Any
-    watch: Any
+    bound_moves: Any
+    watch_distances: Any
+    watch_forces: Any
     measure: Any
     spectrum: Any
     nearest: Any
@@ -255,15 +268,16 @@ def _load(part: str) -> Any:
 
 def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
     engine = _engine(parts)
-    *calls, gather, three = map(partial(_function, engine), ENTRIES, (4, 4, 4, 1, 1, 1, 1, 4, 4))
+    *calls, gather, three = [_function(engine, *entry) for entry in ENTRIES.items()]
     use(gather, engine)
     distance.use(nearest_boxes)
-    return _Code(*calls, three, engine.get_function_address(ENTRIES[1]), engine, unkept)
+    recorder = engine.get_function_address("rigidfleet_record")
+    return _Code(*calls, three, recorder, engine, unkept)
 
 
 def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Sampled:
     engine = _engine(parts)
-    calls = map(partial(_function, engine), SAMPLED_ENTRIES, (5, 2))
+    calls = [_function(engine, *entry) for entry in SAMPLED_ENTRIES.items()]
     return Sampled(*calls, _code().recorder, engine, unkept)
 
 

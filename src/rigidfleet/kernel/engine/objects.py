@@ -11,16 +11,26 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-#: Names of the machine code's functions. Their arguments are addresses: int64(problem, workspace, integrator, segment),
-#: int64(problem, workspace, segment, record) and int64(problem, workspace, integrator, monitor); int64(measured),
-#: int64(spectrum), int64(nearest), int64(recursion) and int64(objects, count, asked, words). Each function is in its
-#: own object. The last one is the first for three agents with three edges.
-ENTRIES = (
-    "rigidfleet_integrate", "rigidfleet_record", "rigidfleet_watch", "rigidfleet_measure", "rigidfleet_spectrum",
-    "rigidfleet_nearest", "rigidfleet_follow", "rigidfleet_gather", "rigidfleet_integrate_three",
-)  # fmt: skip
-#: Those of the second library: int64(problem, workspace, flight, state, segment) and int64(flight, evaluation).
-SAMPLED_ENTRIES = "rigidfleet_fly_ticks", "rigidfleet_evaluate"
+#: The machine code's functions, by name, with how many words they take: integers, or addresses of named tuples. Each
+#: is in its own object, and returns a word. The last one is the first for three agents with three edges.
+ENTRIES = {
+    "rigidfleet_integrate": 4,  # problem, workspace, integrator, segment
+    "rigidfleet_record": 4,  # problem, workspace, segment, record
+    "rigidfleet_bound_moves": 3,  # problem, integrator, monitor
+    "rigidfleet_watch_distances": 5,  # first, end, problem, integrator, monitor
+    "rigidfleet_watch_forces": 5,  # last, problem, workspace, integrator, monitor
+    "rigidfleet_measure": 1,
+    "rigidfleet_spectrum": 1,
+    "rigidfleet_nearest": 1,
+    "rigidfleet_follow": 1,
+    "rigidfleet_gather": 4,  # objects, count, asked, words
+    "rigidfleet_integrate_three": 4,
+}
+#: Those of the second library.
+SAMPLED_ENTRIES = {
+    "rigidfleet_fly_ticks": 5,  # problem, workspace, flight, state, segment
+    "rigidfleet_evaluate": 2,  # flight, evaluation
+}
 #: That of the third library, avoidance in flight: int64(flight, state, avoidance, 0).
 AVOIDANCE_ENTRY = "rigidfleet_avoid"
 

@@ -1,0 +1,326 @@
+"""The leg of a phase: what is planned before a flight is what the flight follows, and is planned once."""
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rigidfleet as rf
+from rigidfleet.math import attitude
+from rigidfleet.mission import Mission
+from rigidfleet.mission.kinds import KINDS
+from rigidfleet.planning import legs, timing
+from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.legs import Leg, leg_of
+from rigidfleet.planning.preview import preview
+from rigidfleet.planning.timing import timed
+from rigidfleet.preflight.losses import planned_way
+from rigidfleet.result import Result
+
+STANDING = np.array([[0.0, -2, 1], [0, 2, 1], [3, -2, 1], [3, 2, 1]])
+FRAME = np.array([[0.5, -2, -1.5], [0.5, 2, -1.5], [-0.5, -2, 1.5], [-0.5, 2, 1.5]])
+FLAT = np.array([[-1.5, -2, 0], [-1.5, 2, 0], [1.5, -2, 0], [1.5, 2, 0]])
+SHAPES = {"frame": FRAME, "wide": 1.4 * FRAME, "flat": FLAT}
+
+
+def planned_legs(mission: Mission, result: Result) -> list[Leg]:
+    """The leg of each phase that was flown, as the check plans it.
+
+    A phase that settles ends when it does, and agents that distances have led are where they have come to: these alone
+    are taken from the flight.
+    """
+    mission = timed(mission)
+    first = mission.first_loss if mission.on_loss != "continue" else np.inf
+    found = [planned.leg for planned in preview(mission)[0]]
+    sure = True
+    for k, record in enumerate(result.phases):
+        if record.t_start >= first:
+            return [*found[:k], *planned_way(mission, found[k - 1])]
+        if not sure:
+            at = int(np.searchsorted(result.time, record.t_start))
+            before = found[k - 1].state_at(record.t_start)
+            if found[k - 1].phase.control != "tracking":
+                before.r, before.v = result.position[at], result.velocity[at]
+                q = result.frame[at]
+                before.frame = attitude.dcm_from_quaternion(q) if np.isfinite(q).all() else None
+            found[k:] = [leg_of(mission, mission.phases[k], before)]
+        phase = mission.phases[k]
+        sure = sure and phase.settle is None and phase.control == "tracking"
+    return found
+
+
+def compare(mission: Mission) -> Counter[str]:
+    """See that the legs lead the slots as the flight has recorded them; returns how often each kind was compared."""
+    result, kinds = rf.simulate(mission), Counter[str]()
+    assert not result.ending
+    assert result.slot_position is not None
+    found = planned_legs(mission, result)
+    # From where avoidance acts on, the reference is not as planned.
+    late = np.zeros(len(result.time), dtype=bool)
+    if result.clock_rate is not None and result.body_displacement is not None:
+        late = (result.clock_rate != 1.0) | result.body_displacement.any(axis=1)
+        late = np.maximum.accumulate(late)
+    for k, record in enumerate(result.phases):
+        if record.control != "tracking":
+            continue
+        some = (result.phase == k) & ~late
+        if not some.any():
+            continue
+        leg = found[k]
+        assert (leg.phase.name, leg.formation) == (record.name, record.formation)
+        r = slot_derivatives(leg.reference, leg.motion, result.time[some], 1)[:, 0]
+        recorded = result.slot_position[some]
+        flying = np.isfinite(recorded)
+        assert flying.any()
+        assert np.abs(r - recorded)[flying].max() < 1e-9, record.name
+        kinds[record.kind] += 1
+    return kinds
+
+
+SHIPPED = [name for name in rf.mission_names() if name not in ("show-1000", "moving-obstacles")]
+
+
+@pytest.mark.parametrize(
+    "name", [*SHIPPED, pytest.param("moving-obstacles", marks=pytest.mark.long)]
+)
+def test_a_shipped_mission_follows_the_legs_that_its_check_plans(name):
+    """Where slots are tracked, the planned reference is the recorded one to 1e-9 m at every sample."""
+    mission = rf.load_mission(name)
+    if name != "line-singular":  # which ends early
+        compare(mission)
+
+
+# -- missions drawn by a seed -----------------------------------------------------------------------------
+
+
+class Draw:
+    """A mission of four vehicles, drawn by a seed: phases of all kinds, times, transitions and losses."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.smooth = self.likely(0.7)
+        self.place, self.shape = np.array([1.5, 0.0, 6.0]), "frame"
+        self.formed = True  # whether vehicles are in the shape: each may have gone a way of its own
+        self.phases: list[dict[str, Any]] = []
+        if self.likely(0.4):
+            self.add(kind="takeoff", height=6.0, **self.lasting(6.0))
+        self.open = not self.smooth and self.likely(0.3)
+        first: dict[str, Any] = {"kind": "establish", "formation": "frame"}
+        if self.open:
+            first["control"] = "open"
+        ends: dict[str, Any] = {"blend": 6.0, "duration": 8.0}
+        if self.likely(0.3):
+            ends = {"blend": 6.0, "settle": {"tolerance": 0.01}}
+        elif self.smooth and self.likely(0.5):
+            ends = {"blend": "auto", "duration": "auto"}
+        self.add(**first, **ends)
+        if self.likely(0.3):
+            self.add(kind="hold", settle={"tolerance": 0.01})
+        self.fly()
+        makers = [
+            self.fly, self.turn, self.orbit, self.brake, self.reshape, self.hold, self.follow, self.go, self.land,
+        ]  # fmt: skip
+        for make in self.rng.choice(np.array(makers, dtype=object), 4):
+            make()
+
+    def likely(self, share: float) -> bool:
+        return bool(self.rng.random() < share)
+
+    def add(self, **table: Any) -> None:
+        self.phases.append(table)
+
+    def lasting(self, time: float) -> dict[str, Any]:
+        """A duration; automatic in some smooth missions."""
+        return {"duration": "auto" if self.smooth and self.likely(0.5) else time}
+
+    def rest(self) -> None:
+        """Be at rest, for phases that begin so."""
+        self.add(kind="brake", duration=5.0)
+        self.fly(plain=True)
+
+    def fly(self, plain: bool = False) -> None:
+        before, self.place = self.place, self.rng.uniform([-6, -6, 6], [6, 6, 10]).round(2)
+        table: dict[str, Any] = {"kind": "fly", "position": self.place.tolist()}
+        if self.smooth and not plain and self.likely(0.4):
+            point = 0.5 * (before + self.place) + [0.0, 0.0, 1.0]
+            table["through"] = [{"position": point.tolist()}]
+        if not plain and self.likely(0.3):
+            table["velocity"] = "free" if self.smooth and self.likely(0.5) else [0.5, 0.2, 0.0]
+        if not plain and self.likely(0.3):
+            table["yaw_deg"] = 70.0
+        if self.likely(0.3):
+            table |= {"travel": 9.0, "duration": 10.0}
+        else:
+            table |= self.lasting(10.0)
+        self.add(**table)
+
+    def turn(self) -> None:
+        self.add(kind="turn", yaw_deg=round(self.rng.uniform(-90, 90), 1), **self.lasting(6.0))
+
+    def orbit(self) -> None:
+        yaw = "along" if self.likely(0.5) else "fixed"
+        self.add(
+            kind="orbit",
+            centre=[0, 0, 8],
+            radius=5.0,
+            rate_deg_s=10.0,
+            duration=20.0,
+            blend=9.0,
+            yaw=yaw,
+        )
+
+    def brake(self) -> None:
+        self.add(kind="brake", duration=5.0, **({"travel": 4.0} if self.likely(0.5) else {}))
+
+    def hold(self) -> None:
+        self.add(kind="hold", duration=3.0)
+
+    def reshape(self) -> None:
+        names = [name for name in SHAPES if name != self.shape]
+        self.shape = str(self.rng.choice(names))
+        table: dict[str, Any] = {"kind": "reshape", "formation": self.shape} | self.lasting(8.0)
+        table["blend"] = "auto" if table["duration"] == "auto" else 7.0
+        ways = ["straight", "layers", "auto"] + ["ways"] * (self.smooth and table["duration"] == "auto")  # fmt: skip
+        if self.smooth and self.formed and self.likely(0.6):
+            table["transition"] = str(self.rng.choice(ways))
+        elif self.likely(0.3):
+            table["alignment"] = "none"
+        if table.get("transition", "straight") == "straight" and self.likely(0.2):
+            self.place = self.place + [0.5, 0.0, 0.5]
+            table["position"] = self.place.tolist()
+        self.add(**table)
+        self.formed = True
+
+    def follow(self) -> None:
+        self.fly(plain=True)
+        self.add(kind="turn", yaw_deg=0.0, duration=6.0)
+        own, starts = SHAPES[self.shape], [self.place]
+        if self.formed and self.likely(0.6):
+            starts, self.formed = list(self.place + own - own.mean(axis=0)), False
+        bend = self.rng.uniform(-0.05, 0.05, 3)
+        rows = [
+            [[8.0, *(c for x, b in zip(start, bend, strict=True) for c in (x, 0.0, b)), 0, 0, 0]]
+            for start in starts
+        ]
+        self.add(kind="follow", trajectories=rows)
+        self.rest()
+
+    def go(self) -> None:
+        if not self.formed or self.likely(0.7):
+            return
+        self.rest()
+        self.fly(plain=True)
+        self.phases[-1] |= {"kind": "go"}
+        self.phases[-1].pop("travel", None)
+
+    def land(self) -> None:
+        self.rest()
+        self.formed = False
+        self.add(
+            kind="land", **({"agents": [1, 2]} if self.likely(0.4) else {}), **self.lasting(30.0)
+        )
+        stagger = {"stagger": 3.0, "by": "vehicles"} if self.likely(0.4) else {}
+        self.add(kind="takeoff", height=8.0, duration=12.0, **stagger)
+        self.fly(plain=True)
+
+    def mission(self, *, lossless: bool = False) -> Mission:
+        data: dict[str, Any] = {
+            "schema_version": 1, "name": "drawn", "output_step": 0.1,
+            "agents": {"mass": 1.0, "radius": 0.2, "position": STANDING.tolist()},
+            "formations": {name: {"slots": x.tolist()} for name, x in SHAPES.items()},
+            "obstacles": [{"kind": "ground"}], "limits": {"speed": 5.0, "acceleration": 3.0},
+            "phases": self.phases,
+        }  # fmt: skip
+        if self.smooth:
+            data["smoothness"] = "jerk"
+        elif self.likely(0.2):
+            data["architecture"] = "body"
+        if self.likely(0.3):
+            lost = {
+                "agent": int(self.rng.integers(1, 5)),
+                "time": round(self.rng.uniform(10, 40), 2),
+            }
+            does = str(self.rng.choice(["hold", "land"]))
+            data["disturbances"] = {"lost": [lost], "on_loss": does} | (
+                {"hold_until": lost["time"] + 30.0}
+                if does == "hold"
+                else {"landing_formation": "flat"}
+            )
+        return Mission.from_dict(data)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_drawn_mission_follows_the_legs_that_its_check_plans(seed):
+    """The planned reference of a drawn mission is the recorded one to 1e-9 m at every sample of tracked slots."""
+    assert compare(Draw(seed).mission())
+
+
+@pytest.mark.long
+def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
+    """So it is in 200 drawn missions, which have phases of all kinds, automatic times, transitions and losses."""
+    kinds: Counter[str] = Counter()
+    missions = [Draw(seed).mission() for seed in range(200)]
+    for mission in missions:
+        kinds += compare(mission)
+    assert min(kinds[kind] for kind in {*KINDS} - {"go"}) > 50
+    written = Counter(p.kind for mission in missions for p in mission.phases)
+    assert min(written.values()) > 10
+    assert set(written) == set(KINDS)
+    assert sum(bool(p.automatic) for mission in missions for p in mission.phases) > 100
+    assert sum(not p.spelled for mission in missions for p in mission.phases) > 20
+    assert sum(mission.on_loss != "continue" for mission in missions) > 40
+
+
+# -- once a phase -----------------------------------------------------------------------------------------
+
+
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Counts, from now on, of the calls that make what a phase departs from."""
+    count: Counter[str] = Counter()
+    for module, name in ((legs, "depart"), (legs, "_attached"), (legs, "align_slots"), (timing, "depart")):  # fmt: skip
+        function = getattr(module, name)
+
+        def counted(*arguments: Any, _function: Any = function, _name: str = name) -> Any:
+            count[_name] += 1
+            return _function(*arguments)
+
+        monkeypatch.setattr(module, name, counted)
+    return count
+
+
+#: Phases of which three change the shape, and three have automatic times.
+ONCE: list[dict[str, Any]] = [
+    {"kind": "establish", "formation": "frame", "duration": "auto", "blend": "auto"},
+    {"kind": "fly", "position": [4, 2, 8], "through": [{"position": [3, 0, 7]}], "duration": "auto"},
+    {"kind": "reshape", "formation": "wide", "duration": 8.0},
+    {"kind": "orbit", "centre": [0, 0, 8], "radius": 5.0, "rate_deg_s": 10.0, "duration": 20.0, "blend": "auto"},
+    {"kind": "brake", "duration": 5.0},
+    {"kind": "reshape", "formation": "frame", "duration": 8.0},
+]  # fmt: skip
+
+
+def test_a_phase_departs_once(monkeypatch):
+    """A preview, a flight and a search of automatic times each attach the frame and align the slots once a phase.
+
+    Up to the last automatic time there are four phases, of which two change the shape. Before legs were made once, the
+    search attached the frame 20 times for them, and aligned slots 6 times; a preview and a flight did so once a phase,
+    each by code of its own.
+    """
+    draw = Draw(0)
+    draw.smooth, draw.phases = True, ONCE
+    written = draw.mission(lossless=True)
+    once = {"depart": 6, "_attached": 6, "align_slots": 3}
+    count = calls(monkeypatch)
+    mission = timed(written)
+    assert count == once | {
+        "depart": 4,
+        "_attached": 4,
+        "align_slots": 2,
+    }  # up to the last automatic time
+    count.clear()
+    preview(mission)
+    assert count == once
+    count.clear()
+    rf.simulate(mission)
+    assert count == once
