@@ -256,16 +256,21 @@ class Sheet:
     parts: Sequence[Table | Line]
 
     @property
+    def shown(self) -> list[Table | Line]:
+        """The parts, without tables in which nothing stands."""
+        return [part for part in self.parts if isinstance(part, Line) or part.rows]
+
+    @property
     def blocks(self) -> list[Any]:
         """What is printed: the head, and the parts with blank lines around tables."""
         from rich.text import Text
 
         head = Text.assemble((self.name, "bold"), f": {self.title}")
-        shown: list[Any] = [head] if self.name else []
-        for part, before in zip(self.parts, [Line(""), *self.parts], strict=False):
+        blocks: list[Any] = [head] if self.name else []
+        for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):
             apart = isinstance(part, Table) or isinstance(before, Table)
-            shown += ["", part] if apart and len(shown) > 1 else [part]
-        return shown
+            blocks += ["", part] if apart and len(blocks) > 1 else [part]
+        return blocks
 
     def __rich__(self) -> RenderableType:
         from rich.console import Group
@@ -275,7 +280,7 @@ class Sheet:
     def html(self) -> str:
         """Show the sheet in a notebook. All text is escaped."""
         head = f"<p><strong>{html.escape(self.name)}</strong> {html.escape(self.title)}".rstrip()
-        parts = (part.html() for part in self.parts)
+        parts = (part.html() for part in self.shown)
         return f"<div>{head}</p>{''.join(parts)}</div>"
 
 

@@ -153,11 +153,10 @@ class Verdict(Shown):
         meaning = (
             "|c|: how far an edge's length is off the commanded one; the greatest of all edges."
         )
-        waypoints = _waypoints(self.phases)
         parts = [
             _phases(self.phases),
             *([Line(meaning)] if has_edges else []),
-            *([waypoints] if waypoints.rows else []),
+            _waypoints(self.phases),
             worst_values("check", checks),
             *(Line(f"Note: {note}.", "note") for note in self.notes),
             Line(self.summary, "ok" if self.passed else "fails"),

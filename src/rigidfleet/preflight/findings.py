@@ -318,7 +318,7 @@ class Preflight(Shown):
         name = "Check" if self.mission is None else self.mission.name
         line = Line(f"{name}: {verdict}", "ok" if self.passed else "fails")
         size = "" if self.mission is None else f"valid: {self.mission.size_in_words}"
-        return Sheet(name, size, [*(part for part in parts if part.rows), line])
+        return Sheet(name, size, [*parts, line])
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""

@@ -61,7 +61,7 @@ def contents(
     colours = plotting.agent_colours(len(flights))
     found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
-    controlled = any(flight.interpolation is None for flight in flights)
+    controlled = any(each["gains"] is not None and each["gains"].rows for each in found)
     response = overlay.response(missions, names) if controlled else None
     return {
         "title": " · ".join(names),
@@ -112,7 +112,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "facts": _facts(result),
         "phases": mission.phase_table,
-        "checks": [part for part in verdict.facts().parts if isinstance(part, Table)],
+        "checks": [part for part in verdict.facts().shown if isinstance(part, Table)],
         "vehicles": _vehicles(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
@@ -141,9 +141,8 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     mission = result.mission
     mass = sorted(set(mission.agents.mass))
     masses = f"{mass[0]:.4g} kg" if len(mass) == 1 else f"{mass[0]:.4g} to {mass[-1]:.4g} kg"
-    forms = [
-        f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
-    ]  # fmt: skip
+    counts = {name: len(mission.formation_edges(name)) for name in mission.formations}
+    forms = [f"{name} ({n} edges)" if n else name for name, n in counts.items()]
     made = result.created.replace("T", " ").replace("+00:00", " UTC")
     if result.interpolation is not None:
         return [
@@ -395,7 +394,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
 
 def _figure(result: Result, name: str) -> dict[str, str]:
     svg = plotting.rendered(result, name, ["svg"])["svg"]
-    return _picture(name, svg, _CAPTIONS.get(name, ""))
+    pairs = name == "constraint_error" and not len(result.edges)
+    return _picture(name, svg, "Shape error of all pairs." if pairs else _CAPTIONS.get(name, ""))
 
 
 def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:

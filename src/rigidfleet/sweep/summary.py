@@ -136,8 +136,7 @@ class Summary(Shown):
         if s.of:
             words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} % (95 % interval {s.interval})."
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
-        shown = [part for part in parts if isinstance(part, Line) or part.rows]
-        return Sheet(self.name, f"{self.flown} of {self.runs} runs", shown)
+        return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
     def _percentiles(self) -> Table:
         rows = [
