@@ -95,57 +95,53 @@ class Table:
 
     @property
     def columns(self) -> list[tuple[str, str, bool]]:
-        """Name and unit of each column that is shown, and whether it holds words."""
-        names = [head.partition(" [") for head in self.heads]
-        shown = [
-            (name, unit.rstrip("]"), k == 0 or name in self.words)
-            for k, (name, _, unit) in enumerate(names)
-            if k in self._kept
+        """Name and unit of each column that is shown, and whether it holds words; the last one is of marks, if any."""
+        names = [self.heads[k].partition(" [") for k in self._used]
+        words = [k == 0 or name in self.words for k, (name, *_) in enumerate(names)]
+        shown = [(name, unit[:-1], w) for (name, _, unit), w in zip(names, words, strict=True)]
+        return shown + [("", "", True)] * self._judged
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """What stands in each row that is shown."""
+        return [
+            [*(_cell(row.cells[k]) for k in self._used), *[Cell(MARKS[row.level])] * self._judged]
+            for row in self.rows
         ]
-        return shown + [("", "", True)] * self.judged
-
-    @property
-    def judged(self) -> bool:
-        """Whether a row is judged, so that the last column has marks."""
-        return any(row.level for row in self.rows) and not self.bare
-
-    @property
-    def _kept(self) -> list[int]:
-        used = [k for k in range(len(self.heads)) if any(_text(r.cells[k]) for r in self.rows)]
-        return used or [0]
 
     @property
     def texts(self) -> list[list[str]]:
-        """Cells of each row as they are shown."""
-        return [
-            [_text(row.cells[k]) for k in self._kept] + [MARKS[row.level]] * self.judged
-            for row in self.rows
-        ]
+        """Cells of each row as text."""
+        return [[str(cell) for cell in cells] for cells in self.cells]
+
+    @property
+    def _used(self) -> list[int]:
+        every = range(len(self.heads))
+        return [k for k in every if k == 0 or any(str(_cell(r.cells[k])) for r in self.rows)]
+
+    @property
+    def _judged(self) -> bool:
+        return any(row.level for row in self.rows) and not self.bare
 
     def html(self, kind: str = "") -> str:
         """The table in a notebook, or as a table of this kind on a page, which has a style for it."""
 
-        def look(*names: str) -> str:
-            known = " ".join(filter(None, names))
-            return f' class="{known}"' if kind and known else "" if kind else _LOOK
+        def look(words: bool, level: str = "") -> str:
+            names = f"{'words' * words} {level}".strip()
+            return _LOOK if not kind else f' class="{names}"' if names else ""
 
         heads = "".join(
-            f"<th{look('words' * words)}>{html.escape(f'{name} [{unit}]' if unit else name)}</th>"
+            f"<th{look(words)}>{html.escape(f'{name} [{unit}]' if unit else name)}</th>"
             for name, unit, words in self.columns
         )
-        lines = ""
-        for row, texts in zip(self.rows, self.texts, strict=True):
-            cells = [Cell(text) for text in texts]
-            for k, column in enumerate(self._kept):
-                own = row.cells[column]
-                cells[k] = own if kind and isinstance(own, Cell) else cells[k]
-            lines += f"<tr{look(row.level) if kind else ''}>" + "".join(
-                f"<td{look('words' * words, cell.level)}>{cell.html()}</td>"
+        body = f"<thead><tr>{heads}</tr></thead>" * (not self.bare)
+        for row, cells in zip(self.rows, self.cells, strict=True):
+            line = "".join(
+                f"<td{look(words, cell.level)}>{cell.html()}</td>"
                 for cell, (*_, words) in zip(cells, self.columns, strict=True)
             )
-            lines += "</tr>"
-        top = "" if self.bare else f"<thead><tr>{heads}</tr></thead>"
-        return f"<table{look(kind) if kind else ''}>{top}<tbody>{lines}</tbody></table>"
+            body += f"<tr{look(False, row.level) if kind else ''}>{line}</tr>"
+        return f"<table{f' class={kind!r}' if kind else ''}>{body}</table>"
 
     def __rich_console__(self, _console: Console, options: ConsoleOptions) -> RenderResult:
         """The table without borders; in a narrow console words are wrapped, or else columns stand below others."""
@@ -154,9 +150,7 @@ class Table:
 
         columns, space = self.columns, 2 if len(self.columns) < _MANY else 1
         below = "\n" if sum(bool(unit) for _, unit, _ in columns) > 1 else " "
-        heads = [
-            f"{x}{below}[{unit}]" if unit else f"{x}{below}".rstrip(" ") for x, unit, _ in columns
-        ]
+        heads = [f"{x}{below}{f'[{unit}]' * bool(unit)}".rstrip(" ") for x, unit, _ in columns]
         widths = self._widths(heads, options.max_width - space * (len(columns) - 1))
         if widths is None:
             half = len(self.heads) // 2 + 1
@@ -164,20 +158,16 @@ class Table:
                 rows = [Row([row.cells[k] for k in some], row.level) for row in self.rows]
                 yield replace(self, heads=[self.heads[k] for k in some], rows=rows)
             return
-        grid = Grid(
-            box=None, show_header=not self.bare, pad_edge=False, padding=(0, space, 0, 0), header_style="bold"
-        )  # fmt: skip
+        grid = Grid(box=None, show_header=not self.bare, pad_edge=False, padding=(0, space, 0, 0))
         for head, width, (*_, words) in zip(heads, widths, columns, strict=True):
             side = "left" if words else "right"
-            grid.add_column(Text(head), justify=side, width=width, overflow="fold")
+            grid.add_column(Text(head, "bold"), justify=side, width=width, overflow="fold")
         heading = ""
         for row, (first, *cells) in zip(self.rows, self.texts, strict=True):
-            style = _STYLES[row.level]
-            if self.bare:  # a repeated heading is printed once
-                grid.add_row(Text(first * (first != heading), f"bold {style}"), *map(Text, cells))
-            else:
-                marked = (Text(x, style * (x == MARKS[row.level])) for x in cells)
-                grid.add_row(Text(first), *marked)
+            style, mark = _STYLES[row.level], MARKS[row.level]
+            # Behind headings in words, a repeated one is printed once.
+            name = Text(first * (first != heading), f"bold {style}") if self.bare else Text(first)
+            grid.add_row(name, *(Text(x, style * (x == mark)) for x in cells))
             heading = first
         yield grid
 
@@ -188,24 +178,25 @@ class Table:
         rows = [*self.texts] if self.bare else [heads, *self.texts]
         lines = [[x for row in rows for x in row[k].split("\n")] for k in range(len(heads))]
         widths = [max(map(cell_len, column), default=0) for column in lines]
+        long = [
+            max((cell_len(x) for s in column for x in s.split()), default=0) for column in lines
+        ]
         least = [
-            max((cell_len(x) for line in column for x in line.split()), default=0)
-            if words
-            else width
-            for column, width, (*_, words) in zip(lines, widths, self.columns, strict=True)
+            x if words else w for x, w, (*_, words) in zip(long, widths, self.columns, strict=True)
         ]
         while sum(widths) > room:
-            k = max(range(len(widths)), key=lambda k: widths[k] * (widths[k] > least[k]))
+            k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
             if widths[k] <= least[k] and len(heads) > 3:
                 return None
             widths[k] -= 1
         return widths
 
 
-def _text(cell: Any) -> str:
-    if cell is None:
-        return ""
-    return value(cell) if isinstance(cell, float) else str(cell)
+def _cell(content: Any) -> Cell:
+    if isinstance(content, Cell):
+        return content
+    text = value(content) if isinstance(content, float) else str(content)
+    return Cell("" if content is None else text)
 
 
 class Fact(NamedTuple):
@@ -228,23 +219,18 @@ class Fact(NamedTuple):
         sign = (">=" if self.limit else ">") if self.at_least else "<="
         return f"{sign} {value(self.limit, self.unit)}"
 
+    @property
+    def row(self) -> Row:
+        """The fact as a row of a table."""
+        worst = None if self.value is None else value(self.value, self.unit)
+        when = None if self.when is None else f"{self.when:.2f}"
+        return Row((self.name, worst, self.bound, when, self.who), self.level)
+
 
 def worst_values(what: str, facts: Iterable[Fact]) -> Table:
     """Table of worst values with their limits."""
-    rows = [
-        Row(
-            (
-                f.name,
-                None if f.value is None else value(f.value, f.unit),
-                f.bound,
-                None if f.when is None else f"{f.when:.2f}",
-                f.who,
-            ),
-            f.level,
-        )
-        for f in facts
-    ]
-    return Table((what, "worst", "limit", "at [s]", "who or where"), rows, ("who or where",))
+    heads = (what, "worst", "limit", "at [s]", "who or where")
+    return Table(heads, [fact.row for fact in facts], heads[4:])
 
 
 @dataclass(frozen=True)
