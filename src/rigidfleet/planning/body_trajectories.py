@@ -105,7 +105,7 @@ def smooth_motion(
     meets = points, begin, end, *(np.array(at.velocity or zero * np.nan) for at in through)
     times = np.array([0.0, *(at.time or np.nan for at in through), total])
     if np.isnan(times).any():
-        times = splines.allocated(total, *meets)
+        times = splines.best_times(total, *meets)
     phi = np.stack([rotation_of(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
     turn = Piecewise.hermite(times[[0, -1]], phi).on(times).pieces
     cm = splines.minimum_snap(times, *meets)

@@ -40,7 +40,7 @@ from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -539,7 +539,7 @@ class Flight:
         self._extremes.among(obstacles)
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
-            solids = joined([thing.solid for thing in obstacles])
+            solids = join([thing.solid for thing in obstacles])
             vehicles.avoidance = among(vehicles.avoidance, solids)
 
     def contact(self) -> Extremum | None:

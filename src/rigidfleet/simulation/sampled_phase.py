@@ -73,7 +73,7 @@ class SampledPhase(Stepper):
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
-            vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
+            vehicles.avoidance = avoidance.of_next_phase(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.led_until = -math.inf  # end of what the leader has decided [s]
@@ -105,7 +105,7 @@ class SampledPhase(Stepper):
         if before is None:
             begun.integral[:] = integral
         else:
-            renewed = fleet.renewed(before, phase.workspace, integral, frame=frame)
+            renewed = fleet.under_problem(before, phase.workspace, integral, frame=frame)
             if phase.parted.any():  # without a link, vehicles do not come to the same integrals
                 own = [
                     ByEdge().updated(given.edges, x).of(plan.edges, integral)
