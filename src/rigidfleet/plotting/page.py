@@ -65,14 +65,14 @@ def summary(result: Result) -> Figure:
     if len(result.edges):
         curves.draw_distances(lengths, result)
     elif result.mission.obstacles and result.n_agents > 1:
-        curves.draw_separation(lengths, result)
+        curves.draw_least(lengths, result, "separation")
     else:
         curves.draw_error(lengths, result)
     if 0 < len(result.edges) <= curves.SINGLE:
         _legend_above(lengths, curves.edge_handles(result))
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
-    (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(apart, result)
+    curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
     key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
     entries = space.handles(result, view)
     fig.legend(

@@ -22,10 +22,10 @@ from rigidfleet.plotting.quadrotors import (
     rotor_forces,
     rotor_limits,
     tilt,
-    tracking_error,
 )
 from rigidfleet.plotting.style import clean
 from rigidfleet.reporting import gains, overlay
+from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
@@ -182,26 +182,29 @@ def _vehicles(result: Result) -> Table:
         most = np.fmax.reduce(values.reshape(*values.shape[:2], -1), axis=(0, 2), initial=np.nan)
         return [x if math.isfinite(x) else None for x in most.tolist()]
 
+    def of(name: str) -> list[float | None]:
+        return greatest(samples(result, name).values)
+
     def share(values: Floats, limits: Any) -> list[str]:
         return ["" if x is None else f"{100 * x:.0f} %" for x in greatest(values / limits)]
 
     z = result.position[..., 2]
-    thrust, nothing = greatest(result.thrust), [None] * n
+    thrust, nothing = of("thrust"), [None] * n
     own, rotors = result.interpolation is None, has_rotors(result)
     columns = {
         "mass [kg]": [f"{m:.4g}" for m in mission.agents.mass] if own else nothing,
         "thrust [N]": thrust if own else nothing,
         "share of limit": share(result.thrust[..., None], np.array(mission.agents.thrust_limit)[:, None])
         if np.isfinite(mission.agents.thrust_limit).any() else nothing,
-        "speed [m/s]": greatest(np.linalg.norm(result.velocity, axis=2)),
-        "acceleration [m/s²]": greatest(np.linalg.norm(result.acceleration, axis=2)),
+        "speed [m/s]": of("speed"),
+        "acceleration [m/s²]": of("acceleration"),
         "lowest [m]": [-x for x in greatest(-z) if x is not None],
         "highest [m]": greatest(z),
         "path length [m]": np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0).tolist(),
         "share of rotor limit": share(rotor_forces(result), rotor_limits(mission)[..., None])
         if rotors else nothing,
         "tilt [deg]": greatest(tilt(result)) if rotors else nothing,
-        "from the slot [m]": greatest(tracking_error(result)) if rotors else nothing,
+        "from the slot [m]": of("tracking_error") if rotors else nothing,
     }  # fmt: skip
     order = np.argsort(-np.nan_to_num(np.array(thrust, dtype=float)))
     shown = np.arange(n) if n <= _VEHICLES else np.sort(order[:_VEHICLES])
@@ -313,7 +316,8 @@ def _numbers(
 
 def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
-    return next((check.worst for check in verdict.checks if check.check == name), None)
+    check = verdict.by_name.get(name)
+    return None if check is None else check.worst
 
 
 def _mean(result: Result) -> float | None:
@@ -383,6 +387,7 @@ _CAPTIONS = {
     "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
     "rotors": "Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit.",
     "operation": "Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.",
+    "motion": "Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits.",
     "vehicles": "Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give.",
 }  # fmt: skip
 
