@@ -252,10 +252,11 @@ class Sheet:
         from rich.text import Text
 
         head = Text.assemble((self.name, "bold"), f": {self.title}")
-        blocks: list[Any] = [head] if self.name else []
+        begin: list[Any] = [head] if self.name else []
+        blocks = [*begin]
         for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):
             apart = isinstance(part, Table) or isinstance(before, Table)
-            blocks += ["", part] if apart and len(blocks) > 1 else [part]
+            blocks += ["", part] if apart and blocks != begin else [part]
         return blocks
 
     def __rich__(self) -> RenderableType:

@@ -157,15 +157,16 @@ def missions(
 
         from rigidfleet._common.facts import Row, Sheet, Table
 
-        rows = []
-        for group, names in GROUPS.items():
-            rows.append(Row((group, None, None)))
-            for name in names:
-                head = tomllib.loads(mission_text(name))
-                rows.append(Row((f"  {name}", head.get("title"), head.get("source"))))
+        def row(name: str) -> Row:
+            head = tomllib.loads(mission_text(name))
+            return Row((f"  {name}", head.get("title"), head.get("source")))
+
+        rows = [
+            x for group, names in GROUPS.items() for x in (Row((group, "", "")), *map(row, names))
+        ]
         heads = ("mission", "what it shows", "in the paper")
-        console.show(Sheet("", "", [Table(heads, rows, heads)]))
         first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
+        console.show(Sheet("", "", [Table(heads, rows, heads)]))
         console.out().print(first, soft_wrap=True)
     return PASSED
 

@@ -182,26 +182,29 @@ def _vehicles(result: Result) -> Table:
         most = np.fmax.reduce(values.reshape(*values.shape[:2], -1), axis=(0, 2), initial=np.nan)
         return [x if math.isfinite(x) else None for x in most.tolist()]
 
+    def of(name: str) -> list[float | None]:
+        return greatest(samples(result, name).values)
+
     def share(values: Floats, limits: Any) -> list[str]:
         return ["" if x is None else f"{100 * x:.0f} %" for x in greatest(values / limits)]
 
     z = result.position[..., 2]
-    thrust, nothing = greatest(result.thrust), [None] * n
+    thrust, nothing = of("thrust"), [None] * n
     own, rotors = result.interpolation is None, has_rotors(result)
     columns = {
         "mass [kg]": [f"{m:.4g}" for m in mission.agents.mass] if own else nothing,
         "thrust [N]": thrust if own else nothing,
         "share of limit": share(result.thrust[..., None], np.array(mission.agents.thrust_limit)[:, None])
         if np.isfinite(mission.agents.thrust_limit).any() else nothing,
-        "speed [m/s]": greatest(samples(result, "speed").values),
-        "acceleration [m/s²]": greatest(samples(result, "acceleration").values),
+        "speed [m/s]": of("speed"),
+        "acceleration [m/s²]": of("acceleration"),
         "lowest [m]": [-x for x in greatest(-z) if x is not None],
         "highest [m]": greatest(z),
         "path length [m]": np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0).tolist(),
         "share of rotor limit": share(rotor_forces(result), rotor_limits(mission)[..., None])
         if rotors else nothing,
         "tilt [deg]": greatest(tilt(result)) if rotors else nothing,
-        "from the slot [m]": greatest(samples(result, "tracking_error").values) if rotors else nothing,
+        "from the slot [m]": of("tracking_error") if rotors else nothing,
     }  # fmt: skip
     order = np.argsort(-np.nan_to_num(np.array(thrust, dtype=float)))
     shown = np.arange(n) if n <= _VEHICLES else np.sort(order[:_VEHICLES])

@@ -1,10 +1,9 @@
-"""The mark of a broken limit has other words on console, notebook and page, and none says what it said before."""
+"""A broken limit is marked by other words: on the console, in a notebook and on a page."""
 
 import io
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -15,13 +14,10 @@ from rigidfleet.reporting import html_page
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from sample_flights import swarm
 
-figures: Any = plotting
-figures.rendered = lambda *_: {"svg": b"<svg/>"}  # none
-result = swarm(4, 10.0)
+setattr(plotting, "rendered", lambda *_: {"svg": b"<svg/>"})  # noqa: B010
+result, printed = swarm(4, 10.0), io.StringIO()
 verdict = rf.assess(result)
-printed = io.StringIO()
-console = Console(file=printed, width=200)
-console.print(verdict)
+Console(width=200, file=printed).print(verdict)
 for text in (printed.getvalue(), verdict._repr_html_(), html_page(result)):
     shown = re.sub("<[^>]*>", " ", text)
     assert "not kept" in shown
