@@ -31,7 +31,7 @@ from rigidfleet.mission.schema import DRAG, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.solids.distance import height_below
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import Solids, join
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Smallest and largest damping that "auto" uses. Below, rounding errors show; docs/robustness.md has the measurements.
@@ -467,7 +467,7 @@ class Mission(Contents):
     @cached_property
     def roofs(self) -> Solids:
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
-        return joined([o.solid for o in self.solids if is_ground(o)])
+        return join([o.solid for o in self.solids if is_ground(o)])
 
     def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import agent_colours
-from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits, tracking_error
+from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits
+from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.solids.distance import displacement
 from rigidfleet.solids.outline import outline
@@ -303,6 +304,6 @@ def _plotted(result: Result) -> dict[str, PackedColumn]:
     }
     if np.isfinite(rotor_limits(result.mission)).any():
         samples["rotor plot"] = PackedColumn(_rotor_lines(result), 0.1)
-        off = np.fmax.reduce(tracking_error(result), axis=1)
+        off = quantities.samples(result, "tracking_error").worst
         samples["off plot"] = PackedColumn(off, 1e-4)
     return {plot["column"]: samples[plot["column"]] for plot in _plots(result.mission)}
