@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.mission import Mission
-from rigidfleet.planning.legs import Leg, leg_of
+from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import changed
@@ -55,12 +55,7 @@ def planned_way(mission: Mission, at: Leg) -> list[Leg]:
     """The planned legs after the first loss, which happens in the leg ``at``."""
     first = mission.first_loss
     lost = mission.lost_at <= first
-    now = changed(at.state_at(first), lost=lost if lost.any() else None)
-    way = []
-    for phase in after_loss(mission, now):
-        way.append(leg_of(mission, phase, now))
-        now = way[-1].after
-    return way
+    return after_loss(mission, changed(at.state_at(first), lost=lost if lost.any() else None))
 
 
 def _links(mission: Mission) -> Iterator[Remark]:
