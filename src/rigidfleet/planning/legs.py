@@ -312,9 +312,11 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
     reference = Reference(kind, now.t, T_b, _NONE, _NONE, p0, dp, turn, *bent)
     if shaping is None and now.blend is not None:
         reference = now.blend
+    settles = phase.settle is not None  # the time in which errors settle takes milliseconds to find
     return Leg(
         phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, trajectory,
-        reference, mission.fleet.mass, mission.fleet.radius, mission.constraint.settling_time or 0.0,
+        reference, mission.fleet.mass, mission.fleet.radius,
+        (settles and mission.constraint.settling_time) or 0.0,
         mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
 
