@@ -20,7 +20,8 @@ from rigidfleet.math.margins import (
     margins,
     tracking_loops,
 )
-from rigidfleet.mission import bounds, json_schema, load_mission, mission_names
+from rigidfleet.mission import bounds, json_schema, load_mission
+from rigidfleet.mission.kinds import KINDS
 from rigidfleet.mission.text import GROUPS
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS
@@ -42,6 +43,14 @@ def render(page: str) -> str:
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
 
     return re.sub(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", table, page, flags=re.DOTALL)
+
+
+def kinds_without_section(page: str) -> set[str]:
+    """Kinds of phases without a section of a page; `hold` needs none, as its keys are those of every kind."""
+    sections = re.findall(r"^### `\[\[phases\]\]` of kinds? (.*)$", page, re.MULTILINE)
+    return (
+        {*KINDS} - {"hold"} - {kind for text in sections for kind in re.findall(r"`(\w+)`", text)}
+    )
 
 
 def _keys(schema: dict[str, Any], name: str) -> str:
@@ -143,9 +152,9 @@ def _shapes() -> str:
 def _missions() -> str:
     """The shipped missions in their groups: name, what it shows, where in the paper."""
     rows = []
-    for group, words in GROUPS.items():
-        rows.append((f"**{words}**", "", ""))
-        for name in mission_names(group):
+    for group, names in GROUPS.items():
+        rows.append((f"**{group}**", "", ""))
+        for name in names:
             mission = load_mission(name)
             rows.append((f"`{name}`", mission.title, mission.source))
     return _table(("mission", "what it shows", "in the paper"), rows)

@@ -157,9 +157,9 @@ def missions(
 
         table = console.table("mission", "what it shows", "in the paper")
         table.columns[0].min_width = 2 + max(map(len, mission_names()))  # a name is not broken
-        for group, words in GROUPS.items():
-            table.add_row(words, style="bold")
-            for name in mission_names(group):
+        for group, names in GROUPS.items():
+            table.add_row(group, style="bold")
+            for name in names:
                 head = tomllib.loads(mission_text(name))
                 table.add_row(f"  {name}", head.get("title", ""), head.get("source", ""))
         console.print_table(table)

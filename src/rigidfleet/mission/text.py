@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -13,29 +11,31 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import near
 
-_SHIPPED = resources.files("rigidfleet") / "missions"
+_SHIPPED = Path(__file__).parents[1] / "missions"
 
-#: Folders of the shipped missions: their names, and what the missions in them are about.
+#: What shipped missions are about, and their names.
 GROUPS = {
-    "paper": "The paper",
-    "shapes": "Shapes and rigidity",
-    "obstacles": "Obstacles and avoidance",
-    "vehicles": "Vehicles",
-    "shows": "Shows",
-}
+    "The paper": (
+        "cube-passage", "cube-waypoint", "establish-cube", "establish-triangle", "narrow-passage", "single-waypoint",
+    ),
+    "Shapes and rigidity": (
+        "drift", "establish-cube-as-printed", "hexagon", "line-singular", "pyramid", "square", "two-agents",
+    ),
+    "Obstacles and avoidance": (
+        "bridge-inspection", "hill-search", "moving-obstacles", "narrow-passage-found", "statue",
+    ),
+    "Vehicles": (
+        "crazyflies", "cube-passage-quadrotors", "delayed", "downwash-cube", "passage-quadrotors", "windy-passage",
+    ),
+    "Shows": ("change-of-picture", "falling-light", "ferris-wheel", "show-1000"),
+}  # fmt: skip
 #: Shipped missions to look at first.
 FIRST = ("narrow-passage", "bridge-inspection", "change-of-picture")
 
 
-def mission_names(*groups: str) -> list[str]:
-    """Names of the shipped missions of some groups (folders of `GROUPS`), of all by default, in alphabetical order."""
-    return sorted(_files(*groups))
-
-
-def _files(*groups: str) -> dict[str, Traversable]:
-    """The files of shipped missions by name."""
-    files = (file for group in groups or GROUPS for file in (_SHIPPED / group).iterdir())
-    return {file.name.removesuffix(".toml"): file for file in files if file.name.endswith(".toml")}
+def mission_names() -> list[str]:
+    """Names of the shipped missions, in alphabetical order."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.toml"))
 
 
 def mission_text(name: str) -> str:
@@ -46,10 +46,9 @@ def mission_text(name: str) -> str:
     MissionError
         There is no shipped mission of this name.
     """
-    files = _files()
-    if name not in files:
+    if name not in mission_names():
         raise MissionError([_not_found(name)])
-    return files[name].read_text(encoding="utf-8")
+    return (_SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
 
 
 def read_text(path: str | Path) -> str:
