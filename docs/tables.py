@@ -21,6 +21,7 @@ from rigidfleet.math.margins import (
     tracking_loops,
 )
 from rigidfleet.mission import bounds, json_schema
+from rigidfleet.mission.kinds import KINDS
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS
 
@@ -41,6 +42,14 @@ def render(page: str) -> str:
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
 
     return re.sub(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", table, page, flags=re.DOTALL)
+
+
+def kinds_without_section(page: str) -> set[str]:
+    """Kinds of phases without a section of a page; `hold` needs none, as its keys are those of every kind."""
+    sections = re.findall(r"^### `\[\[phases\]\]` of kinds? (.*)$", page, re.MULTILINE)
+    return (
+        {*KINDS} - {"hold"} - {kind for text in sections for kind in re.findall(r"`(\w+)`", text)}
+    )
 
 
 def _keys(schema: dict[str, Any], name: str) -> str:

@@ -66,6 +66,15 @@ def test_tables_are_up_to_date():
         assert page(path.name) == tables.render(page(path.name))
 
 
+def test_every_kind_of_phase_has_its_section():
+    """No kind of phase is without a section; the section of `brake`, taken away, is missed."""
+    tables, missions = script("tables"), page("missions.md")
+    assert not tables.kinds_without_section(missions)
+    assert tables.kinds_without_section(missions.replace("of kind `brake`", "of brakes")) == {
+        "brake"
+    }
+
+
 @pytest.mark.long
 def test_flown_tables_are_up_to_date():
     """Tables that are flown have the numbers of today's flights: to a digit or 3 %, errors 1e-N to a factor 3."""

@@ -103,10 +103,10 @@ def test_a_path_leads_to_what_the_document_has():
         ("crazyflies", "phases[2].duration = choice(3.0, 4.0, -1.0)"),
     ],
 )
-def test_runs_share_what_does_not_vary(name, line):
-    """A run's mission is the one that its data alone give, or has the same findings; the sweep's data stay as read."""
+def test_a_run_is_the_mission_that_its_data_give(name, line):
+    """A run's mission is the one that its data give, or has the same findings; the sweep's mission stays as read."""
     found = Sweep.of(name, ["agents.radius.* *= uniform(0.1, 1)", line], runs=40)
-    refused, whole = [], json.dumps(found.document)
+    refused, whole = [], json.dumps(found.mission.to_dict())
 
     def outcome(make: Callable[[], Mission]) -> tuple[str, Any]:
         try:
@@ -116,10 +116,10 @@ def test_runs_share_what_does_not_vary(name, line):
 
     for k in range(40):
         alone = json.loads(json.dumps(found.varied(k)))
-        shared = outcome(lambda k=k: found.mission_of(k))
-        assert shared == outcome(lambda k=k, data=alone: Mission.from_plain(data, f"run {k}"))
-        refused.append(bool(shared[0]))
-    assert json.dumps(found.document) == whole
+        run = outcome(lambda k=k: found.mission_of(k))
+        assert run == outcome(lambda k=k, data=alone: Mission.from_plain(data, f"run {k}"))
+        refused.append(bool(run[0]))
+    assert json.dumps(found.mission.to_dict()) == whole
     assert any(refused)
     assert not all(refused)
 

@@ -144,10 +144,11 @@ def bounded(
     first: Extreme | None = None,
 ) -> CheckResult:
     """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
+    at_least = q.at_least and limit is not None
     if e is None:
         words = words or q.nothing or f"the flight has no {q.called} to judge"
         return CheckResult(
-            q.name, True, words, None, limit, q.unit, q.at_least, judged=limit is not None
+            q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
     if not words:
         bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
@@ -160,6 +161,6 @@ def bounded(
         greatest = limit + SLACK * max(1.0, abs(limit))
         passed = e.value >= limit - SLACK and e.value > 0 if q.at_least else e.value <= greatest
     return CheckResult(
-        q.name, passed is not False, words, e.value, limit, q.unit, q.at_least, e.when, e.who, e.phase,
+        q.name, passed is not False, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,
         limit is not None, e.at_samples, first,
     )  # fmt: skip

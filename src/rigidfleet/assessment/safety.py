@@ -58,7 +58,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     Limits are those of the verdict; those of the altitude are the geofence's. What the flight does not have, such as a
     vehicle below another one, has no row.
     """
-    measured, checks = Measurements(result), {check.check: check for check in verdict.checks}
+    measured, checks = Measurements(result), verdict.by_name
     rows = []
     for q in QUANTITIES.values():
         limit, worst, passed = None, None, True
@@ -68,7 +68,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
                 worst = Extreme(check.worst, check.when, check.who, check.phase, check.at_samples)
         elif q.monitored and not q.way:
             limit, worst = q.limit_of(result.mission), measured.worst(q.name)
-        if q.page and (limit is not None or worst is not None):
+        if (q.key or q.limit) and (limit is not None or worst is not None):
             limit = None if limit is None or not np.isfinite(limit) else limit
             row = Safety(q.called, q.text, shown(q.unit), q.at_least, limit, worst, passed)
             beyond = check is None and row.margin is not None and row.margin < -1e-9

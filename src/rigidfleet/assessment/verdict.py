@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.plain import plain
-from rigidfleet._common.quantities import QUANTITIES
+from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 
@@ -72,6 +72,16 @@ class Verdict:
     def passed(self) -> bool:
         """Whether every check holds."""
         return all(check.passed for check in self.checks)
+
+    @property
+    def by_name(self) -> dict[str, CheckResult]:
+        """Each check by its name; of those that several phases fail, the one with the worst value."""
+        found: dict[str, CheckResult] = {}
+        for check in self.checks:
+            rank, known = quantity(check.check).rank, found.setdefault(check.check, check)
+            if check.worst is not None and known.worst is not None:
+                found[check.check] = max(known, check, key=lambda c: rank(c.worst))
+        return found
 
     @property
     def worst(self) -> dict[str, Extreme]:

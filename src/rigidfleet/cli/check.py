@@ -52,7 +52,6 @@ def check(
     from rigidfleet._common.progress import watched_by
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import ending, goal, load_mission
-    from rigidfleet.mission.files import digests
     from rigidfleet.planning.timing import spelled_out, timed
 
     keep_existing(expand, force=force, other="give another path")
@@ -62,7 +61,7 @@ def check(
             found = load_mission(mission)
             if expand is not None:
                 found = spelled_out(found)
-                write_file(expand, (digests(found.text) + to_toml(found.to_dict())).encode())
+                write_file(expand, (found.about + to_toml(found.to_dict())).encode())
             found = timed(found)
     except MissionError as error:
         if not json:

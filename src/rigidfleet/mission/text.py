@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import near
 
-_SHIPPED = resources.files("rigidfleet") / "missions"
+_SHIPPED = Path(__file__).parents[1] / "missions"
 
 
 def mission_names() -> list[str]:

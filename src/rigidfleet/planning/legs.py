@@ -6,6 +6,7 @@ follows from a loss read it; the plan of a flight (`rigidfleet.planning.plan`) i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,7 +18,6 @@ from rigidfleet.math import rigid_body
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase, Settle
 from rigidfleet.mission.kinds import seconds
-from rigidfleet.planning.body_trajectories import BodyTrajectory
 from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.derivatives import body_series, slot_derivatives
@@ -68,7 +68,7 @@ class Leg:
     knows_slots : whether that has slots, not only distances
     slots : (N, 3) at the end, about the CM, body axes [m]
     goal, arrival : the pose that the body is to reach, and when [s]
-    trajectory : of the body, if there is a course for it
+    way : motion of the body, if there is a course for it
     reference : of the slots; the distances of edges are those of a flight, which knows them
     masses, radius : (N,) of all vehicles, lost ones included [kg, m]
     settling : time in which errors of distances settle [s]
@@ -86,7 +86,7 @@ class Leg:
     slots: Floats | None
     goal: Pose | None
     arrival: float
-    trajectory: BodyTrajectory | None
+    way: Callable[[], Motion] | None
     reference: Reference
     masses: Floats
     radius: Floats
@@ -108,8 +108,8 @@ class Leg:
     @cached_property
     def motion(self) -> Motion:
         """Motion of the body; under the input forces alone, if it has no course."""
-        if self.trajectory is not None:
-            return self.trajectory.motion()
+        if self.way is not None:
+            return self.way()
         now, total = self.before, self.masses.sum()
         pieces = np.zeros((1, 6, 3))
         pieces[0, :3, 0] = self.masses @ now.r / total
@@ -148,7 +148,7 @@ class Leg:
     def _reached(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
         goal, settle = self.goal, self.phase.settle
-        if goal is None or settle is None or self.trajectory is None:
+        if goal is None or settle is None or self.way is None:
             return 0.0
         time = np.linspace(self.start, self.t_end, _LOOKS)
         cm, axes = (x[0] for x in body_series(self.motion, time))
@@ -290,7 +290,7 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
     """The leg of a phase from a departure: its own, or one of a phase that differs in nothing but its times."""
     before, now, frame, target, kind, p0, dp, turn = departure
     shaping, t_end = phase.shaping, latest_end(phase, now.t)
-    goal, arrival, trajectory, lift = course(mission, phase, now, t_end)
+    goal, arrival, way, lift = course(mission, phase, now, t_end)
     name, slots, T_b = now.formation, p0, 0.0
     if shaping is not None:
         name = shaping.formation
@@ -313,7 +313,7 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
     if shaping is None and now.blend is not None:
         reference = now.blend
     return Leg(
-        phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, trajectory,
+        phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, way,
         reference, mission.fleet.mass, mission.fleet.radius, mission.constraint.settling_time or 0.0,
         mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip

@@ -275,7 +275,7 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         constraint=mission.constraint, integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
-        loses=mission.first_loss < math.inf, through=passed(leg.trajectory),
+        loses=mission.first_loss < math.inf, through=passed(phase.points, motion),
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost

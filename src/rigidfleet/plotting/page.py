@@ -67,7 +67,7 @@ def summary(result: Result) -> Figure:
         _legend_above(lengths, curves.edge_handles(result))
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
-    (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(apart, result)
+    curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
     key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
     entries = space.handles(result, view)
     fig.legend(

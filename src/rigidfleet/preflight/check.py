@@ -73,7 +73,7 @@ def check(
         found.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     found.remarks = [
-        *(Remark("note", "files", text) for text in doubts(mission.text)),
+        *(Remark("note", "files", text) for text in doubts(mission.about)),
         *formation_remarks(mission, formations),
         *gain_remarks(mission, found),
         *margin_remarks(found),

@@ -24,10 +24,10 @@ from rigidfleet.plotting.quadrotors import (
     rotor_forces,
     rotor_limits,
     tilt,
-    tracking_error,
 )
 from rigidfleet.plotting.style import clean
 from rigidfleet.reporting import gains, overlay
+from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
@@ -200,10 +200,10 @@ def _phases(result: Result, verdict: Verdict) -> list[dict[str, str]]:
 def _vehicles(result: Result) -> list[dict[str, Any]]:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
-    with np.errstate(invalid="ignore"):
-        thrust = np.nan_to_num(result.thrust).max(axis=0)
-        speed = np.nan_to_num(np.linalg.norm(result.velocity, axis=2)).max(axis=0)
-        acceleration = np.nan_to_num(np.linalg.norm(result.acceleration, axis=2)).max(axis=0)
+    thrust, speed, acceleration = (
+        np.nan_to_num(samples(result, name).values).max(axis=0)
+        for name in ("thrust", "speed", "acceleration")
+    )
     z = result.position[..., 2]
     path = np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0)
     shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
@@ -238,7 +238,7 @@ def _with_rotors(result: Result) -> list[list[str]]:
         for values, form in (
             (share, lambda x: f"{100 * x:.0f} %"),
             (tilt(result), value),
-            (tracking_error(result), value),
+            (samples(result, "tracking_error").values, value),
         )
     ]
 
@@ -335,7 +335,8 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
 
 def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
-    return next((check.worst for check in verdict.checks if check.check == name), None)
+    check = verdict.by_name.get(name)
+    return None if check is None else check.worst
 
 
 def _mean(result: Result) -> float | None:
@@ -405,6 +406,7 @@ _CAPTIONS = {
     "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
     "rotors": "Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit.",
     "operation": "Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.",
+    "motion": "Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits.",
     "vehicles": "Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give.",
 }  # fmt: skip
 

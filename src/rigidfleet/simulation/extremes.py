@@ -25,7 +25,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
 from rigidfleet.mission.model import Fleet
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class CurveWatch:
         #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
         self.solids = None
         if None in corners:
-            self.solids, corners = joined([thing.solid for thing in obstacles]), []
+            self.solids, corners = join([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
     def _begin_monitor(self, states: int, gauge: int, steps: int) -> None:
@@ -177,7 +177,7 @@ class CurveWatch:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
         steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, np.arange(steps))
+        self._take_solids(problem, state, 0, steps)
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
@@ -217,24 +217,21 @@ class CurveWatch:
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
-        self._take_solids(problem, state, np.arange(len(steps[0])))
+        self._take_solids(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
         found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
         return found
 
-    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: Ints) -> None:
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, first: int, end: int
+    ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
-        if self.solids is None:
-            return
-        from rigidfleet.kernel import obstacles  # loads the compiler
+        if self.solids is not None:
+            from rigidfleet.kernel.engine.solids import watch_solids  # loads the compiler
 
-        trail, body = state.trail, bool(problem.body_formulation)
-        laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
-        watched = obstacles.monitor_of(self.monitor.monitor)
-        for row in _rows(state, steps):
-            obstacles.watch(trail.points[row], *trail.clock[row], laid, self.solids, watched)
+            watch_solids(self.monitor, problem, state, first, end, self.solids)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -430,7 +427,7 @@ class Extremes(CurveWatch):
             trail = records.trail(*size[1:])
             state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
         else:
-            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
+            state = records.integrator_in(state, y, t, rtol=rtol, atol=atol)
         self.state, self.size = state, size
         if not known:
             steps, gauge = state.trail.gauge.shape
@@ -487,7 +484,7 @@ class Extremes(CurveWatch):
         new: Ints = np.arange(int(count[records.STAYED]), steps)
         listed = int(count[records.LISTED_DISTANCES])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, new)
+        self._take_solids(problem, state, steps - len(new), steps)
         if self.n > _FEW:
             for step in new:
                 self._step(problem, work, state, step)

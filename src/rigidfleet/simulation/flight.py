@@ -35,11 +35,12 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     RotorCommand,
 )
+from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -322,9 +323,8 @@ class Flight:
                 return False
             phase = self._route[self._following]
             self._following += 1
-        elif isinstance(
-            phase, Mapping
-        ):  # checked first: a phase under way goes on where it has errors
+        elif isinstance(phase, Mapping):  # no phase yet
+            # Checked first: a phase under way goes on where it has errors.
             flown = len(self.phases) - (self._active is not None and not self._active.flew)
             phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
         else:
@@ -338,11 +338,11 @@ class Flight:
             plan = self._planned(phase)
             phase = plan.phase
             self._check_frame(plan)
-            make = ActivePhase
+            stepper = PointPhase
             if self._vehicles is not None:
-                make = partial(SampledPhase, vehicles=self._vehicles)
-            self._active = make(
-                len(self.phases), plan, extremes=self._extremes, external=self.external,
+                stepper = partial(SampledPhase, vehicles=self._vehicles)
+            self._active = ActivePhase(
+                len(self.phases), plan, stepper, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip
         except MissionError as error:
@@ -539,7 +539,7 @@ class Flight:
         self._extremes.among(obstacles)
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
-            solids = joined([thing.solid for thing in obstacles])
+            solids = join([thing.solid for thing in obstacles])
             vehicles.avoidance = among(vehicles.avoidance, solids)
 
     def contact(self) -> Extremum | None:
@@ -625,7 +625,7 @@ class Flight:
         record.extremes = self._extremes.phase()
         record.abandoned = abandoned
         record.controller = None if self.controller is None else active.asked > 0
-        if active.delay > 0.0:
+        if active.stepper.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.settled
         active.count()

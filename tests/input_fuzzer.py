@@ -1,6 +1,6 @@
 """Missions and results with anything wrong in them, and what the command makes of each.
 
-`python tests/mutations.py KIND SEED COUNT` tries so many cases, each by a seed of its own, in one process: within so
+`python tests/input_fuzzer.py KIND SEED COUNT` tries so many cases, each by a seed of its own, in one process: within so
 much memory, and each within so much time. A line of JSON says what came of each; what is none of a good end
 (exit code 0, 1 or 2, or an error with a remedy) is its "fault". `attack` starts such processes and goes on
 behind a case that hangs or dies.
