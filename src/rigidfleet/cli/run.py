@@ -134,7 +134,7 @@ def run(
 def missions(
     *, print_: Annotated[str, Parameter(name="--print")] = "", schema: bool = False
 ) -> int:
-    """List the shipped missions.
+    """List the shipped missions, in groups.
 
     Parameters
     ----------
@@ -144,6 +144,7 @@ def missions(
         Print the JSON schema of mission files instead, for editors.
     """
     from rigidfleet.mission import json_schema, mission_names, mission_text
+    from rigidfleet.mission.text import FIRST, GROUPS
 
     if print_ and schema:
         raise RigidfleetError("--print and --schema cannot be combined. Give one of them.")
@@ -155,10 +156,15 @@ def missions(
         import tomllib
 
         table = console.table("mission", "what it shows", "in the paper")
-        for name in mission_names():
-            head = tomllib.loads(mission_text(name))
-            table.add_row(name, head.get("title", ""), head.get("source", ""))
+        table.columns[0].min_width = 2 + max(map(len, mission_names()))  # a name is not broken
+        for group, names in GROUPS.items():
+            table.add_row(group, style="bold")
+            for name in names:
+                head = tomllib.loads(mission_text(name))
+                table.add_row(f"  {name}", head.get("title", ""), head.get("source", ""))
         console.print_table(table)
+        first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
+        console.out().print(first, soft_wrap=True)
     return PASSED
 
 
