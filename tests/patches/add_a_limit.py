@@ -1,6 +1,7 @@
 """A made-up limit of constraint forces is judged, has its metric, its row on the page, and its key in the document."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -31,7 +32,7 @@ for limit, passes in ((1.01 * greatest, True), (0.5 * greatest, False)):
     assert row.margin is not None
     assert (row.margin > 0.0) == passes
 
-assert html_page(result).count("<th>constraint force") == 2
+assert len(re.findall("<th[^>]*>constraint force", html_page(result))) == 1
 assert METRICS["constraint_force"].unit == "N"
 assert json_schema()["$defs"]["Limits"]["properties"]["constraint_force"]["description"]
 assert "| `constraint_force` | number |" in tables.render(Path("docs/missions.md").read_text())

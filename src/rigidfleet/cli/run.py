@@ -143,7 +143,7 @@ def missions(
     schema : bool
         Print the JSON schema of mission files instead, for editors.
     """
-    from rigidfleet.mission import json_schema, mission_names, mission_text
+    from rigidfleet.mission import json_schema, mission_text
     from rigidfleet.mission.text import FIRST, GROUPS
 
     if print_ and schema:
@@ -155,14 +155,16 @@ def missions(
     else:
         import tomllib
 
-        table = console.table("mission", "what it shows", "in the paper")
-        table.columns[0].min_width = 2 + max(map(len, mission_names()))  # a name is not broken
+        from rigidfleet._common.facts import Row, Sheet, Table
+
+        rows = []
         for group, names in GROUPS.items():
-            table.add_row(group, style="bold")
+            rows.append(Row((group, None, None)))
             for name in names:
                 head = tomllib.loads(mission_text(name))
-                table.add_row(f"  {name}", head.get("title", ""), head.get("source", ""))
-        console.print_table(table)
+                rows.append(Row((f"  {name}", head.get("title"), head.get("source"))))
+        heads = ("mission", "what it shows", "in the paper")
+        console.show(Sheet("", "", [Table(heads, rows, heads)]))
         first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
         console.out().print(first, soft_wrap=True)
     return PASSED
