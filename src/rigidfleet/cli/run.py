@@ -143,7 +143,7 @@ def missions(
     schema : bool
         Print the JSON schema of mission files instead, for editors.
     """
-    from rigidfleet.mission import json_schema, mission_names, mission_text
+    from rigidfleet.mission import json_schema, mission_text
     from rigidfleet.mission.text import FIRST, GROUPS
 
     if print_ and schema:
@@ -155,15 +155,18 @@ def missions(
     else:
         import tomllib
 
-        table = console.table("mission", "what it shows", "in the paper")
-        table.columns[0].min_width = 2 + max(map(len, mission_names()))  # a name is not broken
-        for group, names in GROUPS.items():
-            table.add_row(group, style="bold")
-            for name in names:
-                head = tomllib.loads(mission_text(name))
-                table.add_row(f"  {name}", head.get("title", ""), head.get("source", ""))
-        console.print_table(table)
+        from rigidfleet._common.facts import Row, Sheet, Table
+
+        def row(name: str) -> Row:
+            head = tomllib.loads(mission_text(name))
+            return Row((f"  {name}", head.get("title"), head.get("source")))
+
+        rows = [
+            x for group, names in GROUPS.items() for x in (Row((group, "", "")), *map(row, names))
+        ]
+        heads = ("mission", "what it shows", "in the paper")
         first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
+        console.show(Sheet("", "", [Table(heads, rows, heads)]))
         console.out().print(first, soft_wrap=True)
     return PASSED
 

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
+from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
 from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
-from rigidfleet.formation.assignment import assigned, squashed
+from rigidfleet.formation.assignment import assign_slots, downwash_metric
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
@@ -22,7 +23,7 @@ from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import scaled, told_apart
 from rigidfleet.mission.check import check, defaults
-from rigidfleet.mission.describe import counted
+from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.files import digests
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
@@ -78,7 +79,7 @@ def _once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
     return wrapper
 
 
-class Mission(Contents):
+class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
     >>> import rigidfleet as rf
@@ -196,17 +197,19 @@ class Mission(Contents):
 
     __str__ = __repr__
 
-    def _repr_html_(self) -> str:
-        """Show the mission in a notebook: its phases, in order."""
-        from rigidfleet._common import markup
-        from rigidfleet.mission.describe import ending, goal
+    def facts(self) -> Sheet:
+        """The phases, in order, and the size."""
+        return Sheet(self.name, self.title, [self.phase_table, Line(self.size_in_words)])
 
+    @property
+    def phase_table(self) -> Table:
+        """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
-            (n, phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-            for n, phase in enumerate(self.phases, start=1)
+            Row((n, p.name, p.kind, goal(p), ending(p), p.control))
+            for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
-        return markup.shown(self.name, self.title, heads, rows, self.size_in_words)
+        return Table(heads, rows, heads[1:])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
@@ -314,8 +317,8 @@ class Mission(Contents):
                 radius = self.agents.radius if self.assignment == "safe" else None
                 metric = None
                 if self.assignment_downwash > 1.0 and axes is not None:
-                    metric = squashed(up, self.assignment_downwash)
-                order, turn = assigned(places, slots, turn=axes, radius=radius, metric=metric)
+                    metric = downwash_metric(up, self.assignment_downwash)
+                order, turn = assign_slots(places, slots, turn=axes, radius=radius, metric=metric)
                 if self.assignment != "each":
                     return dict.fromkeys(self.formations, order), {(before, name): turn}
                 orders[name] = order
