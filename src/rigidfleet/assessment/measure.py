@@ -214,7 +214,10 @@ class Measurements:
                 if name in vars(result):  # else it would be made of these very positions
                     stored[name] = getattr(result, name) - getattr(self.close, name), "m"
         stored |= {
-            "distance": (self.off_lengths, "m"),
+            "distance": (
+                np.abs(proximity.lengths(r, result.edges).T - result.distance),
+                "m",
+            ),
             "thrust": (self.thrust - result.thrust, "N"),
         }
         for name, (off, unit) in stored.items():
@@ -262,19 +265,6 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
-
-    @property
-    def off_lengths(self) -> Floats:
-        """Greatest size (K,) [m] by which a recorded length of an edge differs from that between positions."""
-        r, edges, given = self.result.position, self.result.edges, self.result.distance
-        greatest = np.zeros(len(r))
-        some = max(1, proximity.CACHED * len(r) // r.size)  # of some samples at a time
-        for k in range(0, len(r), some):
-            part = slice(k, k + some)
-            off = proximity.lengths(r[part], edges)
-            off -= given[part].T
-            np.fmax.reduce(np.abs(off, out=off), axis=0, initial=0.0, out=greatest[part])
-        return greatest
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""

@@ -46,7 +46,6 @@ class Preparation:
 
     def give_back(self, extremes: Extremes) -> None:
         """Let other flights use the monitor of one that is finished."""
-        extremes.let_go()
         if extremes.reusable and len(self._idle) < _KEPT:
             self._idle.append(extremes)
 
