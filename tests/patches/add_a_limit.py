@@ -31,7 +31,7 @@ for limit, passes in ((1.01 * greatest, True), (0.5 * greatest, False)):
     assert row.margin is not None
     assert (row.margin > 0.0) == passes
 
-assert html_page(result).count("<th>constraint force") == 2
+assert html_page(result).count('class="words">constraint force') == 2
 assert METRICS["constraint_force"].unit == "N"
 assert json_schema()["$defs"]["Limits"]["properties"]["constraint_force"]["description"]
 assert "| `constraint_force` | number |" in tables.render(Path("docs/missions.md").read_text())

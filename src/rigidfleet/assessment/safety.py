@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigidfleet._common.facts import Fact
 from rigidfleet._common.quantities import QUANTITIES, shown
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import Extreme
@@ -43,6 +44,12 @@ class Safety:
             return None
         rest = self.limit - self.worst.value
         return -rest if self.at_least else rest
+
+    @property
+    def fact(self) -> Fact:
+        """The quantity to show."""
+        worst = None if self.worst is None else self.worst.value
+        return Fact(self.quantity, worst, self.unit, self.limit, self.at_least)
 
     @property
     def used(self) -> float | None:

@@ -272,18 +272,18 @@ def sweep(count, p, w, a):
 @compiled
 def entry(i, j, n, k, l, m, a):
     """Entry of A for two rows: unit vectors n and m (3,), vehicles i and j, k and l (-1: none)."""
-    found = 0.0
+    value = 0.0
     dot = n[0] * m[0] + n[1] * m[1] + n[2] * m[2]
     if i == k:
-        found += dot / a.weight[i]
+        value += dot / a.weight[i]
     elif i == l:
-        found -= dot / a.weight[i]
+        value -= dot / a.weight[i]
     if j >= 0:
         if j == k:
-            found -= dot / a.weight[j]
+            value -= dot / a.weight[j]
         elif j == l:
-            found += dot / a.weight[j]
-    return found
+            value += dot / a.weight[j]
+    return value
 
 
 @compiled

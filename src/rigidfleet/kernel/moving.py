@@ -140,7 +140,7 @@ def look(t, r, lost, a):
 
 
 @compiled
-def present(o, a):
+def is_known(o, a):
     """Whether obstacle o stands still, or moves and is known."""
     return a.sight.moves[o] == 0 or a.sight.known[o] == KNOWN
 
@@ -281,11 +281,11 @@ def follow_flow(i, r, v, a):
     U + (R / q)^3 / 2 (U - 3 (U . n) n) (Lamb, *Hydrodynamics*, section 92). R is that of a ball round the obstacle,
     with the vehicle, and a fifth more; nearer than R, q is R.
     """
-    s, led, normal, ask = a.sight, False, a.normal, a.shifted[0]
+    s, turned, normal, ask = a.sight, False, a.normal, a.shifted[0]
     for q in range(3):
         ask[q] = v[q] + a.wanted[i, q] / _FLOW_RATE
     for o in range(s.moves.shape[0]):
-        if not (s.ball[o] < math.inf and present(o, a)):
+        if not (s.ball[o] < math.inf and is_known(o, a)):
             continue
         x = s.track[o]
         away = from_solid(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
@@ -299,5 +299,5 @@ def follow_flow(i, r, v, a):
         for q in range(3):
             turn = share * (ask[q] - x[3 + q] - 3.0 * along * normal[q])
             a.wanted[i, q] += _FLOW_RATE * turn
-        led = True
-    return led
+        turned = True
+    return turned

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet._common.kept import kept
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import Solids, join
 from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 
@@ -277,7 +277,7 @@ def workspace(
     return w
 
 
-def cleared(w: Workspace) -> Workspace:
+def clear(w: Workspace) -> Workspace:
     """The workspace as it was made; all its arrays lie in one memory."""
     memory = w.r.base
     assert memory is not None
@@ -287,7 +287,7 @@ def cleared(w: Workspace) -> Workspace:
     return w
 
 
-def padded(count: int) -> int:
+def padded_size(count: int) -> int:
     """``count`` rounded up to a multiple of 8: the numbers in a cache line, and the lanes of a `lanes` value."""
     return -(-count // 8) * 8
 
@@ -295,10 +295,10 @@ def padded(count: int) -> int:
 def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
     """Arrays of zeros, each aligned to a cache line."""
     sizes = [math.prod(shape) for shape in shapes.values()]
-    ends = list(accumulate(map(padded, sizes)))
+    ends = list(accumulate(map(padded_size, sizes)))
     memory = zeros(ends[-1])
     return {
-        name: memory[end - padded(size) :][:size].reshape(shape)
+        name: memory[end - padded_size(size) :][:size].reshape(shape)
         for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
     }
 
@@ -309,7 +309,7 @@ def no_disturbance(masses: Floats) -> Disturbance:
     none = zeros(0, n, 3)
     return Disturbance(
         False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
-        np.full(n, -np.inf), np.zeros(n), joined([]),
+        np.full(n, -np.inf), np.zeros(n), join([]),
     )  # fmt: skip
 
 
@@ -338,11 +338,11 @@ def _meeting(edges: NDArray[np.integer]) -> tuple[Edges, Ints, Ints, Floats]:
         sign = 1.0 - 2.0 * end
         p, q = np.tril_indices(len(k), -1)
         parts.append(np.stack([k[p], k[q], np.full(len(p), float(agent)), sign[p] * sign[q]]))
-    found = np.concatenate(parts, axis=1)
-    pairs, where = np.unique(found[:2].T.astype(np.uint32), axis=0, return_inverse=True)
+    meetings = np.concatenate(parts, axis=1)
+    pairs, where = np.unique(meetings[:2].T.astype(np.uint32), axis=0, return_inverse=True)
     return (
         np.ascontiguousarray(pairs).reshape(-1, 2),
         where.ravel(),
-        found[2].astype(np.int64),
-        found[3],
+        meetings[2].astype(np.int64),
+        meetings[3],
     )

@@ -75,7 +75,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
     """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
-    times = [s for m in missions if (s := m.constraint.settling_time) is not None]
+    times = [s for m in missions if len(m.edges) and (s := m.constraint.settling_time) is not None]
     if not times:
         return None
     t = np.linspace(0.0, 1.6 * max(times), 400)

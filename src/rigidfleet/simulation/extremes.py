@@ -24,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
 from rigidfleet.mission.model import Fleet
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -99,8 +99,7 @@ class CurveWatch:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        self.stood = _standing(fleet.position, self.radius, tuple(obstacles), t)
-        self.standing = self.stood.copy()
+        self.standing = _standing(fleet.position, self.radius, tuple(obstacles), t)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
@@ -111,7 +110,7 @@ class CurveWatch:
         #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
         self.solids = None
         if None in corners:
-            self.solids, corners = joined([thing.solid for thing in obstacles]), []
+            self.solids, corners = join([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
     def _begin_monitor(self, states: int, gauge: int, steps: int) -> None:
@@ -157,7 +156,7 @@ class CurveWatch:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
         steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, np.arange(steps))
+        self._take_solids(problem, state, 0, steps)
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
@@ -197,24 +196,21 @@ class CurveWatch:
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
-        self._take_solids(problem, state, np.arange(len(steps[0])))
+        self._take_solids(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
         found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
         return found
 
-    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: Ints) -> None:
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, first: int, end: int
+    ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
-        if self.solids is None:
-            return
-        from rigidfleet.kernel import obstacles  # loads the compiler
+        if self.solids is not None:
+            from rigidfleet.kernel.engine.solids import watch_solids  # loads the compiler
 
-        trail, body = state.trail, bool(problem.body_formulation)
-        laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
-        watched = obstacles.monitor_of(self.monitor.monitor)
-        for row in _rows(state, steps):
-            obstacles.watch(trail.points[row], *trail.clock[row], laid, self.solids, watched)
+            watch_solids(self.monitor, problem, state, first, end, self.solids)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -370,22 +366,6 @@ class Extremes(CurveWatch):
             found = self.monitor.monitor
             self.monitor = native.Watch(found._replace(boxes=self.boxes, count=found.count.copy()))
 
-    @property
-    def reusable(self) -> bool:
-        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
-        return self.n <= _FEW and bool(self.left.all())
-
-    def restart(self) -> None:
-        """Forget the flight that was monitored."""
-        self.worst[:] = self.none
-        self.low.fill(np.inf)
-        self.when.fill(0.0)
-        self.who.fill(-1)
-        self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
-        if self.size is not None:
-            self.monitor.monitor.count[:] = 0, records.ANY_STEP, records.ANY_STEP
-
     def begin(
         self,
         y: Floats,
@@ -405,7 +385,7 @@ class Extremes(CurveWatch):
         size = len(y), states or len(y), edges
         state = self.state
         if state is not None and size == self.size:
-            self.state = records.restarted(state, y, t, rtol=rtol, atol=atol)
+            self.state = records.integrator_in(state, y, t, rtol=rtol, atol=atol)
         else:
             trail = records.trail(size[1], self.n, edges, self.directed)
             self.state = state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
@@ -456,7 +436,7 @@ class Extremes(CurveWatch):
         new: Ints = np.arange(int(count[records.STAYED]), steps)
         listed = int(count[records.LISTED_DISTANCES])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, new)
+        self._take_solids(problem, state, steps - len(new), steps)
         if self.n > _FEW:
             for step in new:
                 self._step(problem, work, state, step)

@@ -17,9 +17,9 @@ from rigidfleet.kernel.engine import lane_bounds, lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     Tables,
     integrate,
-    packed,
-    unrolled,
-    unrolled_together,
+    lanes_of,
+    unroll,
+    unroll_together,
 )
 from rigidfleet.kernel.problem import (
     EXACT,
@@ -30,7 +30,7 @@ from rigidfleet.kernel.problem import (
     Disturbance,
     Problem,
     Reference,
-    padded,
+    padded_size,
     workspace,
 )
 from rigidfleet.kernel.records import (
@@ -161,9 +161,9 @@ def _blend(reference: Reference) -> tuple[int, float, float]:
     return reference.kind, reference.t0, reference.T_b
 
 
-def _tables(given: Disturbance) -> tuple[object, ...]:
+def _tables(x: Disturbance) -> tuple[object, ...]:
     return (
-        given.active, given.gust.shape, given.noise_r.shape, given.noise_v.shape, given.gust_step, given.noise_step,
+        x.active, x.gust.shape, x.noise_r.shape, x.noise_v.shape, x.gust_step, x.noise_step,
     )  # fmt: skip
 
 
@@ -175,8 +175,8 @@ class Vector:
     given : disturbances of the flights
     """
 
-    def __init__(self, given: Sequence[Disturbance]) -> None:
-        self._tables = Tables(given)
+    def __init__(self, disturbances: Sequence[Disturbance]) -> None:
+        self._tables = Tables(disturbances)
         self._trails: list[Trail] = []
 
     def begin(
@@ -208,7 +208,7 @@ class Vector:
         ):
             self._allocate(problems)
         tables = self._tables.between(float(states[0].clock[TIME]), t_end)
-        ready = unrolled_together(problems, tables)
+        ready = unroll_together(problems, tables)
         lane_bounds.begin(self._search, monitors)
         places = np.array([x.ctypes.data for x in samples])
         self._problem = ready._replace(samples=places, search=self._search)
@@ -217,7 +217,7 @@ class Vector:
         unpack(K)[: lane_steps.STAGES] = 0.0
         unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
         clock = np.array([first.clock[TIME], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
-        y, count = packed([state.y for state in states]), np.zeros_like(first.count)
+        y, count = lanes_of([state.y for state in states]), np.zeros_like(first.count)
         self._state = IntegratorState(y, K, clock, count, first.rtol, self._length)
         self._fresh = True
 
@@ -296,11 +296,11 @@ def fly_all(
     if not fits(problem):
         raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
-    ready = unrolled(problem)
+    ready = unroll(problem)
 
     def in_lanes(x: Floats) -> LaneArray:
         if count % WIDTH:  # unused lanes of the last vector repeat the last flight
-            x = x[np.minimum(np.arange(padded(count)), count - 1)]
+            x = x[np.minimum(np.arange(padded_size(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def begin() -> Callable[..., None]:
@@ -322,10 +322,10 @@ def fly_all(
 
         return work
 
-    found = _share(begin, in_lanes(starts), in_lanes(before), threads)
-    y = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
-    finished = np.repeat(found.finished, WIDTH)[:count]
-    evaluations = np.repeat(found.evaluations, WIDTH)[:count]
+    ends = _share(begin, in_lanes(starts), in_lanes(before), threads)
+    y = unpack(ends.y).swapaxes(1, 2).reshape(-1, n)[:count]
+    finished = np.repeat(ends.finished, WIDTH)[:count]
+    evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
         again = _fly_alone(

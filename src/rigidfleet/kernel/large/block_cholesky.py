@@ -48,19 +48,19 @@ def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pat
         count_blocks(first, left, parent, mark, count, 1 << 62)
     column = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     blocks = int(column[-1])
-    found = Pattern(
+    blocks_of = Pattern(
         place, column, np.empty(blocks, np.int64), np.empty(n + 1, np.int64),
         np.empty(blocks - n, np.int64), np.empty(blocks - n, np.int64), np.empty(len(edges), np.int64),
     )  # fmt: skip
     mark[:] = -1
     next_ = column[:-1].copy()
-    fill_blocks(first, left, parent, mark, next_, found)
+    fill_blocks(first, left, parent, mark, next_, blocks_of)
     key = (
-        np.repeat(np.arange(n), np.diff(column)) * n + found.row
+        np.repeat(np.arange(n), np.diff(column)) * n + blocks_of.row
     )  # sorted, as rows are in a column
     low, high = np.sort(place[edges], axis=1).T
-    found.of_edge[:] = np.searchsorted(key, low * n + high)
-    return found
+    blocks_of.of_edge[:] = np.searchsorted(key, low * n + high)
+    return blocks_of
 
 
 @compiled
