@@ -18,6 +18,7 @@ from rigidfleet.math import rigid_body
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase, Settle
 from rigidfleet.mission.kinds import seconds
+from rigidfleet.mission.schema import Constraint
 from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.derivatives import body_series, slot_derivatives
@@ -71,7 +72,7 @@ class Leg:
     way : motion of the body, if there is a course for it
     reference : of the slots; the distances of edges are those of a flight, which knows them
     masses, radius : (N,) of all vehicles, lost ones included [kg, m]
-    settling : time in which errors of distances settle [s]
+    constraint : options of the law that holds distances
     smooth : whether the next phase begins with the acceleration and jerk of the reference
     """
 
@@ -90,7 +91,7 @@ class Leg:
     reference: Reference
     masses: Floats
     radius: Floats
-    settling: float
+    constraint: Constraint
     smooth: bool
 
     @property
@@ -143,7 +144,7 @@ class Leg:
         """Time [s] at which the phase is expected to end: one that ends by settling, soon after it reaches its goal."""
         if self.phase.settle is None:
             return self.t_end
-        return self.start + settling_length(self.phase, self.settling, self._reached())
+        return self.start + settling_length(self.phase, self.constraint, self._reached())
 
     def _reached(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
@@ -314,7 +315,7 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
         reference = now.blend
     return Leg(
         phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, way,
-        reference, mission.fleet.mass, mission.fleet.radius, mission.constraint.settling_time or 0.0,
+        reference, mission.fleet.mass, mission.fleet.radius, mission.constraint,
         mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
 
@@ -326,12 +327,13 @@ def latest_end(phase: Phase, start: float) -> float:
     return start + seconds(phase.duration or (phase.settle or Settle()).timeout)
 
 
-def settling_length(phase: Phase, settling: float, reached: float = 0.0) -> float:
+def settling_length(phase: Phase, constraint: Constraint, reached: float = 0.0) -> float:
     """Expected duration [s] of a phase that ends by settling: soon after its motion.
 
-    Errors of distances settle in ``settling`` [s]; the goal is ``reached`` so long after the start [s].
+    Errors of distances have to settle; the goal is ``reached`` so long after the start [s].
     """
     assert phase.settle is not None
+    settling = constraint.settling_time or 0.0
     least = max(phase.least_time, reached) + settling + phase.settle.dwell
     return min(phase.settle.timeout, least)
 
@@ -342,7 +344,6 @@ def phase_spans(mission: Mission) -> list[tuple[float, float]]:
     for phase in mission.phases:
         begin, end = end, latest_end(phase, end)
         if phase.settle is not None:
-            settling = mission.constraint.settling_time or 0.0
-            end = begin + settling_length(phase, settling)
+            end = begin + settling_length(phase, mission.constraint)
         spans.append((begin, end))
     return spans

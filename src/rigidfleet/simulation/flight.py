@@ -35,6 +35,7 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     RotorCommand,
 )
+from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
@@ -207,8 +208,8 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self._prepared = prepared(as_mission(mission))
-        self.mission = mission = self._prepared.mission
+        preparation = prepared(as_mission(mission))
+        self.mission = mission = preparation.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (("controller", controller), ("progress", progress)):
@@ -228,11 +229,11 @@ class Flight:
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
         r, v = mission.fleet.position.copy(), mission.fleet.velocity.copy()
-        self._begins = self._reached = changed(at_start(mission), r=r, v=v)
+        self._reached = changed(at_start(mission), r=r, v=v)
         self._vehicles = Vehicles(mission, self._push.max_step) if mission.vehicle_models else None
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = self._prepared.disturbance if self._vehicles is None else None
-        self._extremes = self._prepared.extremes()
+        self._disturbance = preparation.disturbance if self._vehicles is None else None
+        self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
             None  # the phase before, if its last state is not known yet
@@ -335,7 +336,8 @@ class Flight:
         if self._asked:
             self._report(phase, planning=True)
         try:
-            plan = self._planned(phase)
+            leg = timed_leg(self.mission, phase, self._now, len(self._asked))
+            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
             stepper = PointPhase
@@ -491,9 +493,7 @@ class Flight:
         if self._ended is not None:  # no phase follows
             self._ended.release()
             self._ended = None
-        result = self.record(self.pieces, None if own else self._asked)
-        self._prepared.give_back(self._extremes)
-        return result
+        return self.record(self.pieces, None if own else self._asked)
 
     def record(
         self,
@@ -549,14 +549,6 @@ class Flight:
         return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
-
-    def _planned(self, phase: Phase) -> PhasePlan:
-        """The plan of a phase from the state now, with its times known."""
-        now, disturbance, push = self._now, self._disturbance, self._push
-        if now is self._begins and now.lost is None:
-            return self._prepared.first_plan(phase, now, disturbance, push)
-        leg = timed_leg(self.mission, phase, now, len(self._asked))
-        return plan_phase(self.mission, leg, disturbance=disturbance, external=push)
 
     @property
     def _now(self) -> PhaseState:
