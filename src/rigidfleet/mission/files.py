@@ -126,10 +126,10 @@ def _names(path: Path, named: _Named) -> list[str]:
     found = _inside(path, named.where, name)
     if not named.folder or not found.is_dir():
         return [name]
-    from rigidfleet.foreign.files import files_of
+    from rigidfleet.foreign.files import groups_of_files
 
     try:
-        inside = [file for group in files_of(found) for file in group]
+        inside = [file for group in groups_of_files(found) for file in group]
     except TrajectoryError as error:
         raise _unread(str(path), named.where, error) from None
     return [str(Path(name) / file.relative_to(found)) for file in inside]
@@ -198,7 +198,7 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     from rigidfleet.foreign.columns import Doubt
-    from rigidfleet.foreign.curves import curve_to_rows, least_jerk
+    from rigidfleet.foreign.curves import curve_to_rows
     from rigidfleet.foreign.files import read_trajectories
     from rigidfleet.foreign.samples import ASSUMED
 
@@ -216,7 +216,7 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     if read.assumed in ASSUMED.values():
         if any((c.time[[0, -1]] != (begin, end)).any() for c in curves):
             notes.append(f"only the time of which all have data is flown, {begin:g} to {end:g} s")
-        curves = [least_jerk(c.between(begin, end)) for c in curves]
+        curves = [least_jerk_curve(c.between(begin, end)) for c in curves]
     else:
         begin = min(c.time[0] for c in curves)
         curves = [c.on(np.union1d(begin, c.time), stays=True) for c in curves]

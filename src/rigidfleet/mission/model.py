@@ -15,7 +15,7 @@ from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
-from rigidfleet.formation.assignment import assigned, squashed
+from rigidfleet.formation.assignment import assign_slots, downwash_metric
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
@@ -317,8 +317,8 @@ class Mission(Contents, Shown):
                 radius = self.agents.radius if self.assignment == "safe" else None
                 metric = None
                 if self.assignment_downwash > 1.0 and axes is not None:
-                    metric = squashed(up, self.assignment_downwash)
-                order, turn = assigned(places, slots, turn=axes, radius=radius, metric=metric)
+                    metric = downwash_metric(up, self.assignment_downwash)
+                order, turn = assign_slots(places, slots, turn=axes, radius=radius, metric=metric)
                 if self.assignment != "each":
                     return dict.fromkeys(self.formations, order), {(before, name): turn}
                 orders[name] = order

@@ -568,9 +568,9 @@ _GOALS = {
 
 def _realisation_words(r: Realisations) -> str:
     """How many random starts reach which shape: 36 of 40 random starts reach this shape, 4 its mirror image."""
-    if not r.found:
+    if not r.shapes:
         return f"none of {r.starts} random starts converges"
-    first, *others = [(x.found, _GOALS[x.kind] + " that bends" * x.bends) for x in r.found]
+    first, *others = [(x.starts, _GOALS[x.kind] + " that bends" * x.bends) for x in r.shapes]
     verb = "reaches" if first[0] == 1 else "reach"
     text = f"{first[0]} of {r.starts} random starts {verb} {first[1]}"
     text += "".join(f", {count} {goal}" for count, goal in others[:3])

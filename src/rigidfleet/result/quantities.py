@@ -94,7 +94,7 @@ def samples(result: Result, name: str, close: proximity.Closeness | None = None)
 
 def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
     """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
-    x = (result.velocity, result.acceleration, result.slot_jerk)[q.order - 1]
+    x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
         return (np.full(result.left.shape, np.nan),)
     return (of_left(result, SIZES[q.way](x) if q.way else length(x)),)
