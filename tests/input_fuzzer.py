@@ -98,9 +98,9 @@ class Dice:
 
 def a_mission(dice: Dice) -> bytes:
     """A shipped mission, changed in structure, in values, in sizes or in bytes."""
-    names = sorted(path.name for path in SHIPPED.glob("*.toml"))
-    name = dice.one([n for n in names if n != "show-1000.toml"] * 5 + ["show-1000.toml"])
-    text = (SHIPPED / name).read_text()
+    paths = sorted(SHIPPED.glob("*/*.toml"), key=lambda path: path.name)
+    small = [path for path in paths if path.stem != "show-1000"]
+    text = dice.one(small * 5 + [path for path in paths if path not in small]).read_text()
     how = dice.upto(14)
     if how >= 10:
         data = tomllib.loads(text)

@@ -13,9 +13,10 @@ from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.measured import nearest_of
 from rigidfleet.kernel.problem import workspace
-from rigidfleet.math import proximity
+from rigidfleet.math import pid, proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import VARIABLES, Result
+from rigidfleet.result.result import LATER
 from rigidfleet.simulation.flight import Flight
 
 LOST = {"disturbances": {"lost": [{"agent": 2, "time": 3.0}]}}
@@ -207,6 +208,26 @@ def test_what_is_made_later_is_listed():
     assert "thrust" not in vars(result)
     assert {*VARIABLES, "mission_text"} <= {*dir(result)}
     assert "thrust" not in vars(result), "listing makes nothing"
+
+
+def test_a_verdict_makes_no_derivatives_of_references():
+    """A flight without a limit of jerk is judged without the derivatives of its slots, which take longer to make."""
+    result = simulate(a_mission())
+    assert assess(result).checks
+    assert not {*LATER} & {*vars(result)}
+
+
+def test_only_a_phase_that_settles_needs_the_time_to_settle(monkeypatch):
+    """A flight whose phases end at given times never computes in which time errors settle."""
+
+    def settling_time(*_):
+        raise AssertionError("computed")
+
+    monkeypatch.setattr(pid, "settling_time", settling_time)
+    assert simulate(a_mission()).complete
+    settles = [{"kind": "hold", "settle": {}}]
+    with pytest.raises(AssertionError, match="computed"):
+        simulate(a_mission(phases=[*a_mission().to_dict()["phases"], *settles]))
 
 
 def test_what_somebody_sets_is_not_made_later():

@@ -12,6 +12,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.constraint_jacobian import jacobian
+from rigidfleet.result.quantities import length
 from rigidfleet.typing import Floats, Ints
 
 #: Slots thinner than this, relative to their length, count as planar or straight. Distances of seven digits
@@ -135,22 +136,6 @@ class Fit:
         if self.dimension != 1 or len(self._order) < 3:
             return None
         return self._laid.order[self._k] in (self._order, self._order[::-1])
-
-
-def length(x: Floats, more: Floats | None = None) -> Floats:
-    """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
-    if x.size > proximity.CACHED and len(x) > 1:
-        # In parts, of which what is between stays in the cache.
-        found = np.empty(x.shape[:-1])
-        some = max(1, proximity.CACHED * len(x) // x.size)
-        for k in range(0, len(x), some):
-            part = slice(k, k + some)
-            found[part] = length(x[part], None if more is None else more[part])
-        return found
-    if more is not None:
-        x = x + more
-    squares = x * x
-    return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
 
 @lru_cache(64)

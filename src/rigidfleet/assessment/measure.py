@@ -4,44 +4,25 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
-from functools import cached_property, partial
+from collections.abc import Iterator
+from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
-from rigidfleet._common.text import agent_names
-from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
+from rigidfleet._common.quantities import QUANTITIES, quantity
+from rigidfleet.assessment.fits import Fit, Laid, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.math.bernstein import SIZES
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
+from rigidfleet.result.quantities import SAMPLED, Samples, closeness, of_left, owner_name, samples
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
-
-#: What has a value: by its sample, and its place there, the indices that its quantity needs to name it (from 0).
-Owner = Callable[..., tuple[int, ...]]
-
-
-class Samples:
-    """Values (K, ...) of a quantity at samples, with their owners.
-
-    Attributes
-    ----------
-    rank : of each value (K, places): greater is worse; -infinity if the value is not finite
-    """
-
-    def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i: (i, -1)) -> None:
-        self.quantity, self.values, self.owner = q, values, owner
-        rank = q.rank(values)
-        self.rank = np.where(np.isfinite(rank), rank, -np.inf).reshape(len(rank), -1)
 
 
 class Measurements:
@@ -62,57 +43,31 @@ class Measurements:
         self._nearest: dict[tuple[float, int], int] = {}
         self._sampled: dict[str, Samples] = {}
         #: Distances to each other and to obstacles at samples.
-        self.close = proximity.closeness(
-            result.position,
-            self.mission.agents.radius,
-            self.mission.obstacles,
-            result.time,
-            self.left,
-        )
-        thrust = length(result.input_force, result.constraint_force)
-        if self.mission.agents.saturate:
-            thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
-        if result.rotor_force is not None:  # what was given, not what was asked
-            thrust = result.rotor_force.sum(axis=2)
-        self.thrust = self.of_left(np.maximum(thrust, result.thrust))
+        self.close = closeness(result)
         self.measured = {q.name: self.sampled(q.name) for q in QUANTITIES.values() if q.by_phase}
+        self.thrust = self.measured["thrust"].values
         #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
         self.rank = {name: [-math.inf] * len(result.phases) for name in self.measured}
         starts = np.array([self.samples[k].start for k in self.flown])
-        for name, samples in self.measured.items():
-            if places := samples.rank.shape[1]:
-                most = np.maximum.reduceat(samples.rank.reshape(-1), places * starts).tolist()
+        for name, sampled in self.measured.items():
+            if places := sampled.rank.shape[1]:
+                most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
                 for k, rank in zip(self.flown, most, strict=True):
                     self.rank[name][k] = rank
         #: The last sample of each phase flown, and positions (F, N, 3) there.
         self.last = [self.samples[k].stop - 1 for k in self.flown]
         self.ends = result.position[self.last]
 
-    def of_left(self, values: Floats) -> Floats:
-        """Values (K, N), NaN for lost agents."""
-        return values if self.whole else np.where(self.left, values, np.nan)
-
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
-
-    def owner(self, q: Quantity, who: int, other: int = -1) -> str:
-        """Name of the owner of a value: an agent, two agents, an edge, or an agent and an obstacle (from 0)."""
-        match q.who:
-            case "pair":
-                return agent_names(sorted((who, other)))
-            case "edge":
-                return f"edge {who + 1}-{other + 1}"
-            case "obstacle":
-                return f"agent {who + 1}, {self.mission.obstacles[other].name}"
-        return f"agent {who + 1}" if q.who == "agent" else ""
 
     # -- at samples -----------------------------------------------------------------------------------
 
     def sampled(self, name: str) -> Samples:
         """Values of a quantity at samples."""
         if name not in self._sampled:
-            self._sampled[name] = Samples(QUANTITIES[name], *_SAMPLED[name](self))
+            self._sampled[name] = samples(self.result, name, self.close)
         return self._sampled[name]
 
     def worst_sample(
@@ -129,7 +84,11 @@ class Measurements:
         at = (k,) if values.ndim == 1 else (k, place)
         phase, who = result.phases[result.phase.item(k)].name, samples.owner(*at)
         return Extreme(
-            values.item(at), result.time.item(k), self.owner(samples.quantity, *who), phase, alone
+            values.item(at),
+            result.time.item(k),
+            owner_name(result, samples.quantity, *who),
+            phase,
+            alone,
         )
 
     # -- between samples ------------------------------------------------------------------------------
@@ -144,7 +103,7 @@ class Measurements:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
         size = abs(x.value) if name == "constraint" else q.scale * x.value
-        return Extreme(size, x.time, self.owner(q, x.who, x.other), phase)
+        return Extreme(size, x.time, owner_name(self.result, q, x.who, x.other), phase)
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
@@ -152,7 +111,7 @@ class Measurements:
             every = [worst[name] for worst in self.worst_of if name in worst]
             rank = QUANTITIES[name].rank
             return max(every, key=lambda e: rank(e.value), default=None)
-        return self.among(name, self.sampled(name) if name in _SAMPLED else None)
+        return self.among(name, self.sampled(name) if name in SAMPLED else None)
 
     def among(self, name: str, samples: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``samples``, or between them."""
@@ -172,14 +131,14 @@ class Measurements:
     def worst_of(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         found: list[dict[str, Extreme]] = [{} for _ in self.samples]
-        for name, samples in self.measured.items():
+        for name, sampled in self.measured.items():
             ranks, alone = self.rank[name], name not in self.told
             for k, phase in enumerate(self.result.phases):
                 x, rank, worst = phase.extremes.get(name), ranks[k], None
-                if x is not None and rank < samples.quantity.rank(x.value):
+                if x is not None and rank < sampled.quantity.rank(x.value):
                     worst = self.recorded(name, x, phase.name)
                 elif rank != -math.inf:
-                    worst = self.worst_sample(samples, self.samples[k], alone=alone)
+                    worst = self.worst_sample(sampled, self.samples[k], alone=alone)
                 if worst is not None:
                     found[k][name] = worst
         return found
@@ -191,9 +150,9 @@ class Measurements:
         every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
         if every:
             return self.between(f"{name}_first", every[0])
-        samples = self.sampled(name)
-        k = int(np.argmax(samples.values <= 0.0))
-        return self.worst_sample(samples, slice(k, k + 1), alone=True) or e
+        sampled = self.sampled(name)
+        k = int(np.argmax(sampled.values <= 0.0))
+        return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
 
     def clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
@@ -202,7 +161,7 @@ class Measurements:
         the end.
         """
         time = self.result.time
-        clearance, nearest = self.of_left(self.close.each), self.close.nearest
+        clearance, nearest = of_left(self.result, self.close.each), self.close.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.told & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
@@ -478,7 +437,7 @@ class Measurements:
             miss[name] = dict(zip(asked, off, strict=True))
         for i, off in miss["position"].items():
             if result.phases[targets[i][0][1]].formation is None:
-                own = float(np.fmax.reduce(self.off_slot[at[i]]))
+                own = float(np.fmax.reduce(self.sampled("tracking_error").values[at[i]]))
                 # With a vehicle lost, the centre of those left says nothing of their places.
                 miss["position"][i] = max(off, own) if self.left[at[i]].all() else own
         return {
@@ -491,11 +450,6 @@ class Measurements:
             )
             for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
         }
-
-    @cached_property
-    def off_slot(self) -> Floats:
-        """Distance (K, N) [m] of each vehicle from its slot; NaN where slots are not tracked."""
-        return self.of_left(length(self.result.position - self.result.slot_position))
 
     def passed(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""
@@ -523,97 +477,3 @@ def _greatest(values: Floats) -> list[float | None]:
         most if math.isfinite(most) else max(filter(math.isfinite, row.tolist()), default=None)
         for most, row in zip(sizes.max(axis=1).tolist(), sizes, strict=True)
     ]
-
-
-# -- values at samples -------------------------------------------------------------------------------
-
-
-def _motion(m: Measurements, q: Quantity) -> tuple[Floats, ...]:
-    """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
-    x = (m.result.velocity, m.result.acceleration, m.result.slot_jerk)[q.order - 1]
-    if x is None:
-        return (np.full(m.left.shape, np.nan),)
-    return (m.of_left(SIZES[q.way](x) if q.way else length(x)),)
-
-
-def _separation(m: Measurements) -> tuple[Floats, Owner]:
-    pair = m.close.pair
-    return m.close.separation, lambda k: pair[k].tolist()
-
-
-def _below(m: Measurements) -> tuple[Floats, Owner]:
-    """Least height (K,) [m] between two agents, one below the other."""
-    least, pair = proximity.headroom(m.result.position, m.mission.agents.radius, m.left)
-    return least, lambda k: pair[k]
-
-
-def _clearance(m: Measurements) -> tuple[Floats, Owner]:
-    close = m.close
-    return close.clearance, lambda k: (close.agent.item(k), close.obstacle.item(k))
-
-
-def _fallen(m: Measurements) -> tuple[Floats, Owner]:
-    """Least distance (K,) [m] between a lost agent and one still flying; NaN if no agent is lost."""
-    r, radius = m.result.position, m.mission.fleet.radius
-    least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
-    for i in np.flatnonzero(~m.left[-1]):
-        separation = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
-        separation = np.where(m.left & ~m.left[:, [i]], separation, np.inf)
-        j = separation.argmin(axis=1)
-        separation = np.where(m.left[:, i], np.nan, separation[np.arange(len(r)), j])
-        closer = np.fmin(separation, least) != least
-        closer &= np.isfinite(separation)
-        least[closer] = separation[closer]
-        who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
-    return least, lambda k: who[k]
-
-
-def _outside(m: Measurements) -> tuple[Floats, ...]:
-    """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
-    r, fence = m.result.position, m.mission.limits.geofence
-    if fence is None:
-        return (np.full(m.left.shape, np.nan),)
-    return (m.of_left(np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
-
-
-def _altitude(m: Measurements) -> tuple[Floats, ...]:
-    return (m.of_left(m.result.position[..., 2]),)
-
-
-def _tilt(m: Measurements) -> tuple[Floats, ...]:
-    """Tilt (K, N) [deg] of each vehicle; of points, of the thrust that the slots they track need."""
-    q, wanted = m.result.vehicle_attitude, m.result.slot_acceleration
-    if q is not None:
-        up = att.dcm_from_quaternion(q)[..., 2, 2]
-    elif wanted is not None:
-        force = wanted + np.array([0.0, 0.0, m.mission.gravity])
-        up = force[..., 2] / np.maximum(length(force), 1e-300)
-    else:
-        up = np.full(m.left.shape, np.nan)
-    return (m.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
-
-
-def _edges(m: Measurements, values: Floats) -> tuple[Floats, Owner]:
-    edges = m.result.edges
-    return values, lambda _k, e: edges[e].tolist()
-
-
-#: Values of quantities at samples, with their owners where these are no single agents.
-_SAMPLED: dict[str, Callable[[Measurements], tuple[Any, ...]]] = {
-    **{q.name: partial(_motion, q=q) for q in MOTIONS},
-    "separation": _separation,
-    "separation_below": _below,
-    "clearance": _clearance,
-    "lost": _fallen,
-    "geofence": _outside,
-    "lowest": _altitude,
-    "highest": _altitude,
-    "thrust": lambda m: (m.thrust,),
-    "thrust_margin": lambda m: (m.thrust - m.mission.fleet.thrust_limit,),
-    "tilt": _tilt,
-    "tracking_error": lambda m: (m.off_slot,),
-    "constraint": lambda m: _edges(m, np.abs(m.result.constraint)),
-    "tension": lambda m: _edges(m, -m.result.multiplier),
-    "constraint_force": lambda m: (m.of_left(length(m.result.constraint_force)),),
-    "singular_value": lambda m: (m.result.singular_value, lambda _k: (0,)),
-}

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -222,6 +222,11 @@ class Margins:
     gain: tuple[float, float] = (math.nan, math.nan)
     phase: float = math.nan
     delay: float = math.nan
+
+    def data(self) -> dict[str, Any]:
+        """Plain data: the phase in degrees."""
+        phase = math.degrees(self.phase)
+        return {"stable": self.stable, "gain": self.gain, "phase_deg": phase, "delay_s": self.delay}
 
 
 def formation_loops(

@@ -28,7 +28,7 @@ from rigidfleet.mission import (
     vehicles,
 )
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import Keys, Shared, look_up, model_of, near_shape
+from rigidfleet.mission.findings import Keys, look_up, model_of, near_shape
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
@@ -51,17 +51,15 @@ def defaults() -> dict[str, Any]:
     }
 
 
-def check(data: Mapping[str, Any], origin: str, shared: Shared | None = None) -> dict[str, Any]:
+def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     """Check the data of a mission and return its parts, by the fields of `Contents`.
-
-    Tables that are ``shared`` with other missions are validated once for all of them.
 
     Raises
     ------
     MissionError
         With a finding for each error.
     """
-    m = Draft(data, origin, shared, defaults())
+    m = Draft(data, origin, defaults())
     m.n = _count(data)
     m.keep((), _sizes(m))
     if m.findings:  # the other checks would take long

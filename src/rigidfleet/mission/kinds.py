@@ -151,8 +151,8 @@ class AnyPhase(Part):
         return True
 
     @property
-    def bent(self) -> bool:
-        """Whether the phase leads its vehicles on bent ways to a formation."""
+    def bends(self) -> bool:
+        """Whether bent ways of its vehicles are to be found before the flight."""
         return False
 
     @property
@@ -302,9 +302,9 @@ class Reshape(Shaping):
         return self.transition == "straight"
 
     @property
-    def bent(self) -> bool:
-        """Whether ways have been found, or given."""
-        return self.control_points is not None
+    def bends(self) -> bool:
+        """Whether ways are to be found."""
+        return self.transition == "ways"
 
 
 class Steering(Attitude, AnyPhase):

@@ -49,28 +49,13 @@ Lengths = list[float | None]
 
 
 def rules(m: Draft) -> Breaches:
-    """All phases, by themselves and together; they are parts of the mission, including those with findings.
-
-    They are not checked again if those of the last mission that shares tables had no findings, and nothing differs on
-    which that depends.
-    """
+    """All phases, by themselves and together; they are parts of the mission, including those with findings."""
     phases = yield from _phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
-    dependence = _dependence(m)
-    if m.findings or m.shared.sound != dependence:
-        _check(m, phases)
-        m.shared.sound = None if m.findings else dependence
+    _check(m, phases)
     end = latest_end(m.phases) if m.right((), "phases") else math.nan
     # With automatic durations it is not known; the mission is checked again when they are.
     m.end = None if math.isnan(end) else end
-
-
-def _dependence(m: Draft) -> tuple[Any, ...]:
-    """All that the findings of phases depend on."""
-    limits = None if m.agents is None else m.agents.thrust_limit
-    keys = ("phases", "formations", "architecture", "assignment")
-    read = (m.lqr, m.limits, m.smoothness, m.output_step)
-    return m.n, limits, *map(m.data.get, keys), *read
 
 
 def _check(m: Draft, phases: Written) -> None:

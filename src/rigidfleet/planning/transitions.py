@@ -9,6 +9,7 @@ colours of the graph of these conflicts (greedy colouring, the agents with most 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.progress import report
-from rigidfleet.formation.assignment import closest_approach, nearer_than
+from rigidfleet.formation.assignment import closest_approach, pairs_nearer_than
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
@@ -59,31 +60,39 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
-        if isinstance(phase, Reshape) and phase.transition == "ways":
+        if phase.bends:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             report(f"looking for ways of the agents in '{phase.name}'")
             room = _room(mission.rewritten(so_far) if tables else mission, len(tables), timed)
             parts = [_bent(mission, k, table, phase, before, room)]
-        elif isinstance(phase, Reshape) and phase.transition != "straight":
-            stops = _stops(mission, k, phase, before)
-            if stops is not None:
-                names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
-                forms |= {
-                    name: {"slots": x, "edges": []}
-                    for name, x in zip(names, stops[1:3], strict=True)
-                }
-                parts = _phases(table, phase, names, stops)
-        elif isinstance(phase, Vertical) and phase.stagger is not None:
-            parts = _staggered(mission, k, table, phase, before)
+        elif not phase.spelled:
+            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before)
+            forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
     return mission.rewritten(data)
 
 
+#: Phases as tables, and the formations that they take on the way.
+_Parts = tuple[list[dict[str, Any]], dict[str, Any]]
+
+
+def _layered(
+    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None
+) -> _Parts:
+    """The phases of a transition by layers; the phase alone if its straight ways will do."""
+    stops = _stops(mission, number, phase, before)
+    if stops is None:
+        return [table], {}
+    names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
+    levels = {name: {"slots": x, "edges": []} for name, x in zip(names, stops[1:3], strict=True)}
+    return _phases(table, phase, names, stops), levels
+
+
 def _staggered(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None
-) -> list[dict[str, Any]]:
+) -> _Parts:
     """The phases of a staggered take-off or landing, one for each group.
 
     Raises
@@ -112,13 +121,22 @@ def _staggered(
             f" {phase.stagger:g} s less"
         )
         raise refused(mission, number, "duration", phase.duration, problem, remedy)
-    kept = {key: x for key, x in table.items() if key not in ("stagger", "by")}
-    return [
-        kept
+    common = {key: x for key, x in table.items() if key not in ("stagger", "by")}
+    parts = [
+        common
         | {"name": f"{phase.name}: {k} of {len(groups)}", "agents": group, "travel": travel}
         | {"duration": phase.stagger if k < len(groups) else travel}
         for k, group in enumerate(groups, start=1)
     ]
+    return parts, {}
+
+
+#: What takes the place of each kind of phase that may not be flown as it is written.
+_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None], _Parts]] = {
+    "land": _staggered,
+    "reshape": _layered,
+    "takeoff": _staggered,
+}
 
 
 def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
@@ -157,7 +175,7 @@ def _bent(
     mission: Mission,
     number: int,
     table: dict[str, Any],
-    phase: Reshape,
+    phase: Any,
     before: str | None,
     within: Floats,
 ) -> dict[str, Any]:
@@ -251,7 +269,7 @@ def _stops(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _level_of(nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
+    level = height * _level_of(pairs_nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):

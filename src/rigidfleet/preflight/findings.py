@@ -7,9 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rigidfleet._common import markup
+from rigidfleet._common.facts import Fact, Line, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.plain import plain
 from rigidfleet._common.text import agent_names
+from rigidfleet.math import proximity
 from rigidfleet.math.margins import Margins
+from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.preview import PlannedPhase
@@ -27,6 +30,8 @@ _TOLD = 6
 
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
+#: Number of agents beyond which tracked slots are those of a show, whose edges are not explained.
+MANY = 12
 #: A limit is exceeded only by more than this rounding error.
 SLACK = 1e-9
 
@@ -64,6 +69,8 @@ class FormationCheck:
     realisations : other shapes with the same distances; None if they were not searched
     method : how the constraint force is solved
     spectrum : of a large formation, instead of its rigidity
+    spacing : least distance between two slots, centre to centre [m]; infinite if there are no slots
+    colours : number of colours of its lights; 0 if it keeps the lights before
     skipped : whether the formation was not checked because there are too many
     """
 
@@ -74,6 +81,8 @@ class FormationCheck:
     method: solvers.Method = "dense"
     spectrum: Spectrum | None = None
     skipped: bool = False
+    spacing: float = math.inf
+    colours: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,22 +135,23 @@ class MarginsCheck:
     formations: dict[str, FormationMargins]
     skipped: bool = False
 
-    def describe(self) -> Iterator[str]:
+    @property
+    def rows(self) -> Iterator[tuple[str, str]]:
         """In words, the tracking first."""
         if self.tracking is not None:
-            yield f"tracking: {_margin_words(self.tracking)}"
+            yield "margins", f"tracking: {_margin_words(self.tracking)}"
         alike: dict[str, list[str]] = {}
         for where, f in self.formations.items():
             pole = f"p up to {f.largest_pole:.3g} /s" if f.largest_pole < math.inf else "any p"
             alike.setdefault(f"{_margin_words(f.margins)}; {pole}", []).append(where)
-        yield from (f"{', '.join(places)}: {words}" for words, places in alike.items())
+        yield from (("margins", f"{', '.join(places)}: {words}") for words, places in alike.items())
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "tracking": None if self.tracking is None else _margin_data(self.tracking),
+            "tracking": None if self.tracking is None else self.tracking.data(),
             "formations": {
-                where: _margin_data(f.margins) | {"largest_p": _finite(f.largest_pole)}
+                where: f.margins.data() | {"largest_p": f.largest_pole}
                 for where, f in self.formations.items()
             },
         }
@@ -206,13 +216,12 @@ class VehicleCheck:
     jump: tuple[float, float, float, str] | None
     beyond: tuple[float, str, str, str] | None = None
 
-    def describe(self) -> Iterator[tuple[str, str]]:
-        """Facts with their headings."""
+    @property
+    def worst(self) -> Iterator[Fact]:
+        """What is nearest to a limit, or greatest."""
         force, t, who, limit, _ = self.rotor_force
-        share = 100 * (1 - force / limit)
-        text = f"maximum {force:.3g} N of a rotor (limit {limit:.3g} N, {share:.0f} % left), {who} at {t:.2f} s"
-        yield "rotors", text
-        yield "tilt", f"maximum {self.tilt[0]:.1f} deg, {self.tilt[2]} at {self.tilt[1]:.2f} s"
+        yield Fact("rotor force", force, "N", limit, when=t, who=who)
+        yield Fact("tilt", self.tilt[0], "deg", when=self.tilt[1], who=self.tilt[2])
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -227,14 +236,16 @@ class VehicleCheck:
 
 
 @dataclass
-class Preflight:
+class Preflight(Shown):
     """Result of `check`; `remarks` has the problems and notes.
 
     Attributes
     ----------
     formations, gains : checks of the formations and of the constraint law
     planned_phases : planned paths of each phase
+    mission : with its times known
     separation : minimum separation [m], its time [s] and the agents
+    speed, vertical_speed : greatest planned ones [m/s], their times [s] and agents
     thrust : maximum planned thrust [N], its time [s], the agent and its limit [N]
     clearance : of each obstacle: its name, minimum clearance [m], time [s], agent
     gaps : of each gap: its obstacles, its width [m], the width that the formation needs [m], time [s]
@@ -257,7 +268,10 @@ class Preflight:
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
+    mission: Mission | None = None
     separation: tuple[float, float, str] | None = None
+    speed: tuple[float, float, str] | None = None
+    vertical_speed: tuple[float, float, str] | None = None
     thrust: tuple[float, float, str, float] | None = None
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
@@ -274,44 +288,89 @@ class Preflight:
         """Whether no problem was found that will make the flight fail."""
         return all(remark.level != "fails" for remark in self.remarks)
 
+    @property
+    def is_show(self) -> bool:
+        """Whether slots alone concern the user: all phases track them, of many agents, or without edges."""
+        mission = self.mission
+        return (
+            mission is not None
+            and mission.n_agents > 1
+            and (mission.n_agents > MANY or not len(mission.edges))
+            and all(phase.control == "tracking" for phase in mission.phases)
+        )
+
     def __repr__(self) -> str:
         fails = sum(remark.level == "fails" for remark in self.remarks)
         notes = len(self.remarks) - fails
         verdict = f"{fails} problem{'s' * (fails != 1)}" if fails else "no problems found"
         return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
 
-    def _repr_html_(self) -> str:
-        """Show the check in a notebook: facts, then remarks."""
-        rows = [*self.describe(), *((remark.level, remark.text) for remark in self.remarks)]
+    def facts(self) -> Sheet:
+        """The phases, the facts, and the remarks; of a mission without edges, nothing that concerns edges."""
+        about = ("about", "result")
+        parts = [] if self.mission is None else [self.mission.phase_table]
+        parts += [
+            Table(about, [*map(Row, self._rows())], ("result",), bare=True),
+            worst_values("planned", self._worst()),
+            Table(about, [Row((r.level, r.text), r.level) for r in self.remarks], ("result",), bare=True),
+        ]  # fmt: skip
         verdict = "no problems found" if self.passed else "the flight will fail"
-        return markup.shown("Check", verdict, ("about", "result"), rows)
+        name = "Check" if self.mission is None else self.mission.name
+        line = Line(f"{name}: {verdict}", "ok" if self.passed else "fails")
+        size = "" if self.mission is None else f"valid: {self.mission.size_in_words}"
+        return Sheet(name, size, [*parts, line])
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
-        for f in self.formations:
-            yield f.name, _formation_words(f)
-        if self.formations:
-            yield "gains", _gain_words(self.gains)
-        if self.margins is not None:
-            yield from (("margins", text) for text in self.margins.describe())
-        if self.separation is not None:
-            apart, t, who = self.separation
-            yield "separation", f"minimum {apart:.2f} m, {who} at {t:.2f} s"
-        yield from self._proved()
+        yield from self._rows()
+        for name, *words in worst_values("planned", self._worst()).texts:
+            yield name, ", ".join(filter(None, words))
+
+    def _worst(self) -> Iterator[Fact]:
+        """Worst values of the planned paths, with their limits."""
+        mission = self.mission
+        limits = None if mission is None else mission.limits
+        if mission is not None and self.is_show:
+            pads = float(proximity.nearest(mission.fleet.position).min())
+            for where, apart in (
+                ("start", pads),
+                *((f"'{f.name}'", f.spacing) for f in self.formations),
+            ):
+                yield Fact("spacing, centre to centre", apart, "m", who=where)
+        for name, unit, worst in (
+            ("separation", "m", self.separation),
+            ("speed", "m/s", self.speed),
+            ("vertical_speed", "m/s", self.vertical_speed),
+        ):
+            if worst is not None:
+                least, t, who = worst
+                limit = getattr(limits, name, None)
+                yield Fact(name.replace("_", " "), least, unit, limit, name == "separation", t, who)
         if self.thrust is not None:
-            force, t, who, limit = self.thrust
-            of = f" (limit {limit:g} N)" if math.isfinite(limit) else " (no limit)"
-            yield "thrust", f"maximum {force:.1f} N{of}, {who} at {t:.2f} s"
+            force, t, who, most = self.thrust
+            yield Fact("thrust", force, "N", most if math.isfinite(most) else None, when=t, who=who)
         if self.vehicles is not None:
-            yield from self.vehicles.describe()
+            yield from self.vehicles.worst
+        for name, least, t, who in self.clearance:
+            yield Fact("clearance", least, "m", when=t, who=f"{who}, '{name}'")
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        """Facts in words, each with its heading."""
+        if self.is_show:
+            yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
+        else:
+            yield from ((f.name, _formation_words(f)) for f in self.formations)
+            if self.formations:
+                yield "gains", _gain_words(self.gains)
+        if self.margins is not None:
+            yield from self.margins.rows
+        yield from self._proved()
         if self.reserve:
             text = f"automatic times leave {self.reserve:.2g} s times the greatest jerk of limits of acceleration, tilt"
             text += " and thrust, and times the greatest acceleration of those of speed, for lag and drag of vehicles"
             yield "reserve", text
         if self.disturbed is not None:
             yield "disturbances", _disturbed_words(self.disturbed)
-        for name, least, t, who in self.clearance:
-            yield "clearance", f"{least:.2f} m to '{name}', {who} at {t:.2f} s"
         for between, wide, takes, t in self.gaps:
             text = f"{between}: {wide:.2f} m wide, the formation needs {takes:.2f} m at {t:.2f} s"
             yield "gap", text
@@ -359,7 +418,7 @@ class Preflight:
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
         g = self.gains
-        return {
+        data = {
             "passed": self.passed,
             "remarks": [vars(remark) for remark in self.remarks],
             "formations": {
@@ -368,13 +427,15 @@ class Preflight:
                     "rigidity": None if f.rigidity is None else f.rigidity.data(),
                     "realisations": None if f.realisations is None else f.realisations.data(),
                     "solve": f.method,
-                    "spectrum": None if f.spectrum is None else _spectral_data(f.spectrum),
+                    "spectrum": None if f.spectrum is None else f.spectrum.data(),
+                    "spacing_m": f.spacing,
+                    "colours": f.colours,
                 }
                 for f in self.formations
             },
             "gains": {
                 "stabilised": g.stabilised,
-                "margin": g.margin if math.isfinite(g.margin) else None,
+                "margin": g.margin,
                 "settling_time_s": g.settling_time,
                 "overshoot": g.overshoot,
                 "force_per_error_n_m": g.force,
@@ -394,7 +455,7 @@ class Preflight:
                 "lost": [_named(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
             },
             "paths": {
-                "judged_to_s": self.judged_to if math.isfinite(self.judged_to) else None,
+                "judged_to_s": self.judged_to,
                 "guessed_phases": [
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
@@ -409,6 +470,8 @@ class Preflight:
                     }
                     for phase, c in self.certificates.items()
                 ],
+                "speed": _named(("speed_m_s", "time_s", "who"), self.speed),
+                "vertical_speed": _named(("speed_m_s", "time_s", "who"), self.vertical_speed),
                 "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
                 "clearance": [
                     _named(("obstacle", "clearance_m", "time_s", "who"), c) for c in self.clearance
@@ -424,6 +487,7 @@ class Preflight:
                 },
             },
         }
+        return plain(data)
 
 
 def _disturbed_words(d: Disturbed) -> str:
@@ -441,6 +505,14 @@ def _disturbed_words(d: Disturbed) -> str:
     if d.offset[0] > 0:
         parts.append(f"steady offset from its slot up to {d.offset[0]:.2g} m, {d.offset[1]}")
     parts += [f"agent {i + 1} is lost at {t:g} s" for i, t in d.lost]
+    return "; ".join(parts)
+
+
+def _scene_words(f: FormationCheck) -> str:
+    """What concerns a formation of a show, besides its spacing."""
+    parts = ["not used in any phase"] if f.held_by == "nothing" else []
+    parts += [f"{f.colours} colour{'s' * (f.colours > 1)} of lights"] if f.colours else []
+    parts += [f"edges solved by {solvers.WORDS[f.method]}"] if f.method != "dense" else []
     return "; ".join(parts)
 
 
@@ -496,18 +568,13 @@ _GOALS = {
 
 def _realisation_words(r: Realisations) -> str:
     """How many random starts reach which shape: 36 of 40 random starts reach this shape, 4 its mirror image."""
-    if not r.found:
+    if not r.shapes:
         return f"none of {r.starts} random starts converges"
-    first, *others = [(x.found, _GOALS[x.kind] + " that bends" * x.bends) for x in r.found]
+    first, *others = [(x.starts, _GOALS[x.kind] + " that bends" * x.bends) for x in r.shapes]
     verb = "reaches" if first[0] == 1 else "reach"
     text = f"{first[0]} of {r.starts} random starts {verb} {first[1]}"
     text += "".join(f", {count} {goal}" for count, goal in others[:3])
     return text + (f", and there are {len(others) - 3} more shapes" if len(others) > 3 else "")
-
-
-def _spectral_data(s: Spectrum) -> dict[str, Any]:
-    condition = s.condition if math.isfinite(s.condition) else None
-    return {"w": s.w, "index": s.index, "condition": condition, "free": s.free}
 
 
 def _gain_words(g: GainsCheck) -> str:
@@ -532,19 +599,6 @@ def _margin_words(m: Margins) -> str:
     return f"stable; bears {delay}, {math.degrees(m.phase):.0f} deg of phase, {gain}"
 
 
-def _margin_data(m: Margins) -> dict[str, Any]:
-    return {
-        "stable": m.stable,
-        "gain": [_finite(g) for g in m.gain],
-        "phase_deg": _finite(math.degrees(m.phase)),
-        "delay_s": _finite(m.delay),
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def some(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
     text = ", ".join(f"'{name}'" for name in names[:_TOLD])
@@ -553,7 +607,4 @@ def some(names: Sequence[str]) -> str:
 
 
 def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
-    if values is None:
-        return None
-    plain = [None if isinstance(v, float) and not math.isfinite(v) else v for v in values]
-    return dict(zip(names, plain, strict=True))
+    return None if values is None else dict(zip(names, values, strict=True))

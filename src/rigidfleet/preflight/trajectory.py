@@ -178,6 +178,15 @@ def _nearest_to_limit(
     return (float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])), planned
 
 
+def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, str] | None:
+    """Greatest planned speed [m/s] along some axes, its time [s] and agent, at samples; None without a plan."""
+    if not way:
+        return None
+    sizes = [np.linalg.norm(planned.velocity[..., axes], axis=2) for planned in way]
+    (speed, t, who, _), _ = _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))
+    return speed, t, who
+
+
 def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     """Remarks on the effects of wind, gusts, noise and mass errors that follow from the planned paths."""
     d = mission.disturbances

@@ -119,8 +119,7 @@ class CurveWatch:
         self.low = np.full((self.n, 3), np.inf)
         # Obstacles that are not boxes may be large, and are not to be kept.
         standing = _standing_kept if self.solids is None else _standing
-        self.stood = standing(fleet.position, self.radius, tuple(obstacles), t)
-        self.standing = self.stood.copy()
+        self.standing = standing(fleet.position, self.radius, tuple(obstacles), t).copy()
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
@@ -385,22 +384,6 @@ class Extremes(CurveWatch):
         if self.size is not None:
             found = self.monitor.monitor
             self.monitor = native.Watch(found._replace(boxes=self.boxes, count=found.count.copy()))
-
-    @property
-    def reusable(self) -> bool:
-        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
-        return self.n <= _FEW and bool(self.left.all())
-
-    def restart(self) -> None:
-        """Forget the flight that was monitored."""
-        self.worst[:] = self.none
-        self.low.fill(np.inf)
-        self.when.fill(0.0)
-        self.who.fill(-1)
-        self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
-        if self.size is not None:
-            self.monitor.monitor.count[:] = 0, records.ANY_STEP, records.ANY_STEP
 
     def begin(
         self,
