@@ -42,17 +42,7 @@ class Samples:
 
 def length(x: Floats, more: Floats | None = None) -> Floats:
     """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
-    if x.size > proximity.CACHED and len(x) > 1:
-        # In parts, of which what is between stays in the cache.
-        found = np.empty(x.shape[:-1])
-        some = max(1, proximity.CACHED * len(x) // x.size)
-        for k in range(0, len(x), some):
-            part = slice(k, k + some)
-            found[part] = length(x[part], None if more is None else more[part])
-        return found
-    if more is not None:
-        x = x + more
-    squares = x * x
+    squares = (x if more is None else x + more) ** 2
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
 
