@@ -164,7 +164,8 @@ def bounded(
     if passed is None and limit is not None:
         greatest = limit + SLACK * max(1.0, abs(limit))
         passed = e.value >= limit - SLACK and e.value > 0 if q.at_least else e.value <= greatest
+    passed = passed is None or bool(passed)
     return CheckResult(
-        q.name, passed is not False, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,
+        q.name, passed, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,
         limit is not None, e.at_samples, first,
     )  # fmt: skip

@@ -292,15 +292,10 @@ def _numbers(
     flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
 ) -> Table:
     """Numbers of the flights side by side, with how much they differ from those of the first."""
-
-    def misses(_: Result, verdict: Verdict) -> float | None:
-        found = [p.waypoint.position for p in verdict.phases if p.waypoint is not None]
-        return max((miss for miss in found if miss is not None), default=None)
-
     measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
-        ("greatest waypoint miss", "m", misses),
+        ("greatest waypoint miss", "m", partial(_checked, "waypoint_position")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
         *((q.text, shown(q.unit), partial(_checked, q.name)) for q in QUANTITIES.values()),
     ]

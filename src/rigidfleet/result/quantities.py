@@ -42,17 +42,7 @@ class Samples:
 
 def length(x: Floats, more: Floats | None = None) -> Floats:
     """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
-    if x.size > proximity.CACHED and len(x) > 1:
-        # In parts, of which what is between stays in the cache.
-        found = np.empty(x.shape[:-1])
-        some = max(1, proximity.CACHED * len(x) // x.size)
-        for k in range(0, len(x), some):
-            part = slice(k, k + some)
-            found[part] = length(x[part], None if more is None else more[part])
-        return found
-    if more is not None:
-        x = x + more
-    squares = x * x
+    squares = (x if more is None else x + more) ** 2
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
 
 
@@ -94,7 +84,7 @@ def samples(result: Result, name: str, close: proximity.Closeness | None = None)
 
 def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
     """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
-    x = (result.velocity, result.acceleration, result.slot_jerk)[q.order - 1]
+    x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
         return (np.full(result.left.shape, np.nan),)
     return (of_left(result, SIZES[q.way](x) if q.way else length(x)),)

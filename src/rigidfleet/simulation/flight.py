@@ -493,9 +493,7 @@ class Flight:
         if self._ended is not None:  # no phase follows
             self._ended.release()
             self._ended = None
-        result = self.record(self.pieces, None if own else self._asked)
-        self._extremes.let_go()
-        return result
+        return self.record(self.pieces, None if own else self._asked)
 
     def record(
         self,
