@@ -61,7 +61,7 @@ _HUES = {"r": "red", "g": "green", "b": "blue"}
 _DIMENSIONS = {"": "length", "v": "length/time", "a": "length/time2", "j": "length/time3"}
 
 
-class Quantity(NamedTuple):
+class Heading(NamedTuple):
     """What a name of a column says.
 
     Attributes
@@ -99,7 +99,7 @@ def unit_of(text: str) -> tuple[str, float] | None:
 
 
 @cache
-def quantity_of(name: str) -> Quantity:
+def quantity_of(name: str) -> Heading:
     """The quantity, unit and vehicle of a column's name."""
     if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
         if bracket[2].strip().lower() in _FRAMES:
@@ -114,28 +114,28 @@ def quantity_of(name: str) -> Quantity:
     return plain
 
 
-def _plain(name: str) -> Quantity:
+def _plain(name: str) -> Heading:
     """The quantity and vehicle of a name without a unit."""
     plain = name.strip().lower().replace(" ", "")
     words = [word.lower() for word in _WORD.findall(name)]
     every = {*words}
     if re.fullmatch(r"duration|(x|y|z|yaw)\^[0-7]", plain) or plain in DIRECTIONS:
-        return Quantity(plain)
+        return Heading(plain)
     if re.fullmatch(r"p?[neud]", plain):
-        return Quantity(next(way for way in DIRECTIONS if way[0] == plain[-1]))
+        return Heading(next(way for way in DIRECTIONS if way[0] == plain[-1]))
     units = [word for word in words if _UNIT.get(word, ("",))[0] == "time"]
     if every & _IS["time"] and every <= _IS["time"] | _IS["time too"] | {*units}:
-        return Quantity("time", units[-1] if units else "")
+        return Heading("time", units[-1] if units else "")
     if (
         every & (_IS["agent"] | _IS["thing"])
         and every <= _IS["agent"] | _IS["thing"] | _IS["thing too"]
     ):
-        return Quantity("agent" if every & _IS["agent"] else "thing")
+        return Heading("agent" if every & _IS["agent"] else "thing")
     if hue := _HUE.fullmatch(plain):
-        return Quantity(_HUES[hue[1]])
+        return Heading(_HUES[hue[1]])
     for kind in ("colour", "latitude", "longitude"):
         if words and every <= _IS[kind]:
-            return Quantity(kind)
+            return Heading(kind)
     frames = [_FRAMES[word] for word in words if word in _FRAMES]
     words = [word for word in words if word not in _FRAMES]
     for k in (len(words) - 1, 0) if words else ():
@@ -143,7 +143,7 @@ def _plain(name: str) -> Quantity:
         beside = {*rest}
         if words[k] in _IS["yaw"]:
             who = "".join(word for word in rest if word not in _IS["q"] | _IS[""])
-            return Quantity("yaw_rate") if who == "rate" else Quantity("yaw", who=who)
+            return Heading("yaw_rate") if who == "rate" else Heading("yaw", who=who)
         axis = _AXIS.fullmatch(words[k])
         if axis is None or beside & _IS["none"]:
             continue
@@ -154,12 +154,12 @@ def _plain(name: str) -> Quantity:
             who = "".join(w for w in rest if w not in _IS[kind] | _IS[""])
             if frames and kind == "":
                 letter = frames[0]["xyz".index(axis[2])]
-                return Quantity(next(d for d in DIRECTIONS if d[0] == letter), who=who)
-            return Quantity(kind + axis[2], who=who)
-    return Quantity("")
+                return Heading(next(d for d in DIRECTIONS if d[0] == letter), who=who)
+            return Heading(kind + axis[2], who=who)
+    return Heading("")
 
 
-def of_columns(names: Sequence[str]) -> list[Quantity]:
+def of_columns(names: Sequence[str]) -> list[Heading]:
     """The quantities of all columns of a table.
 
     A letter such as a, v or b beside three axes is a quantity (`a_x`: an acceleration). It is a vehicle, perhaps one
@@ -191,7 +191,7 @@ def of_columns(names: Sequence[str]) -> list[Quantity]:
             short = re.fullmatch(r"[a-z]\d*", word)
             if (vehicles and not kind) or (short and (vehicles or lost or lone)):
                 for k, axis in zip(own, "xyz", strict=True):
-                    kinds[k] = Quantity(axis, unit, word)
+                    kinds[k] = Heading(axis, unit, word)
     return kinds
 
 

@@ -57,7 +57,7 @@ class Table:
 
     Attributes
     ----------
-    names, kinds : of the columns: as they are written, and the `names.Quantity` that each is
+    names, kinds : of the columns: as they are written, and the `names.Heading` that each is
     line : of the names, from 1; of the first row, where there are none
     separator, decimal : a key of `SEPARATORS`, and the decimal mark of numbers; "" until one is no plain number
     named : whether the file has names
