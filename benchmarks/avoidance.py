@@ -64,7 +64,7 @@ def tour(sizes: list[int]) -> Iterator[list[str]]:
         for before, name in pairwise(names):
             to = stops[name] - stops[name].mean(axis=0)
             order, plan = clocked(
-                lambda at=at, to=to: assignment.assigned(at, to, turn=np.eye(3)).order
+                lambda at=at, to=to: assignment.assign_slots(at, to, turn=np.eye(3)).order
             )
             (least, _, _), proof = clocked(
                 lambda at=at, to=to, order=order: assignment.closest_approach(at, to[order])
@@ -236,7 +236,9 @@ def main() -> None:
     )
     parser.add_argument("--random", type=int, default=300, help="fly so many random changes")
     asked = parser.parse_args()
-    assignment.assigned(*np.eye(400, 3)[[range(400), range(400)]], turn=np.eye(3))  # loads SciPy
+    assignment.assign_slots(
+        *np.eye(400, 3)[[range(400), range(400)]], turn=np.eye(3)
+    )  # loads SciPy
     table(
         "A tour, assigned at each change and proved",
         ["agents", "change", "assignment [s]", "proof [s]", "least distance [m]", "bound [m]"],

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import rigidfleet as rf
 from rigidfleet.errors import ResultError
-from rigidfleet.interchange import FORMATS, brief, export
+from rigidfleet.interchange import FORMATS, brief_number, export
 
 FLIGHTS = ("passage-quadrotors", "cube-passage-quadrotors", "show-1000")
 
@@ -25,8 +25,8 @@ def row(result: rf.Result, name: str, folder: Path, flown: bool) -> str:
     except ResultError as error:
         found = re.search(r"is ([\d.]+ m) from|needs (\d+ \w+) of|needs (\d+ bytes)", str(error))
         return f"refused: {next(x for x in found.groups() if x) if found else error}"
-    turned = brief(math.degrees(made.yaw_deviation))
-    return f"{brief(1e3 * made.deviation)} mm, {turned} deg, {made.size / 1e3:,.0f} kB"
+    turned = brief_number(math.degrees(made.yaw_deviation))
+    return f"{brief_number(1e3 * made.deviation)} mm, {turned} deg, {made.size / 1e3:,.0f} kB"
 
 
 def main() -> None:

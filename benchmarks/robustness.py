@@ -305,7 +305,7 @@ def beside(case: Case) -> Case:
 
 def assigned(case: Case) -> Case:
     """The same start, each agent where the slots are nearer: as assignment = "shortest" has it."""
-    order = assignment.assigned(case.start, case.slots).order
+    order = assignment.assign_slots(case.start, case.slots).order
     return replace(case, start=case.start[np.argsort(order)])
 
 

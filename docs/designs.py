@@ -47,9 +47,9 @@ def main() -> None:
     ):
         search = realisations(cube, edges, starts=2000)
         found = Counter[Kind]()
-        for shape in search.found:
-            found[shape.kind] += shape.found
-        others = sum(shape.kind in (Kind.FOLDED, Kind.COINCIDENT) for shape in search.found)
+        for shape in search.shapes:
+            found[shape.kind] += shape.starts
+        others = sum(shape.kind in (Kind.FOLDED, Kind.COINCIDENT) for shape in search.shapes)
         counts = [found[kind] for kind in Kind]
         _row(name, f"{analyse(cube, edges).w:.4f}", search.converged, *counts, others)
     print()

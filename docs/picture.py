@@ -41,7 +41,7 @@ def flight() -> None:
 
 def show() -> None:
     """The pictures of a show, made as its page makes it."""
-    letters = outlines.on_outlines(outlines.text_outlines("HI"), 100, 2.0)
+    letters = outlines.slots_on_outlines(outlines.text_outlines("HI"), 100, 2.0)
     scenes = [show_draft.scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
     scenes.append(show_draft.points_scene("logo", Points(letters, None), "logo.csv"))
     text = show_draft.show("my-show", scenes, agents=100, spacing=2.0)
@@ -54,7 +54,7 @@ def show() -> None:
 
 def words() -> None:
     """A word in single strokes, as the page of shows writes it."""
-    letters = outlines.on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)
+    letters = outlines.slots_on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)
     scenes = [show_draft.points_scene("FLY", Points(letters, None), "strokes:FLY")]
     result = rf.simulate(Mission.from_toml(show_draft.show("fly", scenes, agents=60, spacing=2.0)))
     with TemporaryDirectory() as folder:

@@ -80,7 +80,7 @@ def folded_twin() -> Figure:
     """The cube by a designed graph, and another shape whose 18 lengths are the same."""
     cube = slots("cube", 4.0, 8)
     edges = design(cube)
-    found = realisations(cube, edges, starts=200).found
+    found = realisations(cube, edges, starts=200).shapes
     twin = max((r for r in found if r.kind is Kind.FOLDED), key=lambda r: r.closest)
     fig = Figure(figsize=(9.0, 3.4))
     R = space.camera(-62.0, 18.0)

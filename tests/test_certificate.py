@@ -44,7 +44,7 @@ def products(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 def test_up_to_a_thousand_the_sum_of_squares_is_the_least(n):
     """SciPy, asked for the optimum without any help, finds no better order."""
     for p, q in zip(tour(n), tour(n)[1:], strict=False):
-        order = assignment.assigned(p, q, turn=np.eye(3)).order
+        order = assignment.assign_slots(p, q, turn=np.eye(3)).order
         assert sorted(order) == list(range(n))
         best = linear_sum_assignment(-(p @ q.T))[1]
         cost, least = (((p - q[k]) ** 2).sum() for k in (order, best))
@@ -55,7 +55,7 @@ def test_up_to_a_thousand_the_sum_of_squares_is_the_least(n):
 def test_no_exchange_of_two_slots_is_better(n):
     """Beyond, x . y >= 0 for every pair, so that the distance of two never falls below the bound."""
     for p, q in zip(tour(n), tour(n)[1:], strict=False):
-        order = assignment.assigned(p, q, turn=np.eye(3)).order
+        order = assignment.assign_slots(p, q, turn=np.eye(3)).order
         assert sorted(order) == list(range(n))
         assert products(p, q[order]).min() >= -1e-9 * (p**2).sum(axis=1).max()
         a, b = pdist(p).min(), pdist(q).min()
@@ -66,12 +66,12 @@ def test_no_exchange_of_two_slots_is_better(n):
 def test_the_bound_holds_where_heights_count_less(n):
     """In a downwash metric along any axis the order is the optimum, or no exchange is better, and the bound holds."""
     up = np.array([0.0, 0.6, 0.8])
-    metric = assignment.squashed(up, 3.0)
+    metric = assignment.downwash_metric(up, 3.0)
     np.testing.assert_allclose(metric @ up, up / 3.0, atol=1e-15)
     np.testing.assert_allclose(metric @ [1.0, 0.0, 0.0], [1.0, 0.0, 0.0], atol=1e-15)
     turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     for p, q in zip(tour(n), tour(n)[1:], strict=False):
-        order = assignment.assigned(p, q, turn=turn, metric=metric).order
+        order = assignment.assign_slots(p, q, turn=turn, metric=metric).order
         x, y = p @ metric, q @ turn.T @ metric
         assert products(x, y[order]).min() >= -1e-9 * (x**2).sum(axis=1).max()
         if n < 1000:
@@ -80,7 +80,7 @@ def test_the_bound_holds_where_heights_count_less(n):
         a, b = pdist(x).min(), pdist(y).min()
         assert assignment.closest_approach(x, y[order])[0] >= a * b / np.hypot(a, b) * (1 - 1e-9)
     with pytest.raises(ValueError, match="prescribed turn"):
-        assignment.assigned(p, q, metric=metric)
+        assignment.assign_slots(p, q, metric=metric)
 
 
 def test_missions_assign_where_heights_count_less():
@@ -109,7 +109,7 @@ def test_exchanges_end_at_any_points():
     rng = np.random.default_rng(0)
     p, q = rng.normal(size=(2, 600, 3))
     for start, slots in ((p, q), (np.round(p), q), (np.round(p), np.round(q))):
-        order = assignment.exchanged(start, slots)
+        order = assignment.order_by_exchanges(start, slots)
         assert sorted(order) == list(range(600))
         assert products(start, slots[order]).min() >= -1e-9
 

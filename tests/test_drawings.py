@@ -260,7 +260,7 @@ def test_words_of_single_strokes():
     strokes = [(4, 21, 4, 0), (4, 21, 17, 21), (4, 11, 12, 11)]
     strokes += [(22, 21, 22, 0), (22, 0, 34, 0)]
     strokes += [(36, 21, 44, 11), (44, 11, 44, 0), (52, 21, 44, 11)]
-    p = outlines.on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)[:, [0, 2]]
+    p = outlines.slots_on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)[:, [0, 2]]
     assert KDTree(p).query(p, 2)[0][:, 1].min() == pytest.approx(2.0)
     a, b = np.array(strokes, dtype=float).reshape(-1, 2, 2).transpose(1, 0, 2)
     p = (p - p.min(axis=0)) * (21.0 / np.ptp(p[:, 1])) + [4.0, 0.0]

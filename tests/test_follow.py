@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import make_interp_spline
 
 import rigidfleet as rf
-from rigidfleet.foreign.curves import least_jerk
+from rigidfleet.foreign.curves import least_jerk_curve
 from rigidfleet.kernel.problem import SHAPE, Reference
 from rigidfleet.kernel.references import blend_slots
 from rigidfleet.math.piecewise import Piecewise, join
@@ -250,7 +250,7 @@ def test_files_that_are_not_there(tmp_path, file):
 
 def test_trajectories_are_joined_at_all_knots():
     """Curves with knots of their own agree with themselves at any time, and stay where they end."""
-    one = least_jerk(Piecewise(np.array([0.0, 1.0, 3.0]), np.arange(24.0).reshape(2, 4, 3)))
+    one = least_jerk_curve(Piecewise(np.array([0.0, 1.0, 3.0]), np.arange(24.0).reshape(2, 4, 3)))
     two = Piecewise(np.array([0.0, 2.0]), np.arange(8.0).reshape(1, 4, 2))
     knots, pieces = join([one, two])
     np.testing.assert_array_equal(knots, [0.0, 1.0, 2.0, 3.0])

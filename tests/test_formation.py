@@ -267,14 +267,14 @@ def test_measured_distances_exist(seed, n, dimension):
     p = points(seed, n, 3)
     p[:, dimension:] = 0
     edges = graphs.complete_graph(n)
-    assert distance_geometry.unrealisable(edges, distance_geometry.distances(p, edges)) == []
+    assert distance_geometry.violations(edges, distance_geometry.distances(p, edges)) == []
 
 
 def test_triangle_inequality():
     """4-8-4 is a line and exists; 4-8.1-4 does not, by 0.1 m."""
     edges = graphs.complete_graph(3)
-    assert distance_geometry.unrealisable(edges, [4, 8, 4]) == []
-    (found,) = distance_geometry.unrealisable(edges, [4, 8.1, 4])
+    assert distance_geometry.violations(edges, [4, 8, 4]) == []
+    (found,) = distance_geometry.violations(edges, [4, 8.1, 4])
     assert found.agents == (0, 1, 2)
     assert found.excess == pytest.approx(0.1)
 
@@ -287,7 +287,7 @@ def test_cayley_menger(d):
     i, j = graphs.complete_graph(4).T + 1
     squares[i, j] = squares[j, i] = d**2
     determinant = np.linalg.det(squares)  # 288 V^2
-    found = distance_geometry.unrealisable(graphs.complete_graph(4), d)
+    found = distance_geometry.violations(graphs.complete_graph(4), d)
     if determinant < -1e-2:
         assert [v.agents for v in found] == [(0, 1, 2, 3)]
         assert found[0].excess == pytest.approx(determinant / 288)
@@ -299,15 +299,13 @@ def test_only_complete_quadruples_are_judged():
     """Without one of its six distances a quadruple is free to exist."""
     edges = graphs.complete_graph(4)
     d = [4, 4, 4, 4, 4, 7.5]
-    assert len(distance_geometry.unrealisable(edges, d)) == 1
-    assert (
-        distance_geometry.unrealisable(edges[[0, 1, 2, 3, 5]], np.array(d)[[0, 1, 2, 3, 5]]) == []
-    )
+    assert len(distance_geometry.violations(edges, d)) == 1
+    assert distance_geometry.violations(edges[[0, 1, 2, 3, 5]], np.array(d)[[0, 1, 2, 3, 5]]) == []
 
 
 def test_edges_may_be_written_either_way():
     """Edge 21 is edge 12."""
-    assert len(distance_geometry.unrealisable([[1, 0], [2, 0], [2, 1]], [4, 9, 4])) == 1
+    assert len(distance_geometry.violations([[1, 0], [2, 0], [2, 1]], [4, 9, 4])) == 1
 
 
 # -- slots from distances

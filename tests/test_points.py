@@ -187,7 +187,7 @@ def neighbours(p: np.ndarray) -> np.ndarray:
 def test_a_circle_is_sampled_evenly(tmp_path):
     """Points of a drawn circle are a regular polygon whose side is the spacing."""
     (tmp_path / "c.svg").write_text(SVG.format('<circle cx="3" cy="4" r="40"/>'))
-    p = outlines.on_outlines(outlines.svg_outlines(tmp_path / "c.svg"), 24, 2.0)
+    p = outlines.slots_on_outlines(outlines.svg_outlines(tmp_path / "c.svg"), 24, 2.0)
     np.testing.assert_allclose(p[:, 1], 0.0)
     np.testing.assert_allclose(neighbours(p), 2.0, rtol=2e-3)
     np.testing.assert_allclose(np.linalg.norm(p, axis=1), 1.0 / np.sin(np.pi / 24), rtol=2e-3)
@@ -196,7 +196,7 @@ def test_a_circle_is_sampled_evenly(tmp_path):
 def test_drawings_stand_upright(tmp_path):
     """SVG's y points down: what is above in the drawing is above in the air."""
     (tmp_path / "t.svg").write_text(SVG.format('<path d="M 0 0 L 10 40 L -10 40 Z"/>'))
-    p = outlines.on_outlines(outlines.svg_outlines(tmp_path / "t.svg"), 30, 1.0)
+    p = outlines.slots_on_outlines(outlines.svg_outlines(tmp_path / "t.svg"), 30, 1.0)
     top, bottom = p[p[:, 2].argmax()], p[p[:, 2] < p[:, 2].min() + 0.5]
     assert np.ptp(bottom[:, 0]) > 5 * abs(top[0] - bottom[:, 0].mean())
     assert neighbours(p).min() == pytest.approx(1.0)
@@ -205,7 +205,7 @@ def test_drawings_stand_upright(tmp_path):
 def test_words_keep_their_spacing():
     """No two points are nearer than the spacing, none is alone, and all lie on the letters' outlines."""
     drawn = outlines.text_outlines("HI")
-    p = outlines.on_outlines(drawn, 80, 2.0)
+    p = outlines.slots_on_outlines(drawn, 80, 2.0)
     assert neighbours(p).min() == pytest.approx(2.0)
     assert neighbours(p).max() < 4.0
     assert p.shape == (80, 3)
@@ -215,9 +215,9 @@ def test_points_are_thinned_evenly():
     """Fewer of a grid's points keep a distance as large as a coarser grid's."""
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0)), axis=-1).reshape(-1, 2)
     grid = np.asarray(grid, dtype=np.float64)
-    assert neighbours(grid[outlines.spread(grid, 20)]).min() >= np.sqrt(2.0)
+    assert neighbours(grid[outlines.most_even_points(grid, 20)]).min() >= np.sqrt(2.0)
     with pytest.raises(ValueError, match="81 points cannot place 82"):
-        outlines.spread(grid, 82)
+        outlines.most_even_points(grid, 82)
 
 
 def test_design_writes_points_that_it_reads(tmp_path, monkeypatch, capsys):

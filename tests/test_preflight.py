@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.assessment import assess
-from rigidfleet.formation.assignment import assigned, closest_approach
+from rigidfleet.formation.assignment import assign_slots, closest_approach
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
@@ -283,7 +283,7 @@ def test_shortest_assignment():
     cube = slots("cube", 4.0, 8)
     shuffled = rng.permutation(8)
     start = cube[shuffled] @ np.linalg.qr(rng.normal(size=(3, 3)))[0] + [9, 9, 9]
-    order, turn = assigned(start, cube)
+    order, turn = assign_slots(start, cube)
     there = cube[order] @ turn.T
     np.testing.assert_allclose(there, start - start.mean(axis=0), atol=1e-6)
     separation, pair, _ = closest_approach(start, there, np.full(8, 0.25))
@@ -296,7 +296,7 @@ def test_given_assignment_is_kept():
     cube = slots("cube", 4.0, 8)
     for turn in (None, np.eye(3)):
         for radius in (None, np.full(8, 0.25)):
-            order, turned = assigned(cube, cube, turn=turn, radius=radius)
+            order, turned = assign_slots(cube, cube, turn=turn, radius=radius)
             np.testing.assert_array_equal(order, np.arange(8))
             np.testing.assert_allclose(turned, np.eye(3), atol=1e-12)
 
@@ -312,8 +312,8 @@ def test_safe_assignment():
                 closest_approach(start, cube[order] @ turned.T, radius)[0]
                 for order, turned in (
                     (np.arange(8), kabsch(start, cube)),
-                    assigned(start, cube, turn=turn),
-                    assigned(start, cube, turn=turn, radius=radius),
+                    assign_slots(start, cube, turn=turn),
+                    assign_slots(start, cube, turn=turn, radius=radius),
                 )
             )
             assert safe >= shortest

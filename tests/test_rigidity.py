@@ -398,15 +398,24 @@ def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, rigidity_class):
 # -- other shapes with the same distances
 
 
+def test_former_names_of_realisations_work_and_warn():
+    """`found` of a search, and of one of its shapes, still gives what it gave, with a warning."""
+    search = realisations(shapes.slots("triangle", 4.0, 3), graphs.complete_graph(3), starts=4)
+    for thing, was in (search, search.shapes), (search.shapes[0], search.shapes[0].starts):
+        with pytest.warns(DeprecationWarning, match="found is now"):
+            assert thing.found == was
+    assert search.data()["found"][0]["found"] == search.shapes[0].starts
+
+
 def test_cube_of_paper_has_folded_twins():
     """The 18 distances of the cube have solutions with coincident agents, found far more often than the cube."""
     p = shapes.slots("cube", 4.0, 8)
     found = realisations(p, graphs.CUBE_EDGES)
-    assert found.found[0].kind is Kind.SAME
+    assert found.shapes[0].kind is Kind.SAME
     assert not found.unique
-    folded = [r for r in found.found if r.kind is Kind.COINCIDENT]
-    assert sum(r.found for r in folded) > found.converged / 2
-    for r in found.found:
+    folded = [r for r in found.shapes if r.kind is Kind.COINCIDENT]
+    assert sum(r.starts for r in folded) > found.converged / 2
+    for r in found.shapes:
         got = distance_geometry.distances(r.slots, graphs.CUBE_EDGES)
         np.testing.assert_allclose(
             got, distance_geometry.distances(p, graphs.CUBE_EDGES), atol=1e-6
@@ -418,14 +427,14 @@ def test_all_distances_leave_only_the_mirror_image(n):
     """With all pairs prescribed there is nothing but the shape and its mirror image."""
     p = shape(n, n, 3)
     found = realisations(p, graphs.complete_graph(n), starts=60)
-    assert {r.kind for r in found.found} == {Kind.SAME, Kind.MIRRORED}
+    assert {r.kind for r in found.shapes} == {Kind.SAME, Kind.MIRRORED}
     assert found.unique
 
 
 def test_flat_shapes_are_their_own_mirror_images():
     """A hexagon turned over is the hexagon."""
     found = realisations(shapes.slots("hexagon", 4.0, 6), graphs.complete_graph(6), starts=40)
-    assert [r.kind for r in found.found] == [Kind.SAME]
+    assert [r.kind for r in found.shapes] == [Kind.SAME]
 
 
 def test_bipyramid_folds_over():
@@ -433,8 +442,8 @@ def test_bipyramid_folds_over():
     p = np.array([[1, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0], [0, 0, 1.5], [0, 0, -1.5]])
     edges = [e for e in graphs.complete_graph(5).tolist() if e != [3, 4]]
     found = realisations(p, edges, starts=60)
-    assert {r.kind for r in found.found} == {Kind.SAME, Kind.MIRRORED, Kind.COINCIDENT}
-    assert all(r.rigid for r in found.found)
+    assert {r.kind for r in found.shapes} == {Kind.SAME, Kind.MIRRORED, Kind.COINCIDENT}
+    assert all(r.rigid for r in found.shapes)
 
 
 def test_start_decides_the_side():
@@ -445,7 +454,7 @@ def test_start_decides_the_side():
         start = p * [1, 1, side] + 0.05 * shape(3, 4, 3)
         found = realisations(p, edges, starts=20, start=start)
         assert found.leads_to is not None
-        assert found.found[found.leads_to].kind is kind
+        assert found.shapes[found.leads_to].kind is kind
 
 
 def test_search_is_repeatable():
@@ -459,7 +468,7 @@ def test_search_is_repeatable():
 def test_few_agents_have_one_shape(n):
     """Up to three agents, all distances leave one shape."""
     found = realisations(SPREAD[:n], graphs.complete_graph(n), starts=10)
-    assert [r.kind for r in found.found] == [Kind.SAME]
+    assert [r.kind for r in found.shapes] == [Kind.SAME]
 
 
 #: Two triangles joined by three edges.
@@ -509,10 +518,10 @@ def test_three_prism_has_up_to_twelve_shapes_in_its_plane(p, count):
     tilt = Rotation.from_euler("xyz", [0.3, -0.5, 0.8]).as_matrix()
     slots = np.pad(p, [(0, 0), (0, 1)]) @ tilt.T
     found = realisations(slots, PRISM, starts=400, dimension=2)
-    kinds = [r.kind for r in found.found]
+    kinds = [r.kind for r in found.shapes]
     assert kinds[:2] == [Kind.SAME, Kind.MIRRORED]
     shapes_found = [
-        r.slots for r, kind in zip(found.found, kinds, strict=True) if kind is not Kind.MIRRORED
+        r.slots for r, kind in zip(found.shapes, kinds, strict=True) if kind is not Kind.MIRRORED
     ]
     wanted = assembly_modes(np.array(p))
     assert len(shapes_found) == len(wanted) == count
@@ -521,22 +530,22 @@ def test_three_prism_has_up_to_twelve_shapes_in_its_plane(p, count):
     for q in wanted:
         apart = np.abs(got - distance_geometry.distances(np.pad(q, [(0, 0), (0, 1)]), pairs))
         assert apart.max(axis=1).min() < 1e-5
-    assert all(r.rigid and not r.bends for r in found.found)
+    assert all(r.rigid and not r.bends for r in found.shapes)
 
 
 def test_in_a_plane_no_shape_is_turned_over():
     """A flat shape by all distances is one shape in space, and itself and its mirror image in its plane."""
     p = shape(4, 5, 2)
     edges = graphs.complete_graph(5)
-    assert [r.kind for r in realisations(p, edges, starts=40).found] == [Kind.SAME]
+    assert [r.kind for r in realisations(p, edges, starts=40).shapes] == [Kind.SAME]
     found = realisations(p, edges, starts=40, dimension=2)
-    assert [r.kind for r in found.found] == [Kind.SAME, Kind.MIRRORED]
+    assert [r.kind for r in found.shapes] == [Kind.SAME, Kind.MIRRORED]
     for side in (1, -1):
         start = p * [1, side, 1] + 0.05 * shape(3, 5, 2)
         led = realisations(p, edges, starts=20, dimension=2, start=start)
         assert led.leads_to is not None
         assert (
-            led.found[led.leads_to].kind is Kind.SAME
+            led.shapes[led.leads_to].kind is Kind.SAME
         )  # from either side: agents in space are turned over
 
 
@@ -588,11 +597,11 @@ def test_chair_is_rigid_and_its_boats_are_one_family(bond, angle, starts):
     """
     p, edges = chair(bond, angle)
     found = realisations(p, np.sort(edges, axis=1), starts=starts, seed=1)
-    family = found.found[-1]
-    assert {r.kind for r in found.found[:-1]} <= {Kind.SAME, Kind.MIRRORED}
-    assert not any(r.bends for r in found.found[:-1])
+    family = found.shapes[-1]
+    assert {r.kind for r in found.shapes[:-1]} <= {Kind.SAME, Kind.MIRRORED}
+    assert not any(r.bends for r in found.shapes[:-1])
     assert (family.kind, family.rigid, family.bends) == (Kind.FOLDED, False, True)
-    assert family.found > 0.5 * starts
+    assert family.starts > 0.5 * starts
     assert not found.unique
 
 
@@ -603,9 +612,9 @@ def test_linkages_of_four_have_the_families_of_grashof(seed):
     ring = [[0, 1], [1, 2], [2, 3], [0, 3]]
     s, a, b, length = np.sort(np.linalg.norm(p - np.roll(p, -1, axis=0), axis=1))
     found = realisations(p, ring, starts=16, dimension=2)
-    assert len(found.found) == (2 if s + length < a + b else 1)
-    assert all(r.bends for r in found.found)
-    assert len(realisations(p, ring, starts=16).found) == 1  # in space, it folds over
+    assert len(found.shapes) == (2 if s + length < a + b else 1)
+    assert all(r.bends for r in found.shapes)
+    assert len(realisations(p, ring, starts=16).shapes) == 1  # in space, it folds over
 
 
 def test_start_must_fit():

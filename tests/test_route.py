@@ -237,7 +237,7 @@ def test_the_safest_has_as_much_room_as_the_shortest(turn):
         start, slots, radius = scattered(rng, 12), scattered(rng, 12), rng.uniform(0.0, 0.5, 12)
         separations = []
         for way in (None, radius):
-            order, turned = assignment.assigned(start, slots, turn=turn, radius=way)
+            order, turned = assignment.assign_slots(start, slots, turn=turn, radius=way)
             x, y = about_centre(start), about_centre(slots)[order] @ turned.T
             s = np.linspace(0.0, 1.0, 2001)[:, None, None]
             between = [pdist(p) for p in (1 - s) * x + s * y]

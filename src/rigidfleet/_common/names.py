@@ -61,7 +61,7 @@ _HUES = {"r": "red", "g": "green", "b": "blue"}
 _DIMENSIONS = {"": "length", "v": "length/time", "a": "length/time2", "j": "length/time3"}
 
 
-class Heading(NamedTuple):
+class ColumnMeaning(NamedTuple):
     """What a name of a column says.
 
     Attributes
@@ -99,43 +99,43 @@ def unit_of(text: str) -> tuple[str, float] | None:
 
 
 @cache
-def quantity_of(name: str) -> Heading:
+def meaning_of(name: str) -> ColumnMeaning:
     """The quantity, unit and vehicle of a column's name."""
     if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
         if bracket[2].strip().lower() in _FRAMES:
-            return _plain(f"{bracket[1]}_{bracket[2]}")
-        plain = _plain(bracket[1])
+            return _meaning_without_unit(f"{bracket[1]}_{bracket[2]}")
+        plain = _meaning_without_unit(bracket[1])
         return plain._replace(unit=bracket[2].strip()) if plain.kind else plain
-    plain, parts = _plain(name), name.split("_")
+    plain, parts = _meaning_without_unit(name), name.split("_")
     for cut in (2, 1) if not plain.kind or plain.who else ():
-        unit, short = "_".join(parts[-cut:]), _plain("_".join(parts[:-cut]))
+        unit, short = "_".join(parts[-cut:]), _meaning_without_unit("_".join(parts[:-cut]))
         if (known := unit_of(unit)) and known[0] == short.dimension:
             return short._replace(unit=unit)
     return plain
 
 
-def _plain(name: str) -> Heading:
+def _meaning_without_unit(name: str) -> ColumnMeaning:
     """The quantity and vehicle of a name without a unit."""
     plain = name.strip().lower().replace(" ", "")
     words = [word.lower() for word in _WORD.findall(name)]
     every = {*words}
     if re.fullmatch(r"duration|(x|y|z|yaw)\^[0-7]", plain) or plain in DIRECTIONS:
-        return Heading(plain)
+        return ColumnMeaning(plain)
     if re.fullmatch(r"p?[neud]", plain):
-        return Heading(next(way for way in DIRECTIONS if way[0] == plain[-1]))
+        return ColumnMeaning(next(way for way in DIRECTIONS if way[0] == plain[-1]))
     units = [word for word in words if _UNIT.get(word, ("",))[0] == "time"]
     if every & _IS["time"] and every <= _IS["time"] | _IS["time too"] | {*units}:
-        return Heading("time", units[-1] if units else "")
+        return ColumnMeaning("time", units[-1] if units else "")
     if (
         every & (_IS["agent"] | _IS["thing"])
         and every <= _IS["agent"] | _IS["thing"] | _IS["thing too"]
     ):
-        return Heading("agent" if every & _IS["agent"] else "thing")
+        return ColumnMeaning("agent" if every & _IS["agent"] else "thing")
     if hue := _HUE.fullmatch(plain):
-        return Heading(_HUES[hue[1]])
+        return ColumnMeaning(_HUES[hue[1]])
     for kind in ("colour", "latitude", "longitude"):
         if words and every <= _IS[kind]:
-            return Heading(kind)
+            return ColumnMeaning(kind)
     frames = [_FRAMES[word] for word in words if word in _FRAMES]
     words = [word for word in words if word not in _FRAMES]
     for k in (len(words) - 1, 0) if words else ():
@@ -143,7 +143,7 @@ def _plain(name: str) -> Heading:
         beside = {*rest}
         if words[k] in _IS["yaw"]:
             who = "".join(word for word in rest if word not in _IS["q"] | _IS[""])
-            return Heading("yaw_rate") if who == "rate" else Heading("yaw", who=who)
+            return ColumnMeaning("yaw_rate") if who == "rate" else ColumnMeaning("yaw", who=who)
         axis = _AXIS.fullmatch(words[k])
         if axis is None or beside & _IS["none"]:
             continue
@@ -154,18 +154,18 @@ def _plain(name: str) -> Heading:
             who = "".join(w for w in rest if w not in _IS[kind] | _IS[""])
             if frames and kind == "":
                 letter = frames[0]["xyz".index(axis[2])]
-                return Heading(next(d for d in DIRECTIONS if d[0] == letter), who=who)
-            return Heading(kind + axis[2], who=who)
-    return Heading("")
+                return ColumnMeaning(next(d for d in DIRECTIONS if d[0] == letter), who=who)
+            return ColumnMeaning(kind + axis[2], who=who)
+    return ColumnMeaning("")
 
 
-def of_columns(names: Sequence[str]) -> list[Heading]:
+def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
     """The quantities of all columns of a table.
 
     A letter such as a, v or b beside three axes is a quantity (`a_x`: an acceleration). It is a vehicle, perhaps one
     that is not read, where others written alike are vehicles (`x_a`, `x_cf1`), or the quantity says nothing here.
     """
-    kinds = [quantity_of(name) for name in names]
+    kinds = [meaning_of(name) for name in names]
     known, place = {q.kind for q in kinds}, {name.lower(): k for k, name in enumerate(names)}
     alike: dict[str, dict[str, tuple[list[int], str]]] = {}
     for name in place:
@@ -176,7 +176,7 @@ def of_columns(names: Sequence[str]) -> list[Heading]:
                 continue
             words = re.findall(r"[^\W_]+", re.sub(r"[\[(].*|_m$", "", " ".join(ends)))
             letters = [word for word in words if re.fullmatch(r"[a-z]\d*", word)]
-            unit = quantity_of(re.sub(_LETTER, "", "X".join(ends), count=1)).unit
+            unit = meaning_of(re.sub(_LETTER, "", "X".join(ends), count=1)).unit
             same = alike.setdefault(re.sub(r"[^\W_]+", "a", " ".join(ends)), {})
             same[letters[0] if len(letters) == 1 else "".join(words)] = own, unit
     for shape, same in alike.items():
@@ -191,12 +191,12 @@ def of_columns(names: Sequence[str]) -> list[Heading]:
             short = re.fullmatch(r"[a-z]\d*", word)
             if (vehicles and not kind) or (short and (vehicles or lost or lone)):
                 for k, axis in zip(own, "xyz", strict=True):
-                    kinds[k] = Heading(axis, unit, word)
+                    kinds[k] = ColumnMeaning(axis, unit, word)
     return kinds
 
 
-def understood(names: Sequence[str]) -> int:
+def count_understood(names: Sequence[str]) -> int:
     """How many of a line's fields are names of columns; 0 if it has no place and nothing else besides."""
-    kinds = [q.kind for q in of_columns(names) if q.kind]
+    kinds = [q.kind for q in meanings_of(names) if q.kind]
     places = {*DIRECTIONS, "x", "y", "latitude", "x^0"}
     return len(kinds) if len(kinds) > 1 and places & {*kinds} else 0

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import of_columns, understood, unit_of
+from rigidfleet._common.names import count_understood, meanings_of, unit_of
 from rigidfleet.typing import Floats, Ints
 
 #: Separators in the order in which they are tried, with their names.
@@ -31,7 +31,7 @@ _HEAD, _SAMPLE, _TOGETHER, _LONGEST = 200, 20, 1 << 14, 100_000
 
 
 class Fault(NamedTuple):
-    """One error in a table: the line (from 1; 0: the whole file), its text, what is wrong, and the remedy."""
+    """One error in a file: the line (from 1; 0: the whole file), its text, what is wrong, and the remedy."""
 
     line: int
     text: str
@@ -39,25 +39,28 @@ class Fault(NamedTuple):
     remedy: str
 
 
-class TableError(ValueError):
-    """A table cannot be read; it has at least one fault."""
+class ContentError(ValueError):
+    """The content of a file cannot be read; it has at least one fault."""
 
     def __init__(self, *faults: Fault) -> None:
         self.faults = faults
-        super().__init__(f"{faults[0].problem}. {faults[0].remedy}")
+        line, _, problem, remedy = faults[0]
+        place = f"line {line}: " if line else ""
+        words = f"{place}{problem}. {remedy}".rstrip(". ")
+        super().__init__((words if words.endswith("?") else f"{words}.").replace("?. ", "? "))
 
 
-def fault(problem: str, remedy: str, line: int = 0, text: str = "") -> TableError:
+def fault(problem: str, remedy: str = "", line: int = 0, text: str = "") -> ContentError:
     """The error of a single fault."""
-    return TableError(Fault(line, text, problem, remedy))
+    return ContentError(Fault(line, text, problem, remedy))
 
 
-class Table:
+class TextTable:
     """A table of text with K rows, whose columns are understood by their names.
 
     Attributes
     ----------
-    names, kinds : of the columns: as they are written, and the `names.Heading` that each is
+    names, kinds : of the columns: as they are written, and the `names.ColumnMeaning` of each
     line : of the names, from 1; of the first row, where there are none
     separator, decimal : a key of `SEPARATORS`, and the decimal mark of numbers; "" until one is no plain number
     named : whether the file has names
@@ -74,7 +77,7 @@ class Table:
 
     Raises
     ------
-    TableError
+    ContentError
         The file is no table, has names that are not understood, an unknown unit, or two columns for a quantity.
     """
 
@@ -91,7 +94,7 @@ class Table:
                 why = f"has no names of columns that are understood, and {width} numbers"
                 raise fault(why, "Begin with a line such as time_s,x_m,y_m,z_m", self.line)
             self.names, below = unnamed[width], [""] * width
-        self.kinds = of_columns(self.names)
+        self.kinds = meanings_of(self.names)
         self.places: dict[tuple[str, str], int] = {}
         self.units: dict[str, tuple[str, str]] = {}
         self._below = below
@@ -108,7 +111,7 @@ class Table:
 
         Raises
         ------
-        TableError
+        ContentError
             The unit is unknown, said twice in other ways, or said for some columns of a dimension only.
         """
         name, said, below = self.names[k], self.kinds[k].unit, self._below[k]
@@ -134,7 +137,7 @@ class Table:
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
 
-    def missing(self, *kinds: str) -> TableError:
+    def missing(self, *kinds: str) -> ContentError:
         """The error of a table without some quantities."""
         if self.place("latitude"):
             return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
@@ -155,12 +158,14 @@ class Table:
 
         Raises
         ------
-        TableError
+        ContentError
             A field is no finite number, or a row has another number of fields.
         """
         factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
-        odd = [i for i, k in enumerate(which) if not _take(self.columns[k], values[:, i])]
+        odd = [
+            i for i, k in enumerate(which) if not _put_plain_numbers(self.columns[k], values[:, i])
+        ]
         if odd and not self.decimal:
             columns = [self.columns[k].tolist() for k in self.places.values()]
             every = [_REMARK.sub("", x) for column in columns for x in column]
@@ -183,11 +188,11 @@ class Table:
                 remedy = "Write decimals with a point" if _COMMA.fullmatch(field) else remedy
                 faults.setdefault(line, Fault(line, self.texts[line - 1].strip(), why, remedy))
         if faults:
-            raise TableError(*(faults[line] for line in sorted(faults)))
+            raise ContentError(*(faults[line] for line in sorted(faults)))
         return values * factors
 
 
-def _take(fields: np.ndarray, values: Floats) -> bool:
+def _put_plain_numbers(fields: np.ndarray, values: Floats) -> bool:
     """Whether all fields are plain finite numbers, which are put into ``values``."""
     try:
         values[:] = fields.astype(np.float64)
@@ -206,7 +211,7 @@ def is_number(field: str) -> bool:
     return "_" not in field
 
 
-def split(line: str, separator: str) -> list[str]:
+def split_fields(line: str, separator: str) -> list[str]:
     """Fields of a line, without blanks around them; blanks before a unit in brackets separate nothing."""
     if separator == " ":
         line = re.sub(r"\s+(?=[\[(])", "\xa0", line).replace("\t", " ").strip()
@@ -223,7 +228,7 @@ def _lines(data: bytes) -> list[str]:
 
     Raises
     ------
-    TableError
+    ContentError
         It is no text.
     """
     wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -245,7 +250,7 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
         raise fault("has no names of columns that are understood", "Give shorter lines", long)
     bare = [texts[k].lstrip("#") for k in head]
-    most = [max(sum(map(is_number, split(line, s))) for s in SEPARATORS) for line in bare]
+    most = [max(sum(map(is_number, split_fields(line, s))) for s in SEPARATORS) for line in bare]
     rows = [k for k, count in zip(head, most, strict=True) if count > 1]
     first = next((k for k in rows if texts[k][0] != "#"), len(texts))
     start, names, own = _names(texts, [k for k in head if k < first], first)
@@ -257,12 +262,12 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     fits = {s: _fitting(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
     width, line = len(names) or fits[separator][1], start + (not names)
-    row = [x.strip("[]()") for x in split(below[0], separator)] if below else []
+    row = [x.strip("[]()") for x in split_fields(below[0], separator)] if below else []
     units = [""] * width
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1
     above = [k for k in head if not names and k < start and texts[k][0] != "#"]
-    for k in [k for k in above if width in (0, len(split(texts[k], separator)))]:
+    for k in [k for k in above if width in (0, len(split_fields(texts[k], separator)))]:
         why = f"has no names of columns that are understood: {texts[k][:60]}"
         raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
     return line, start, names, units, separator, width
@@ -270,15 +275,15 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
 
 def _names(texts: list[str], head: list[int], first: int) -> tuple[int, list[str], str]:
     """Line, from 1, names and separator: of all lines, the one that is understood best."""
-    counts = {len(split(line, s)) for line in texts[first : first + 1] for s in SEPARATORS}
+    counts = {len(split_fields(line, s)) for line in texts[first : first + 1] for s in SEPARATORS}
     best, names = (False, 0.0), (0, [], "")
     for k in head:
         for separator in reversed(SEPARATORS):
             line = texts[k].lstrip("#% \t")
-            fields, whole = split(line, separator), split(f"{line}.", separator)
+            fields, whole = split_fields(line, separator), split_fields(f"{line}.", separator)
             if len(whole) > len(fields) and len(whole) in counts:
                 fields.append("")  # a last column without a name
-            score = len(fields) in counts, understood(fields) / max(1, len(fields))
+            score = len(fields) in counts, count_understood(fields) / max(1, len(fields))
             if score[1] > 0.0 and score >= best:
                 best, names = score, (k + 1, fields, separator)
     return names
@@ -286,7 +291,7 @@ def _names(texts: list[str], head: list[int], first: int) -> tuple[int, list[str
 
 def _fitting(lines: list[str], width: int, separator: str) -> tuple[int, int]:
     """How many lines are rows by a separator, and their width: without names, those of numbers and colours alone."""
-    rows = [split(_REMARK.sub("", line), separator) for line in lines]
+    rows = [split_fields(_REMARK.sub("", line), separator) for line in lines]
     colour = re.compile(r"#[0-9a-fA-F]{6}")
     fine = [
         len(row) for row in rows
@@ -341,6 +346,6 @@ def _row(text: str, fields: list[str], width: int, separator: str) -> list[str] 
     if len(fields) == width + 1 and not fields[-1].strip():
         fields = fields[:-1]
     if len(fields) != width:
-        fields = split(_REMARK.sub("", text), separator)
+        fields = split_fields(_REMARK.sub("", text), separator)
     is_row = len(fields) == width or (len(fields) > 2 and all(map(is_number, fields[1:])))
     return fields if text[0] != "#" or is_row else None

@@ -78,7 +78,7 @@ def design(
     from rigidfleet._common.facts import Row, Table
     from rigidfleet._common.files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
-    from rigidfleet.formation.point_files import to_csv
+    from rigidfleet.formation.point_files import csv_of_points
     from rigidfleet.rigidity import design as designs
 
     keep_existing(out, force=force)
@@ -112,7 +112,7 @@ def design(
     for note in notes:
         console.err().print(f"Note: {shape}: {note}.")
     if out is not None:
-        table = to_csv(slots, colours) if out.suffix.lower() == ".csv" else text
+        table = csv_of_points(slots, colours) if out.suffix.lower() == ".csv" else text
         write_file(out, table.encode())
     if json:
         found = {what: data for what, (data, _) in judged.items()}
@@ -228,7 +228,7 @@ def points_of(
             raise ValueError("an outline needs --agents and --spacing")
         own = [] if font is None else [font]
         drawn = letters(words, *own) if letters else outlines.svg_outlines(shape, notes)
-        points = outlines.on_outlines(drawn, agents, spacing)
+        points = outlines.slots_on_outlines(drawn, agents, spacing)
         wide, _, high = np.ptp(points, axis=0)
         notes += [
             f"{wide:,.4g} m wide, {high:,.4g} m high: the nearest two are {spacing:g} m apart"
@@ -236,10 +236,10 @@ def points_of(
         return words if letters else Path(shape).stem, Points(points, None, tuple(notes))
     points, colours, doubts = read_points(shape, repeated=True)
     if agents is not None and agents != len(points):
-        kept = outlines.spread(points, agents)
+        kept = outlines.most_even_points(points, agents)
         points, colours = points[kept], colours and tuple(colours[k] for k in kept.tolist())
     if spacing is None:
         return Path(shape).stem, Points(centred(points), colours, doubts)
-    scaled = outlines.scaled(points, spacing)
+    scaled = outlines.scale_to_spacing(points, spacing)
     notes += [*doubts, *outlines.scale_in_words(points, scaled)]
     return Path(shape).stem, Points(scaled, colours, tuple(notes))

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import AXES, DIRECTIONS, ROLES, quantity_of, unit_of
-from rigidfleet._common.tables import DEFAULT, SEPARATORS, Table, fault, is_number
+from rigidfleet._common.names import AXES, DIRECTIONS, ROLES, meaning_of, unit_of
+from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, fault, is_number
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
 
@@ -97,15 +97,15 @@ def _are_axes(axes: str) -> bool:
     return sorted(AXES.get(letter, (9,))[0] for letter in axes) == [0, 1, 2]
 
 
-def parse(data: bytes, words: Units) -> tuple[Table, list[str]]:
+def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
     """A table of trajectories or of polynomials, and doubts of its head.
 
     Raises
     ------
-    TableError
+    ContentError
         It is none.
     """
-    table, notes = Table(data, {len(_TUM): _TUM}, words.words), []
+    table, notes = TextTable(data, {len(_TUM): _TUM}, words.words), []
     if not table.columns:
         bare = any(line.strip() for line in table.texts)
         why = "has no names of columns that are understood" if bare else "is empty"
@@ -124,7 +124,7 @@ def parse(data: bytes, words: Units) -> tuple[Table, list[str]]:
     return table, notes
 
 
-def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
+def _times(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
     """Times (K,) [s], and the nanoseconds since 1970 from which they count; None if they are no dates."""
     if not (columns := table.place("time")):
         raise table.missing("time")
@@ -134,7 +134,7 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
         return table.numbers(columns)[:, 0], None
     ticks, _ = [], table.factor(columns[0])
     for line, field in zip(table.lines.tolist(), fields, strict=True):
-        if (tick := _tick(field)) is None:
+        if (tick := _seconds_in(field)) is None:
             why = f"the time {table.names[columns[0]]} is {field[:40] or 'empty'}, neither a finite number nor a date"
             raise fault(why, "Write one, such as 2026-05-01T12:00:00.5Z", line)
         ticks.append(tick)
@@ -154,7 +154,7 @@ def _times(table: Table, notes: list[str]) -> tuple[Floats, int | None]:
     return time + float(since), None
 
 
-def _tick(field: str) -> Decimal | None:
+def _seconds_in(field: str) -> Decimal | None:
     """A number, or a date as seconds since 1970."""
     if is_number(field):
         plain = Decimal(field.replace(",", "."))
@@ -168,16 +168,16 @@ def _tick(field: str) -> Decimal | None:
 
 
 def read_tracks(
-    table: Table, stem: str, axes: str, notes: list[str]
+    table: TextTable, stem: str, axes: str, notes: list[str]
 ) -> tuple[list[Track], dict[str, Any]]:
     """Rows of each vehicle of a table, and what was taken for what; doubts go into the notes.
 
     Raises
     ------
-    TableError
+    ContentError
         The table cannot be read, or does not say whose rows they are.
     """
-    sets = _sets(table, axes, notes)
+    sets = _columns_of_vehicles(table, axes, notes)
     time, since = _times(table, notes)
     columns = [k for own in sets.values() for part in own[1:] for k in part]
     blank = {k for own in sets.values() for k in own.place}
@@ -194,7 +194,7 @@ def read_tracks(
             table.lines, table.columns = table.lines[known], [x[known] for x in every]
             time, values = time[known], {k: x[known] for k, x in values.items()}
         place = stack(main.place, slice(None))
-        groups, identity = _vehicles(table, time, place, columns, stem, notes)
+        groups, identity = _rows_of_vehicles(table, time, place, columns, stem, notes)
         lost = [x for k in identity for x in {*every[k].tolist()} - {*table.columns[k].tolist()}]
         if lost or not groups:
             raise fault(f"{min(lost, default=stem)!r} has no position", "Leave it out")
@@ -209,10 +209,10 @@ def read_tracks(
             raise fault(f"{who!r} has no position", "Leave it out")
         velocity, yaw = stack(own.velocity, rows) if own.velocity else None, None
         if own.yaw:
-            yaw = _yaw(table, values[own.yaw[0]][rows], time[rows], rows, notes)
+            yaw = _yaw_unless_doubtful(table, values[own.yaw[0]][rows], time[rows], rows, notes)
         elif own.quaternion:
-            yaw = yaws(stack(own.quaternion, rows))
-        turned = _in_enu(own.axes, stack(own.place, rows), velocity, yaw)
+            yaw = yaws_of(stack(own.quaternion, rows))
+        turned = _turn_to_enu(own.axes, stack(own.place, rows), velocity, yaw)
         tracks.append(Track(who, table.lines[rows], time[rows], *turned))
     named = table.kinds[main.place[0]].kind in DIRECTIONS
     said = "the option" if axes else "the file" if named else ""
@@ -229,12 +229,12 @@ def read_tracks(
     }  # fmt: skip
 
 
-def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
+def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[str, _Places]:
     """Columns of each vehicle that has its own; those of one if all share them.
 
     Raises
     ------
-    TableError
+    ContentError
         A place is missing, or some columns may be those of another vehicle; or names of axes contradict the option.
     """
     sets: dict[str, _Places] = {}
@@ -267,26 +267,26 @@ def _sets(table: Table, axes: str, notes: list[str]) -> dict[str, _Places]:
         notes.append(f"the columns {names} are not read: if a vehicle is there, it is not judged")
     for who, own in flown.items():
         columns = [table.names[k] for k in own.place]
-        if who and quantity_of(columns[0]).who != who.lower():
+        if who and meaning_of(columns[0]).who != who.lower():
             notes.append(
                 f"the columns {', '.join(columns)} are read as places of a vehicle {who!r}"
             )
     return flown
 
 
-def _vehicles(
-    table: Table, time: Floats, place: Floats, used: list[int], stem: str, notes: list[str]
+def _rows_of_vehicles(
+    table: TextTable, time: Floats, place: Floats, used: list[int], stem: str, notes: list[str]
 ) -> tuple[dict[str, Ints], list[int]]:
     """Rows of each vehicle, and the columns that tell them apart: by their names, or by the rows themselves.
 
     Raises
     ------
-    TableError
+    ContentError
         A name is empty, or a time has two places, or two columns may be the names.
     """
     names, kinds, n = table.names, [q.kind for q in table.kinds], len(time)
     part, coded = np.zeros(n, np.int64), {}
-    alone = _increases(time, part)
+    alone = _time_increases(time, part)
     for k, q in enumerate(table.kinds):
         if k not in used and (not q.dimension or q.kind in DIRECTIONS):
             coded[k] = table.codes(k)
@@ -294,11 +294,11 @@ def _vehicles(
     for k in sorted(coded, key=lambda k: kinds[k] != "agent"):
         (code, labels), thing = coded[k], kinds[k] == "thing"
         # What numbers the rows, or words for parts of a flight, are no names of vehicles.
-        counts = np.ptp(time) > 0.0 and _counts(labels, n)
+        counts = np.ptp(time) > 0.0 and _are_row_numbers(labels, n)
         if (
             kinds[k] in ("agent", "thing")
             and not counts
-            and not (thing and alone and _follow(code, time, place))
+            and not (thing and alone and _are_parts_of_one_way(code, time, place))
         ):
             named.append(k)
             if "" in labels:
@@ -306,19 +306,19 @@ def _vehicles(
                 raise fault(f"{names[k]} is empty", "Name the vehicle", int(line))
         elif len(labels) > 1 and (kinds[k] == "agent" or _FLAGS.search(names[k])):
             notes.append(f"the column {names[k]!r} is not read: rows count whatever it says")
-    chosen = next(([k] for k in named if _increases(time, coded[k][0])), named)
-    part = _both(part, *(coded[k][0] for k in chosen))
+    chosen = next(([k] for k in named if _time_increases(time, coded[k][0])), named)
+    part = _joint_codes(part, *(coded[k][0] for k in chosen))
     few = [k for k in coded if k not in named and 1 < len(coded[k][1]) <= n / 2]
-    others = {k: _both(part, coded[k][0]) for k in few}
+    others = {k: _joint_codes(part, coded[k][0]) for k in few}
     others = {k: both for k, both in others.items() if _ROWS * (both.max() + 1) <= n}
-    if unclear := not _increases(time, part):
-        apart = {k: both for k, both in others.items() if _increases(time, both)}
+    if unclear := not _time_increases(time, part):
+        apart = {k: both for k, both in others.items() if _time_increases(time, both)}
     else:
-        whole = _SHORTER * _length(place, part)
-        apart = {k: both for k, both in others.items() if _length(place, both) < whole}
+        whole = _SHORTER * _length_of_ways(place, part)
+        apart = {k: both for k, both in others.items() if _length_of_ways(place, both) < whole}
         first, row = place[:_FIRST], np.arange(min(n, _FIRST))
-        whole = _SHORTER * _length(first, 0 * row)
-        turns = [p for p in _TURNS if n > 2 * p and _length(first, row % p) < whole]
+        whole = _SHORTER * _length_of_ways(first, 0 * row)
+        turns = [p for p in _TURNS if n > 2 * p and _length_of_ways(first, row % p) < whole]
         if turns and not chosen and not apart:
             why = f"rows lie apart as if {turns[0]} vehicles took turns"
             raise fault(why, "Name vehicles in a column agent")
@@ -329,7 +329,7 @@ def _vehicles(
         chosen, part = [*chosen, k], apart[k]
         notes.append(f"the column {names[k]!r} is taken for names of vehicles: its rows lie apart")
     for k in named:
-        if _both(part, coded[k][0]).max() > part.max():
+        if _joint_codes(part, coded[k][0]).max() > part.max():
             notes.append(f"the column {names[k]!r} may name vehicles, too, and is not read")
     groups = {}
     for rows in np.split(np.argsort(part, kind="stable"), np.cumsum(np.bincount(part))[:-1]):
@@ -342,7 +342,7 @@ def _vehicles(
     return groups, chosen
 
 
-def _both(*codes: Ints) -> Ints:
+def _joint_codes(*codes: Ints) -> Ints:
     """Codes of the combinations of codes, in the order of their first rows."""
     whole = codes[0]
     for code in codes[1:]:
@@ -351,13 +351,13 @@ def _both(*codes: Ints) -> Ints:
     return np.argsort(np.argsort(first))[inverse]
 
 
-def _increases(time: Floats, part: Ints) -> bool:
+def _time_increases(time: Floats, part: Ints) -> bool:
     """Whether times increase within each part of the rows."""
     order = np.argsort(part, kind="stable")
     return bool((np.diff(time[order]) > 0.0)[np.diff(part[order]) == 0].all())
 
 
-def _length(place: Floats, part: Ints) -> float:
+def _length_of_ways(place: Floats, part: Ints) -> float:
     """Length of the ways of all parts of the rows [m]."""
     order = np.argsort(part, kind="stable")
     with np.errstate(all="ignore"):
@@ -365,13 +365,13 @@ def _length(place: Floats, part: Ints) -> float:
     return float(step[np.diff(part[order]) == 0].sum())
 
 
-def _counts(labels: list[str], rows: int) -> bool:
+def _are_row_numbers(labels: list[str], rows: int) -> bool:
     """Whether labels only number the rows."""
     whole = [int(label) for label in labels if re.fullmatch(r"-?\d{1,15}", label)]
     return rows > 1 and len(whole) == rows and np.ptp(np.diff(whole)) == 0
 
 
-def _follow(code: Ints, time: Floats, place: Floats) -> bool:
+def _are_parts_of_one_way(code: Ints, time: Floats, place: Floats) -> bool:
     """Whether what is coded follows each other on one way, as words for parts of a flight do."""
     change = np.diff(code) != 0
     steps = np.column_stack([np.diff(time), np.linalg.norm(np.diff(place, axis=0), axis=1)])
@@ -379,13 +379,13 @@ def _follow(code: Ints, time: Floats, place: Floats) -> bool:
     return bool(change.sum() == code.max() and (steps[change] <= _CONTINUES * usual).all())
 
 
-def yaws(quaternions: Floats) -> Floats:
+def yaws_of(quaternions: Floats) -> Floats:
     """Yaws (K,) [rad] of quaternions (K, 4), scalar last, body to world; zero without an attitude."""
     x, y, z, w = quaternions.T
     return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
 
-def _in_enu(
+def _turn_to_enu(
     axes: str, place: Any, velocity: Floats | None, yaw: Floats | None
 ) -> tuple[Floats, Floats | None, Floats | None]:
     """Places, velocities (K, 3) and yaws (K,) in east, north, up; yaw turns from the first axis to the second."""
@@ -400,12 +400,14 @@ def _in_enu(
     return place @ turn.T, None if velocity is None else velocity @ turn.T, yaw
 
 
-def _yaw(table: Table, yaw: Floats, time: Floats, rows: Ints, notes: list[str]) -> Floats | None:
+def _yaw_unless_doubtful(
+    table: TextTable, yaw: Floats, time: Floats, rows: Ints, notes: list[str]
+) -> Floats | None:
     """The yaws (K,) [rad], or None if they may be in another unit than assumed.
 
     Raises
     ------
-    TableError
+    ContentError
         A yaw changes by more than half a turn from one row to the next, in yaws of more than a turn.
     """
     step, far = np.abs(np.diff(yaw)), float(np.abs(yaw).max())
@@ -424,7 +426,7 @@ def _yaw(table: Table, yaw: Floats, time: Floats, rows: Ints, notes: list[str]) 
     return yaw
 
 
-def _doubts(table: Table, tracks: list[Track], *, axes: bool) -> Iterator[str]:
+def _doubts(table: TextTable, tracks: list[Track], *, axes: bool) -> Iterator[str]:
     """What is assumed of units, and what looks as if it had other units or axes."""
     place = np.concatenate([track.place for track in tracks])
     top, bottom = place[:, 2].max(), place[:, 2].min()

@@ -6,6 +6,7 @@ Yaw is NaN where a format does not have it.
 from __future__ import annotations
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +19,30 @@ NAMES = ("x", "y", "z", "yaw")
 CHANNELS = len(NAMES)
 
 
-def through(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:
+class Trajectories(NamedTuple):
+    """Trajectories of N vehicles as piecewise polynomials.
+
+    Attributes
+    ----------
+    names : of the vehicles, in order
+    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown
+    assumed : the curve that was assumed between the points of the file, in words
+    notes : what a reader of the verdict should know, in sentences without a full stop
+    read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
+    away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
+    since : seconds since 1970 from which times count; 0 if they are no dates
+    """
+
+    names: tuple[str, ...]
+    curves: tuple[Piecewise, ...]
+    assumed: str
+    notes: tuple[str, ...] = ()
+    read: tuple[dict[str, Any], ...] = ({},)
+    away: bool = False
+    since: float = 0.0
+
+
+def curve_through_states(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:
     """The way through states (m, K, 3) at times (K,) [s]: m derivatives of position are met, 4, 2, or 1 (lines).
 
     Yaw (2, K) [rad, rad/s] or (1, K) is met in the same way; without it, yaw is NaN. A single state stays for a second.
@@ -65,7 +89,7 @@ def greatest_jumps(curve: Piecewise) -> tuple[Floats, Floats]:
     return far.max(axis=1), curve.time[1 + far.argmax(axis=1)]
 
 
-def least_jerk(curve: Piecewise) -> Piecewise:
+def least_jerk_curve(curve: Piecewise) -> Piecewise:
     """The natural quintic spline through the knots of a curve: of all curves through them the one with the least jerk.
 
     Its fourth derivative is continuous. Full turns of yaw between two knots do not count.

@@ -11,15 +11,16 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from rigidfleet._common.files import why_not
-from rigidfleet._common.tables import TableError
+from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
+from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.math.piecewise import Piecewise
 
@@ -42,29 +43,6 @@ _SUFFIXES = {".csv", ".skyc", ".mcap"}
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
 #: Share of a number that is rounding, and the greatest number of things that a note lists.
 _ROUNDING, _LISTED = 1e-6, 5
-
-
-class Trajectories(NamedTuple):
-    """Trajectories of N vehicles as piecewise polynomials.
-
-    Attributes
-    ----------
-    names : of the vehicles, in order
-    curves : of each vehicle, its knots [s] and coefficients of x, y, z [m] and yaw [rad]; yaw is NaN if it is unknown
-    assumed : the curve that was assumed between the points of the file, in words
-    notes : what a reader of the verdict should know, in sentences without a full stop
-    read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
-    away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
-    since : seconds since 1970 from which times count; 0 if they are no dates
-    """
-
-    names: tuple[str, ...]
-    curves: tuple[Piecewise, ...]
-    assumed: str
-    notes: tuple[str, ...] = ()
-    read: tuple[dict[str, Any], ...] = ()
-    away: bool = False
-    since: float = 0.0
 
 
 def read_trajectories(
@@ -105,12 +83,16 @@ def read_trajectories(
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
-    listed = [group for path in paths for group in files_of(path)]
+    listed = [group for path in paths for group in groups_of_files(path)]
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
-    left_out = [note for path in paths if path.is_dir() for note in _left_out(path, listed)]
+    left_out = [
+        note for path in paths if path.is_dir() for note in _note_on_unread_files(path, listed)
+    ]
     words = units_of(units, axes)
-    parts = _on_one_clock([_of_sequence(group, interpolation, words) for group in listed], listed)
+    parts = _put_on_one_clock(
+        [_read_sequence(group, interpolation, words) for group in listed], listed
+    )
     kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
     if len(kinds) > 1:
         (_, first), (_, second), *_ = kinds.items()
@@ -136,12 +118,14 @@ def read_trajectories(
     sampled = parts[0].assumed in ASSUMED.values()
     away = spans == "away" or (sampled and spans == "refuse")
     since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
-    read = Trajectories(tuple(names), curves, parts[0].assumed, (), _alike(parts), away, since)
-    notes += _doubts(read, sources, spans, gaps) if sampled else []
-    return read._replace(notes=(*left_out, *notes, *_spans(read)))
+    read = Trajectories(
+        tuple(names), curves, parts[0].assumed, (), _records_of_alike_files(parts), away, since
+    )
+    notes += _notes_on_gaps(read, sources, spans, gaps) if sampled else []
+    return read._replace(notes=(*left_out, *notes, *_note_on_spans(read)))
 
 
-def _on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[Trajectories]:
+def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[Trajectories]:
     """The same parts, those that count their times from a date all from the first one.
 
     Raises
@@ -165,7 +149,7 @@ def _on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[T
     ]
 
 
-def _alike(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
+def _records_of_alike_files(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
     """What was taken for what, once for files that are alike."""
     every: dict[str, dict[str, Any]] = {}
     for part in parts:
@@ -182,7 +166,7 @@ def _alike(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
     return tuple(every.values())
 
 
-def files_of(path: Path) -> list[list[Path]]:
+def groups_of_files(path: Path) -> list[list[Path]]:
     """The files of a path, those of one vehicle that follow each other together.
 
     Raises
@@ -192,7 +176,7 @@ def files_of(path: Path) -> list[list[Path]]:
     """
     if not path.is_dir():
         return [[path]]
-    inside = [p for p in sorted(path.iterdir(), key=_order) if not _is_hidden(p)]
+    inside = [p for p in sorted(path.iterdir(), key=_sort_key) if not _is_hidden(p)]
     kinds = {p.suffix.lower() for p in inside if p.is_file()} & _SUFFIXES
     if len(kinds) > 1:
         raise TrajectoryError(
@@ -204,7 +188,7 @@ def files_of(path: Path) -> list[list[Path]]:
     groups = [
         [
             p
-            for p in sorted(folder.iterdir(), key=_order)
+            for p in sorted(folder.iterdir(), key=_sort_key)
             if p.suffix.lower() == ".csv" and not _is_hidden(p)
         ]
         for folder in folders
@@ -220,13 +204,13 @@ def files_of(path: Path) -> list[list[Path]]:
         whole = [[*range(first, first + len(group))] for first in (0, 1)]
         if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
             raise TrajectoryError(
-                f"{group[0].parent}: {_some([p.name for p in group])} are no sequence. Number the tables that a "
+                f"{group[0].parent}: {_first_few([p.name for p in group])} are no sequence. Number the tables that a "
                 "vehicle flies one after the other from 0 or 1 on, and leave none out."
             )
     return groups
 
 
-def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
+def _note_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
     """A note on the files in a folder that are not read.
 
     Raises
@@ -235,17 +219,17 @@ def _left_out(path: Path, listed: list[list[Path]]) -> list[str]:
         One of them may be a further vehicle.
     """
     read = {p for group in listed for p in group}
-    rest = [p for p in sorted(path.rglob("*"), key=_order) if p.is_file() and p not in read]
+    rest = [p for p in sorted(path.rglob("*"), key=_sort_key) if p.is_file() and p not in read]
     for p in rest:
         hidden = p.suffix.lower() in _SUFFIXES and not _is_hidden(p)
         with suppress(TrajectoryError):
-            hidden = hidden or bool(_of_file(p, "linear", units_of(None, None)))
+            hidden = hidden or bool(_read_file(p, "linear", units_of(None, None)))
         if hidden:
             raise TrajectoryError(
                 f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
                 "move it out of the folder."
             )
-    names = _some([p.relative_to(path) for p in rest])
+    names = _first_few([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
 
 
@@ -254,21 +238,21 @@ def _is_hidden(path: Path) -> bool:
     return path.name.startswith((".", "__MACOSX"))
 
 
-def _some(things: Sequence[object]) -> str:
+def _first_few(things: Sequence[object]) -> str:
     """The first of some things, and how many more there are."""
     more = f" and {len(things) - _LISTED:,} more" if len(things) > _LISTED else ""
     return ", ".join(map(str, things[:_LISTED])) + more
 
 
-def _order(path: Path) -> list[tuple[int, str]]:
+def _sort_key(path: Path) -> list[tuple[int, str]]:
     """Names in the order of the numbers in them: 2 before 10."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
 
 
-def _of_sequence(group: list[Path], interpolation: Interpolation, units: Units) -> Trajectories:
+def _read_sequence(group: list[Path], interpolation: Interpolation, units: Units) -> Trajectories:
     """What is in the file of a vehicle, or in several that it flies one after the other."""
-    first, *others = parts = [_of_file(path, interpolation, units) for path in group]
+    first, *others = parts = [_read_file(path, interpolation, units) for path in group]
     if not others:
         return first
     if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
@@ -283,7 +267,7 @@ def _of_sequence(group: list[Path], interpolation: Interpolation, units: Units) 
     return Trajectories((name,), (curve,), first.assumed, first.notes, first.read)
 
 
-def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajectories:
+def _read_file(path: Path, interpolation: Interpolation, units: Units) -> Trajectories:
     """What is in one file, by its content."""
     try:
         size = path.stat().st_size
@@ -294,63 +278,49 @@ def _of_file(path: Path, interpolation: Interpolation, units: Units) -> Trajecto
         data = path.read_bytes()
     except OSError as error:
         raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
-    name = str(path)
     if data.startswith(_HDF):
-        raise TrajectoryError(f"{name}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
-    record: dict[str, Any] = {}
-    notes: Sequence[str] = ()
-    if data.startswith(_ZIP) or path.suffix.lower() == ".skyc":
-        names, curves = shows.read_show(data, name)
-        assumed = shows.BEZIER
-    elif data.startswith(_MCAP) or path.suffix.lower() == ".mcap":
-        names, curves, record["since_1970_ns"] = poses.read_poses(data, name, interpolation)
-        assumed = ASSUMED[interpolation]
-    else:
-        try:
-            names, curves, assumed, notes, record = texts.read_text(
-                data, path, interpolation, units
-            )
-        except TableError as error:
-            line, _, problem, remedy = error.faults[0]
-            place = f"line {line}: " if line else ""
-            ends = "" if remedy.endswith("?") else "."
-            words = f"{name}: {place}{problem}. {remedy}{ends}".replace("?. ", "? ")
-            raise TrajectoryError(words) from None
-    read = Trajectories(tuple(names), tuple(curves), assumed, tuple(notes), (record,))
-    if (units.words or units.axes) and "units" not in record:
-        raise TrajectoryError(f"{name}: says its units and axes itself. Remove --units and --axes.")
-    for who, curve in zip(read.names, read.curves, strict=True):
-        _check_size(name, who, curve)
+        raise TrajectoryError(f"{path}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
+    suffix = path.suffix.lower()
+    try:
+        if data.startswith(_ZIP) or suffix == ".skyc":
+            read = shows.read_show(data)
+        elif data.startswith(_MCAP) or suffix == ".mcap":
+            read = poses.read_poses(data, interpolation)
+        else:
+            read = texts.read_text(data, path.stem, interpolation, units)
+        if (units.words or units.axes) and "units" not in read.read[0]:
+            raise fault("says its units and axes itself", "Remove --units and --axes")
+        for who, curve in zip(read.names, read.curves, strict=True):
+            _refuse_far_numbers(who, curve)
+    except ContentError as error:
+        raise TrajectoryError(f"{path}: {error}") from None
     return read
 
 
-def _check_size(name: str, who: str, curve: Piecewise) -> None:
+def _refuse_far_numbers(who: str, curve: Piecewise) -> None:
     """Refuse numbers with which no distance can be computed.
 
     Raises
     ------
-    TrajectoryError
+    ContentError
         A position or time is not finite or larger than `FARTHEST`.
     """
-    h = np.diff(curve.time)
+    begin, end = curve.time[[0, -1]]
+    if not (abs(begin) <= FARTHEST and abs(end) <= FARTHEST):
+        why = f"{who} flies from {begin:.9g} to {end:.9g} s; the most is {FARTHEST:g} s"
+        raise fault(why, "Let times begin at 0, in seconds, or name their unit: time [ms]")
     with np.errstate(all="ignore"):
-        powers = h[:, None, None] ** np.arange(curve.pieces.shape[2])
+        powers = np.diff(curve.time)[:, None, None] ** np.arange(curve.pieces.shape[2])
         reach = np.abs(curve.pieces[:, :3] * powers).sum(axis=2).max(axis=1)
-    if not (np.abs(curve.time[[0, -1]]) <= FARTHEST).all():
-        raise TrajectoryError(
-            f"{name}: {who} flies from {curve.time[0]:.9g} to {curve.time[-1]:.9g} s; the most is {FARTHEST:g} s. Let "
-            "times begin at 0, in seconds, or name their unit: time [ms]."
-        )
     bad = np.flatnonzero(~(reach <= FARTHEST))
     if len(bad):
         k = int(bad[0])
-        raise TrajectoryError(
-            f"{name}: {who} reaches {reach[k]:.3g} m from the origin in piece {k + 1}, which begins at "
-            f"{curve.time[k]:.3g} s; the most is {FARTHEST:g} m. Give metres and seconds, or name other units."
-        )
+        where = f"from the origin in piece {k + 1}, which begins at {curve.time[k]:.3g} s"
+        why = f"{who} reaches {reach[k]:.3g} m {where}; the most is {FARTHEST:g} m"
+        raise fault(why, "Give metres and seconds, or name other units")
 
 
-def _doubts(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -> list[str]:
+def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -> list[str]:
     """Notes on where samples leave open what a vehicle does: gaps, and a standstill that may be one.
 
     Raises
@@ -409,12 +379,12 @@ def _doubts(read: Trajectories, sources: list[Path], spans: Spans, gaps: Gaps) -
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
     if frozen:
-        words = f"positions repeat to the last digit between moves, {_some(frozen)}"
+        words = f"positions repeat to the last digit between moves, {_first_few(frozen)}"
         notes.append(f"{words}: a hold, or a tracker that lost sight of it")
     return notes
 
 
-def _spans(read: Trajectories) -> list[str]:
+def _note_on_spans(read: Trajectories) -> list[str]:
     """A note if vehicles begin or end at different times."""
     starts, ends = np.array([curve.time[[0, -1]] for curve in read.curves]).T
     begin, end = starts.min(), ends.max()
@@ -426,7 +396,7 @@ def _spans(read: Trajectories) -> list[str]:
     if not part:
         return []
     if not read.away:
-        return [f"{_some(part)}: each stays at its first and last place outside of its time"]
+        return [f"{_first_few(part)}: each stays at its first and last place outside of its time"]
     apart = len(starts) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
     never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
-    return [f"vehicles are judged only where they have data: {_some(part)}{never}"]
+    return [f"vehicles are judged only where they have data: {_first_few(part)}{never}"]

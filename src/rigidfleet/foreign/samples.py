@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import through
+from rigidfleet._common.tables import fault
+from rigidfleet.foreign.curves import curve_through_states
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
@@ -18,12 +18,11 @@ ASSUMED = {
 }
 
 
-def sampled(
+def curve_through_samples(
     time: Floats,
     position: Floats,
     yaw: Floats | None,
     kind: str,
-    name: str,
     place: Callable[[int], str],
 ) -> Piecewise:
     """The curve through positions (K, 3) [m] and yaws (K,) [rad] at times (K,) [s].
@@ -33,18 +32,17 @@ def sampled(
 
     Raises
     ------
-    TrajectoryError
-        A time does not increase; ``place`` tells where in the file ``name`` it is.
+    ContentError
+        A time does not increase; ``place`` tells where in the file it is.
     """
     behind = np.flatnonzero(~(np.diff(time) > 0.0))
     if len(behind):
         k = int(behind[0]) + 1
         how = "repeats" if time[k] == time[k - 1] else "goes back behind"
-        raise TrajectoryError(
-            f"{name}: {place(k)}: the time {time[k]:.9g} s {how} {time[k - 1]:.9g} s. Give increasing times."
-        )
+        why = f"{place(k)}: the time {time[k]:.9g} s {how} {time[k - 1]:.9g} s"
+        raise fault(why, "Give increasing times")
     turned = None if yaw is None else np.unwrap(yaw)[None]
-    lines = through(time, position[None], turned)
+    lines = curve_through_states(time, position[None], turned)
     if kind == "linear" or len(time) < 3:
         return lines
     return Piecewise.cubic_spline(time, position).beside(Piecewise(time, lines.pieces[:, 3:]))

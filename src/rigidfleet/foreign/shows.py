@@ -12,14 +12,13 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign.curves import with_headings
+from rigidfleet._common.tables import fault
+from rigidfleet.foreign.curves import Trajectories, with_headings
 from rigidfleet.math.piecewise import Piecewise
 
 #: What is between the points of a show.
@@ -31,140 +30,129 @@ _BYTES, _ENTRY, _INNER = 512 << 20, 64 << 20, 6
 #: number, half a text), and the greatest sum for an entry; the greatest number of coefficients of all curves.
 _BECOMES, _MEMORY = {b"[": 88, b"{": 64, b":": 120, b",": 32, b'"': 33}, 320 << 20
 _COEFFICIENTS = 1 << 25
+_AGAIN = "Export the show again"
 
 
-def read_show(data: bytes, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
-    """Names and curves of the drones of a show, in the show's time and axes.
+def read_show(data: bytes) -> Trajectories:
+    """The drones of a show, in the show's time and axes.
 
     Raises
     ------
-    TrajectoryError
+    ContentError
         The archive is damaged, too large or refers to files outside of it, or an entry is missing or not a number.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
             if size > _BYTES:
-                raise TrajectoryError(
-                    f"{name}: unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}. It is not a show."
-                )
-            return _drones(archive, name)
+                more = f"unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}"
+                raise fault(more, "It is not a show")
+            return _read_drones(archive)
     except RecursionError:
-        raise TrajectoryError(
-            f"{name}: show.json is nested too deeply. Export the show again."
-        ) from None
+        raise fault("show.json is nested too deeply", _AGAIN) from None
     except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError) as error:
-        raise TrajectoryError(
-            f"{name}: is not a complete zip archive ({error}). Export the show again."
-        ) from None
+        raise fault(f"is not a complete zip archive ({error})", _AGAIN) from None
 
 
-def _drones(archive: zipfile.ZipFile, name: str) -> tuple[tuple[str, ...], tuple[Piecewise, ...]]:
-    show = _json(archive, "show.json", name)
-    drones = _get(show, "swarm.drones", list, f"{name}: show.json")
+def _read_drones(archive: zipfile.ZipFile) -> Trajectories:
+    show = _read_json(archive, "show.json")
+    drones = _value_at(show, "swarm.drones", list, "show.json")
     if not drones:
-        raise TrajectoryError(f"{name}: show.json: has no drones.")
+        raise fault("show.json: has no drones")
     names: list[str] = []
     curves: list[Piecewise] = []
     room = _COEFFICIENTS
     for k, drone in enumerate(drones, 1):
-        where = f"{name}: show.json: drone {k}"
-        settings = _get(drone, "settings", dict, where)
+        where = f"show.json: drone {k}"
+        settings = _value_at(drone, "settings", dict, where)
         who = settings.get("name")
-        names.append(
-            who if isinstance(who, str) and who.strip() and who.isprintable() else f"drone {k}"
-        )
-        trajectory = _resolved(archive, settings.get("trajectory"), name, f"{where}: trajectory")
+        is_name = isinstance(who, str) and who.strip() and who.isprintable()
+        names.append(who if is_name else f"drone {k}")
+        trajectory = _dereference(archive, settings.get("trajectory"), f"{where}: trajectory")
         yaw = settings.get("yawControl")
-        turned = None if yaw is None else _resolved(archive, yaw, name, f"{where}: yawControl")
-        curves.append(_curve(trajectory, turned, f"{name}: {names[-1]}"))
+        turned = None if yaw is None else _dereference(archive, yaw, f"{where}: yawControl")
+        curves.append(_curve(trajectory, turned, names[-1]))
         room -= curves[-1].pieces.size
         if room < 0:
-            raise TrajectoryError(f"{where}: is too much beside those before. Give fewer points.")
+            raise fault(f"{where}: is too much beside those before", "Give fewer points")
     if len(set(names)) < len(names):
         names = [f"{who} ({k})" for k, who in enumerate(names, 1)]
-    return tuple(names), tuple(curves)
+    return Trajectories(tuple(names), tuple(curves), BEZIER)
 
 
-def _json(archive: zipfile.ZipFile, entry: str, name: str) -> Any:
+def _read_json(archive: zipfile.ZipFile, entry: str) -> Any:
     try:
         size = archive.getinfo(entry).file_size
-        data = archive.read(entry) if size <= _ENTRY else b""
-        if size > _ENTRY or sum(data.count(x) * each for x, each in _BECOMES.items()) > _MEMORY:
-            raise TrajectoryError(
-                f"{name}: {entry}: has {size >> 20:,} MiB, more than a show needs. Give each drone an entry of its own."
-            )
-        return json.loads(data, parse_constant=_no_constant)
     except KeyError:
-        raise TrajectoryError(f"{name}: has no {entry}. Is it a show of Skybrush?") from None
+        raise fault(f"has no {entry}", "Is it a show of Skybrush?") from None
+    try:
+        data = archive.read(entry) if size <= _ENTRY else b""
+        memory = sum(data.count(x) * each for x, each in _BECOMES.items())
+        if size <= _ENTRY and memory <= _MEMORY:
+            return json.loads(data, parse_constant=_refuse_constant)
     except (ValueError, zlib.error) as error:
-        raise TrajectoryError(
-            f"{name}: {entry}: is damaged ({error}). Export the show again."
-        ) from None
+        raise fault(f"{entry}: is damaged ({error})", _AGAIN) from None
+    more = f"{entry}: has {size >> 20:,} MiB, more than a show needs"
+    raise fault(more, "Give each drone an entry of its own")
 
 
-def _no_constant(told: str) -> float:
-    raise ValueError(f"has {told}, not a finite number")
+def _refuse_constant(constant: str) -> float:
+    raise ValueError(f"has {constant}, not a finite number")
 
 
-def _get(given: Any, path: str, kind: type, where: str) -> Any:
+def _value_at(value: Any, path: str, kind: type, where: str) -> Any:
     for key in path.split("."):
-        given = given.get(key) if isinstance(given, dict) else None
-    if not isinstance(given, kind):
+        value = value.get(key) if isinstance(value, dict) else None
+    if not isinstance(value, kind):
         word = "list" if kind is list else "object"
-        raise TrajectoryError(f"{where}: has no {word} {path!r}. Export the show again.")
-    return given
+        raise fault(f"{where}: has no {word} {path!r}", _AGAIN)
+    return value
 
 
-def _resolved(archive: zipfile.ZipFile, value: Any, name: str, where: str) -> dict[str, Any]:
+def _dereference(archive: zipfile.ZipFile, value: Any, where: str) -> dict[str, Any]:
     """An object of a show, or the one in the entry that it refers to."""
     if not isinstance(value, dict):
-        raise TrajectoryError(f"{where}: is missing. Export the show again.")
+        raise fault(f"{where}: is missing", _AGAIN)
     reference = value.get("$ref")
     if reference is None:
         return value
     entry = str(reference).removeprefix("./").removesuffix("#")
     if entry.startswith(("/", "\\")) or ".." in entry.replace("\\", "/").split("/") or ":" in entry:
-        raise TrajectoryError(
-            f"{where}: refers to {entry[:80]!r}, outside of the show, which is not read."
-        )
-    found = _json(archive, entry, name)
-    if not isinstance(found, dict):
-        raise TrajectoryError(f"{name}: {entry}: is no object. Export the show again.")
-    return found
+        outside = f"{entry[:80]!r}, outside of the show, which is not read"
+        raise fault(f"{where}: refers to {outside}")
+    entered = _read_json(archive, entry)
+    if not isinstance(entered, dict):
+        raise fault(f"{entry}: is no object", _AGAIN)
+    return entered
 
 
-def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -> Piecewise:
-    points = _get(trajectory, "points", list, where)
+def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> Piecewise:
+    points = _value_at(trajectory, "points", list, who)
     if not points:
-        raise TrajectoryError(f"{where}: its trajectory has no points.")
-
-    def told(k: int) -> str:
-        return f"{where}: point {k + 1}"
-
-    start = _floats(trajectory.get("takeoffTime", 0), (), lambda: f"{where}: takeoffTime")
-    for k, point in enumerate(points):
+        raise fault(f"{who}: its trajectory has no points")
+    start = _floats(trajectory.get("takeoffTime", 0), (), f"{who}: takeoffTime")
+    where = [f"{who}: point {k}" for k in range(1, len(points) + 1)]
+    for place, point in zip(where, points, strict=True):
         if not isinstance(point, list) or len(point) < 2:
-            raise TrajectoryError(f"{told(k)}: is not [time, [x, y, z], [control points]].")
-    time = np.array([_floats(p[0], (), lambda k=k: told(k)) for k, p in enumerate(points)])
-    ends = [_floats(p[1], (3,), lambda k=k: told(k)) for k, p in enumerate(points)]
+            raise fault(f"{place}: is not [time, [x, y, z], [control points]]")
+    time = np.array([_floats(p[0], (), w) for p, w in zip(points, where, strict=True)])
+    ends = [_floats(p[1], (3,), w) for p, w in zip(points, where, strict=True)]
     if len(points) == 1:
-        points, time, ends = [*points, [0, ends[0], []]], np.append(time, time + 1.0), ends * 2
+        points, time = [*points, [0, ends[0], []]], np.append(time, time + 1.0)
+        ends, where = ends * 2, where * 2
     late = np.flatnonzero(~(np.diff(time) > 0.0))
     if len(late):
         k = int(late[0])
-        raise TrajectoryError(
-            f"{told(k + 1)}: its time {time[k + 1]:g} s is not after {time[k]:g} s. Give increasing times."
-        )
+        why = f"{where[k + 1]}: its time {time[k + 1]:g} s is not after {time[k]:g} s"
+        raise fault(why, "Give increasing times")
     inner = [p[2] if len(p) > 2 and p[2] is not None else [] for p in points[1:]]
     powers = 2 + max((len(c) if isinstance(c, list) else 0 for c in inner), default=0)
     if powers > _INNER + 2:
-        raise TrajectoryError(
-            f"{where}: has {powers - 2} control points in a segment, more than {_INNER}."
-        )
-    pieces = np.zeros((len(inner), 4, max(powers, 2)))
+        more = f"{powers - 2} control points in a segment, more than {_INNER}"
+        raise fault(f"{who}: has {more}")
+    pieces = np.zeros((len(inner), 4, powers))
     for k, ((begin, end), between) in enumerate(zip(pairwise(ends), inner, strict=True)):
-        middle = _floats(between or np.zeros((0, 3)), (None, 3), lambda k=k: told(k + 1))
+        middle = _floats(between or np.zeros((0, 3)), (None, 3), where[k + 1])
         control = np.vstack([begin, middle, end])
         piece = Piecewise.of_bernstein(time[k : k + 2], control.T[None])
         pieces[k, :3, : len(control)] = piece.pieces[0]
@@ -173,27 +161,23 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, where: str) -
     if yaw is None or yaw.get("autoYaw"):
         pieces[:, 3] = np.nan
         return curve
-    setpoints = _floats(
-        _get(yaw, "setpoints", list, where), (None, 2), lambda: f"{where}: yaw setpoints"
-    )
-    if (np.diff(setpoints[:, 0]) < 0.0).any():
-        raise TrajectoryError(f"{where}: yaw setpoints: times go back. Give increasing times.")
-    if not len(setpoints):
-        pieces[:, 3] = np.nan
-        return curve
-    return with_headings(curve, setpoints[:, 0], -np.radians(setpoints[:, 1]))
+    setpoints = _value_at(yaw, "setpoints", list, who)
+    times, degrees = _floats(setpoints, (None, 2), f"{who}: yaw setpoints").T
+    if (np.diff(times) < 0.0).any():
+        raise fault(f"{who}: yaw setpoints: times go back", "Give increasing times")
+    return with_headings(curve, times, -np.radians(degrees))
 
 
-def _floats(given: Any, shape: tuple[int | None, ...], where: Callable[[], str]) -> Any:
+def _floats(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
     """Finite numbers of a shape, in which None is any length."""
     try:
-        found = np.asarray(given, dtype=float)
+        numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
-        found = np.array(np.nan)
-    fits = found.ndim == len(shape) and all(
-        n in (None, m) for n, m in zip(shape, found.shape, strict=True)
+        numbers = np.array(np.nan)
+    fits = numbers.ndim == len(shape) and all(
+        n in (None, m) for n, m in zip(shape, numbers.shape, strict=True)
     )
-    if not fits or not np.isfinite(found).all() or isinstance(given, str | bool):
+    if not fits or not np.isfinite(numbers).all() or isinstance(value, str | bool):
         words = "numbers" if shape else "a number"
-        raise TrajectoryError(f"{where()}: has {str(given)[:60]!r} where {words} must be.")
-    return found if shape else float(found)
+        raise fault(f"{where}: has {str(value)[:60]!r} where {words} must be")
+    return numbers if shape else float(numbers)

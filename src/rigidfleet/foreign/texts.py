@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
-from rigidfleet._common.tables import Table, fault
-from rigidfleet.foreign.columns import Units, parse, read_tracks
-from rigidfleet.foreign.curves import NAMES, rows_to_curve, through
-from rigidfleet.foreign.samples import ASSUMED, sampled
+from rigidfleet._common.tables import TextTable, fault
+from rigidfleet.foreign.columns import Units, parse_table, read_tracks
+from rigidfleet.foreign.curves import NAMES, Trajectories, curve_through_states, rows_to_curve
+from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 
@@ -20,50 +17,42 @@ POLYNOMIALS = "the polynomials of the file"
 _SHARE, _LEAST = 0.05, 0.05
 
 
-def read_text(
-    data: bytes, path: Path, interpolation: str, words: Units
-) -> tuple[list[str], list[Piecewise], str, list[str], dict[str, Any]]:
-    """Names and curves of a table, what is assumed between samples, notes, and what was taken for what.
+def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Trajectories:
+    """The vehicles of a table; the only one is named by the file's stem.
 
     Raises
     ------
-    TableError, TrajectoryError
+    ContentError
         The table cannot be read, or a time does not increase.
     """
-    table, notes = parse(data, words)
+    table, notes = parse_table(data, units)
     if table.place("duration", "x^0"):
-        curve = _pieces(table)
-        return (
-            [path.stem],
-            [curve],
-            POLYNOMIALS,
-            notes,
-            {"columns": table.names, "rows": len(curve.pieces)},
-        )
-    tracks, record = read_tracks(table, path.stem, words.axes, notes)
+        curve = _curve_of_coefficients(table)
+        record = {"columns": table.names, "rows": len(curve.pieces)}
+        return Trajectories((stem,), (curve,), POLYNOMIALS, tuple(notes), (record,))
+    tracks, record = read_tracks(table, stem, units.axes, notes)
     curves, off, fastest = [], 0.0, 0.0
-    for track in tracks:
-        where = lambda k, track=track: f"line {track.lines[k]}"  # noqa: E731
-        curve = sampled(track.time, track.place, track.yaw, interpolation, str(path), where)
-        curves.append(curve)
+    for _, lines, time, place, velocity, yaw in tracks:
+        where = lambda k, lines=lines: f"line {lines[k]}"  # noqa: E731
+        curves.append(curve_through_samples(time, place, yaw, interpolation, where))
         # At the inner samples, where lines have two velocities.
-        between = curve.pieces[1:, :3, 1]
-        if track.velocity is not None and interpolation == "cubic" and len(between):
-            off = max(off, float(np.linalg.norm(track.velocity[1:-1] - between, axis=1).max()))
+        between = curves[-1].pieces[1:, :3, 1]
+        if velocity is not None and interpolation == "cubic" and len(between):
+            off = max(off, float(np.linalg.norm(velocity[1:-1] - between, axis=1).max()))
             fastest = max(fastest, float(np.linalg.norm(between, axis=1).max()))
     if off > _LEAST + _SHARE * fastest:
-        notes.append(
-            f"the velocities of the table are up to {off:.3g} m/s off those of its positions, which count"
-        )
-    return [track.name for track in tracks], curves, ASSUMED[interpolation], notes, record
+        words = f"up to {off:.3g} m/s off those of its positions, which count"
+        notes.append(f"the velocities of the table are {words}")
+    names = tuple(track.name for track in tracks)
+    return Trajectories(names, tuple(curves), ASSUMED[interpolation], tuple(notes), (record,))
 
 
-def _pieces(table: Table) -> Piecewise:
+def _curve_of_coefficients(table: TextTable) -> Piecewise:
     """The curve in Crazyswarm2's table: duration [s], 8 coefficients of x, y, z [m] and yaw [rad] a piece, any order.
 
     Raises
     ------
-    TableError
+    ContentError
         A column is missing, or a duration is not positive.
     """
     due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
@@ -80,18 +69,18 @@ def _pieces(table: Table) -> Piecewise:
 
 def read_polynomial(data: bytes) -> list[Piecewise]:
     """The curve in a table of `crazyflie.write_polynomial`, from time zero on."""
-    return [_pieces(Table(data, {}))]
+    return [_curve_of_coefficients(TextTable(data, {}))]
 
 
 def read_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
-    table = Table(data, {})
+    table = TextTable(data, {})
     every = table.numbers(table.place("time", *axes, "yaw", "yaw_rate"))
     code, labels = table.codes(table.names.index("agent"))
     curves = []
     for agent in sorted(range(len(labels)), key=lambda k: int(labels[k])):
         own = every[code == agent]
         states = own[:, 1:13].reshape(-1, 4, 3).swapaxes(0, 1)
-        curves.append(through(own[:, 0], states, own[:, 13:15].T))
+        curves.append(curve_through_states(own[:, 0], states, own[:, 13:15].T))
     return curves

@@ -20,7 +20,7 @@ _TRIED = 6
 FEW = 6
 
 
-class Assigned(NamedTuple):
+class AssignedSlots(NamedTuple):
     """The slot of each agent, and the rotation of the slots during the blend."""
 
     order: Ints  # (N,) slot of each agent, from 0
@@ -67,13 +67,13 @@ def _approaches_of_few(
         yield math.sqrt(x * x + y * y + z * z) - (r[i] + r[j]), (i, j), s
 
 
-def nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:
+def pairs_nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:
     """Pairs (m, 2), i < j, of agents that come nearer than a distance [m] on straight ways in step (N, 3) [m]."""
-    found = [np.zeros((0, 2), dtype=np.int64)]
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
     for i, separation, _ in _approaches(start, end, None):
         k, j = np.nonzero(separation < distance)
-        found.append(np.column_stack([i[k], i[0] + 1 + j]))
-    return np.concatenate(found)
+        pairs.append(np.column_stack([i[k], i[0] + 1 + j]))
+    return np.concatenate(pairs)
 
 
 def _approaches(
@@ -112,14 +112,14 @@ def _dot(x: Floats, y: Floats) -> Floats:
     return z
 
 
-def assigned(
+def assign_slots(
     start: ArrayLike,
     slots: ArrayLike,
     *,
     turn: ArrayLike | None = None,
     radius: ArrayLike | None = None,
     metric: ArrayLike | None = None,
-) -> Assigned:
+) -> AssignedSlots:
     """Assign slots (N, 3) to agents at start (N, 3) [m], and choose the rotation of the slots during the blend.
 
     The rotation is chosen first; the order then has the least sum of squared distances to the rotated slots. On
@@ -133,8 +133,8 @@ def assigned(
     ----------
     turn : (3, 3) prescribed rotation of the slots; any rotation if it is not given
     radius : (N,) [m] asks for the safest assignment instead of the shortest
-    metric : (3, 3) symmetric M with which distances are |M x|, with a prescribed turn only; see `squashed`. The bound
-        then holds in this metric: the proof is the same for M x and M y
+    metric : (3, 3) symmetric M with which distances are |M x|, with a prescribed turn only; see `downwash_metric`. The
+        bound then holds in this metric: the proof is the same for M x and M y
 
     The shortest assignment has the least sum of squares for the given rotation. Without one, several attitudes are
     tried: slots are assigned and rotated to the agents (Kabsch) in turns, until nothing changes. The safest assignment
@@ -154,28 +154,28 @@ def assigned(
         if turn is None or radius is not None:
             raise ValueError("a metric needs a prescribed turn, and no radius")
         fixed, M = (np.asarray(x, dtype=np.float64) for x in (turn, metric))
-        return Assigned(_nearest_slots(p @ M, q @ fixed.T @ M), fixed)
-    given, scale = np.arange(n), float((p**2).sum() + (q**2).sum())
-    fits = Assigned(given, kabsch(p, q))
+        return AssignedSlots(_nearest_slots(p @ M, q @ fixed.T @ M), fixed)
+    own_order, scale = np.arange(n), float((p**2).sum() + (q**2).sum())
+    fits = AssignedSlots(own_order, kabsch(p, q))
     options = [fits]
     if turn is not None:
         fixed = np.asarray(turn, dtype=np.float64)
-        short = Assigned(_nearest_slots(p, q @ fixed.T), fixed)
-        options = [short, Assigned(given, fixed)] + ([] if radius is None else [fits])
+        short = AssignedSlots(_nearest_slots(p, q @ fixed.T), fixed)
+        options = [short, AssignedSlots(own_order, fixed)] + ([] if radius is None else [fits])
     if turn is None or radius is not None:
         left = max(1, int(_WORK / n**3))
-        for attitude in [fits.turn, *_attitudes()]:
+        for attitude in [fits.turn, *_rotations_of_a_cube()]:
             if left > 0:
-                option, used = _settled(p, q, attitude, min(left, _ROUNDS))
+                option, used = _assign_and_turn(p, q, attitude, min(left, _ROUNDS))
                 options.append(option)
                 left -= used
 
-    def worth(option: Assigned) -> tuple[float, bool, float]:
+    def worth(option: AssignedSlots) -> tuple[float, bool, float]:
         to, swing = option.turn, 0.0
         if turn is not None:
             to, swing = fixed, float(np.linalg.norm(option.turn - fixed))
         squares = float(((q[option.order] @ to.T - p) ** 2).sum()) / max(scale, 1e-300)
-        return round(squares, 12), bool((option.order != given).any()), swing
+        return round(squares, 12), bool((option.order != own_order).any()), swing
 
     straight = [o for o in options if turn is None or o.turn is fixed]
     shortest = min(straight, key=worth)
@@ -186,7 +186,7 @@ def assigned(
     return min(safe, key=lambda o: (-round(separation[id(o)], 2), *worth(o)))
 
 
-def squashed(up: ArrayLike, ratio: float) -> Floats:
+def downwash_metric(up: ArrayLike, ratio: float) -> Floats:
     """Metric (3, 3) in which distances along ``up`` (3,), a unit vector, count divided by a ratio >= 1 (downwash)."""
     u = np.asarray(up, dtype=np.float64)
     return np.eye(3) - (1.0 - 1.0 / ratio) * np.outer(u, u)
@@ -219,13 +219,13 @@ def _nearest_slots(p: Floats, q: Floats) -> Ints:
         orders = np.array(list(permutations(range(n))), dtype=np.int64)
         return orders[near[np.arange(n), orders].sum(axis=1).argmax()]
     if n > _LEAST:
-        return exchanged(p, q)
+        return order_by_exchanges(p, q)
     from scipy.optimize import linear_sum_assignment
 
     if n <= _PLAIN:
         return linear_sum_assignment(-(p @ q.T))[1]
     # Costs less prices have the same optimum. With prices near the optimal ones it is found five times faster.
-    order = exchanged(p, q)
+    order = order_by_exchanges(p, q)
     cost = -(p @ q[order].T)
     own, price, priced = cost.diagonal().copy(), np.zeros(n), np.empty_like(cost)
     for _ in range(_PRICED):
@@ -241,14 +241,14 @@ _TOGETHER = 64
 _ROUNDING = 1e-12
 
 
-def exchanged(p: Floats, q: Floats) -> Ints:
+def order_by_exchanges(p: Floats, q: Floats) -> Ints:
     """Order (N,) of slots q (N, 3) from which no exchange of two slots brings agents p (N, 3) nearer.
 
     If i and j exchange their slots, the sum of squared distances falls by -2 x . y, x = p_i - p_j, y = q_i - q_j.
     Exchanges of pairs with x . y < 0 therefore end, and leave x . y >= 0 for all pairs, up to rounding. Agents and
     slots that are halved along their longest axis again and again give an order from which few exchanges are left.
     """
-    n, order = len(p), _halved(p, q)
+    n, order = len(p), _order_by_halves(p, q)
     # x . y of agents i and j is the product of row i of one matrix and row j of the other.
     rows, columns = np.ones((n, 8)), np.ones((n, 8))
 
@@ -260,9 +260,9 @@ def exchanged(p: Floats, q: Floats) -> Ints:
 
     put(np.arange(n))
     least = -_ROUNDING * float((p**2).sum(axis=1).max() + (q**2).sum(axis=1).max())
-    found = True
-    while found:
-        found = False
+    improved = True
+    while improved:
+        improved = False
         for first in range(0, n, _TOGETHER):
             i = np.arange(first, min(first + _TOGETHER, n))
             while len(i):
@@ -272,16 +272,16 @@ def exchanged(p: Floats, q: Floats) -> Ints:
                 bad = np.flatnonzero(gain < least)
                 if not len(bad):
                     break
-                found = True
+                improved = True
                 bad = bad[np.argsort(gain[bad], kind="stable")]
-                i, j = _apart(i[bad], j[bad])
+                i, j = _disjoint_pairs(i[bad], j[bad])
                 order[i], order[j] = order[j], order[i]
                 put(np.concatenate([i, j]))
                 i = np.union1d(i, j[(j >= first) & (j < first + _TOGETHER)])
     return order
 
 
-def _apart(i: Ints, j: Ints) -> tuple[Ints, Ints]:
+def _disjoint_pairs(i: Ints, j: Ints) -> tuple[Ints, Ints]:
     """Those of the pairs (i, j), from the first on, that share no agent."""
     taken: set[int] = set()
     kept = []
@@ -293,7 +293,7 @@ def _apart(i: Ints, j: Ints) -> tuple[Ints, Ints]:
     return one, other
 
 
-def _halved(p: Floats, q: Floats) -> Ints:
+def _order_by_halves(p: Floats, q: Floats) -> Ints:
     """Order (N,) of slots q (N, 3) for agents p (N, 3): both are halved along the longest axis until one is left."""
     order = np.empty(len(p), dtype=np.int64)
     left = [(np.arange(len(p)), np.arange(len(p)))]
@@ -308,7 +308,7 @@ def _halved(p: Floats, q: Floats) -> Ints:
     return order
 
 
-def _settled(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Assigned, int]:
+def _assign_and_turn(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[AssignedSlots, int]:
     """Assign slots q (N, 3) to agents p and rotate them onto the agents, in turns, until nothing changes.
 
     Each step reduces the same sum of squares; the last is an assignment. Also return their number, at most ``most``.
@@ -318,12 +318,12 @@ def _settled(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Assigned, i
         turned = kabsch(p, q[order])
         new = _nearest_slots(p, q @ turned.T)
         if (new == order).all():
-            return Assigned(order, turned), used + 1
+            return AssignedSlots(order, turned), used + 1
         order, turn = new, turned
-    return Assigned(order, turn), most
+    return AssignedSlots(order, turn), most
 
 
-def _attitudes() -> list[Floats]:
+def _rotations_of_a_cube() -> list[Floats]:
     """The 24 rotations of a cube, as attitudes to start from."""
     turns = []
     for axes in permutations(range(3)):

@@ -46,7 +46,7 @@ class Violation(NamedTuple):
     """Triangle: by how much the longest side is too long [m]. Tetrahedron: its squared volume [m^6], < 0."""
 
 
-def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> list[Violation]:
+def violations(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> list[Violation]:
     """Find all triangles and tetrahedra among the given distances that do not exist in space.
 
     A triangle whose three sides are given must meet the triangle inequality; a quadruple with all six
@@ -61,20 +61,22 @@ def unrealisable(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) 
     for i, j in pairs:
         after[i].add(j)
 
-    found: list[Violation] = []
-    for agents, sides in _measured(_cliques(after, 3), index):
+    broken_rules: list[Violation] = []
+    for agents, sides in _with_edges(_cliques(after, 3), index):
         a = length[sides]
         excess = 2 * a.max(axis=1) - a.sum(axis=1)
         for t in np.flatnonzero(excess > tol * a.max(axis=1)):
-            found.append(Violation(agents[t], tuple(sides[t].tolist()), float(excess[t])))
-    broken = {v.agents for v in found}
-    for agents, sides in _measured(_cliques(after, 4), index):
+            broken_rules.append(Violation(agents[t], tuple(sides[t].tolist()), float(excess[t])))
+    broken = {v.agents for v in broken_rules}
+    for agents, sides in _with_edges(_cliques(after, 4), index):
         d2 = length[sides] ** 2
         volume2 = _squared_volume(*d2.T)
         for q in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
             if not any(face in broken for face in combinations(agents[q], 3)):
-                found.append(Violation(agents[q], tuple(sides[q].tolist()), float(volume2[q])))
-    return found
+                broken_rules.append(
+                    Violation(agents[q], tuple(sides[q].tolist()), float(volume2[q]))
+                )
+    return broken_rules
 
 
 def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]:
@@ -90,7 +92,7 @@ def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]
     return extend((), set(after))
 
 
-def _measured(
+def _with_edges(
     cliques: Iterator[tuple[int, ...]], index: dict[tuple[int, int], int]
 ) -> Iterator[tuple[list[tuple[int, ...]], Ints]]:
     """Some thousands of cliques at a time, each with the numbers of its edges 12, 13, ..., 23, ..."""
@@ -123,28 +125,28 @@ def slots_from_distances(
         No points in space have these distances, within `tol` of the largest.
     """
     e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
-    given = np.asarray(lengths, dtype=np.float64)
+    length = np.asarray(lengths, dtype=np.float64)
     pairs = n * (n - 1) // 2
     if len(e) < pairs or len({(min(i, j), max(i, j)) for i, j in e.tolist()}) < pairs:
         return None
     d = np.zeros((n, n))
-    d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = given
+    d[e[:, 0], e[:, 1]] = d[e[:, 1], e[:, 0]] = length
     centring = np.eye(n) - 1 / n
     value, vector = np.linalg.eigh(-0.5 * centring @ d**2 @ centring)
     # An eigenvalue is a squared extent; rounding errors alone are no thickness.
     top = np.where(value[-3:] > 1e-12 * value[-1], value[-3:], 0.0)[::-1]
     p = np.zeros((n, 3))
     p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(top)
-    error = float(np.abs(distances(p, e) - given).max(initial=0.0))
+    error = float(np.abs(distances(p, e) - length).max(initial=0.0))
     # Near a flat shape, an error e in a distance moves points by sqrt(e); therefore distances decide, not the volume.
     if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
         raise ValueError(
             f"no points in space have these distances (the nearest realisable set is {error:.3g} m off)"
         )
-    return _conventional(p)
+    return _turn_to_convention(p)
 
 
-def _conventional(p: Floats) -> Floats:
+def _turn_to_convention(p: Floats) -> Floats:
     """Turn and mirror centred points (N, 3) to the convention of `slots_from_distances`."""
     x = _first_direction(p[::-1], p)
     if x is None:

@@ -38,7 +38,7 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     p = np.asarray(points, dtype=np.float64)
     if len(p) < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    pairs = KDTree(p).query_pairs(_within(p, reach), output_type="ndarray")
+    pairs = KDTree(p).query_pairs(_reach_of_neighbours(p, reach), output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
 
 
@@ -47,7 +47,7 @@ def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
     p = np.asarray(points, dtype=np.float64)
     if len(p) < 2:
         return 0
-    return count_within(p, _within(p, reach))
+    return count_within(p, _reach_of_neighbours(p, reach))
 
 
 def count_within(points: ArrayLike, distance: float) -> int:
@@ -58,15 +58,15 @@ def count_within(points: ArrayLike, distance: float) -> int:
     return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
-def _within(p: Floats, reach: float) -> float:
+def _reach_of_neighbours(p: Floats, reach: float) -> float:
     """Greatest distance [m] between neighbours among points (N, 3)."""
     return reach * float(np.median(nearest(p))) * (1 + 1e-9)
 
 
-def spans_space(points: ArrayLike) -> None:
+def refuse_flat_shapes(points: ArrayLike) -> None:
     """Raise a ValueError with the reason if `henneberg` and `henneberg_multilevel` have no edges for points (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
-    _spanning_first(p, np.arange(len(p)))
+    _put_spanning_points_first(p, np.arange(len(p)))
 
 
 def henneberg(points: ArrayLike) -> Ints:
@@ -85,7 +85,9 @@ def henneberg(points: ArrayLike) -> Ints:
 
     p = np.asarray(points, dtype=np.float64)
     n = len(p)
-    order = _spanning_first(p, np.argsort(((p - p.mean(axis=0)) ** 2).sum(axis=1), kind="stable"))
+    order = _put_spanning_points_first(
+        p, np.argsort(((p - p.mean(axis=0)) ** 2).sum(axis=1), kind="stable")
+    )
     rank = np.empty(n, dtype=np.int64)
     rank[order] = np.arange(n)
     tree = KDTree(p)
@@ -101,7 +103,7 @@ def henneberg(points: ArrayLike) -> Ints:
             d = ((p[before] - p[some[k]]) ** 2).sum(axis=1)
             few = before[np.argsort(d, kind="stable")[:12]]
             at[k] = np.append(few, np.full(12 - len(few), -1))
-        u, length = _towards(p, some, at)
+        u, length = _directions(p, some, at)
         a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
         volume = np.abs((a * np.cross(b, c)).sum(axis=2))
         # Among equally good triples, the one with the shortest edges.
@@ -130,9 +132,9 @@ def henneberg_multilevel(points: ArrayLike) -> Ints:
     p = np.asarray(points, dtype=np.float64)
     n = len(p)
     away = np.linalg.norm(p - p.mean(axis=0), axis=1)
-    first = farthest(p, min(n, 12), int(away.argmax()))
-    order = _halves(p)
-    order = _spanning_first(p, np.concatenate([first, order[~np.isin(order, first)]]))
+    first = farthest_points(p, min(n, 12), int(away.argmax()))
+    order = _order_from_coarse_to_fine(p)
+    order = _put_spanning_points_first(p, np.concatenate([first, order[~np.isin(order, first)]]))
     edges, soft, done = [_triangle_of(order)], np.zeros(n), 3
     while done < n:
         some = order[done : 2 * done if done >= 12 else done + 1]
@@ -155,7 +157,7 @@ def _softness(p: Floats, some: Ints, at: Ints, soft: Floats) -> Floats:
 
     Triples that lie in a plane with the point, or are incomplete, give about 1e18.
     """
-    u, _ = _towards(p, some, at)
+    u, _ = _directions(p, some, at)
     a, b, c = (u[:, _TRIPLES[:, k]] for k in range(3))
     rows = np.cross(b, c), np.cross(c, a), np.cross(a, b)
     volume = (a * rows[0]).sum(axis=2)
@@ -176,7 +178,7 @@ def _triangle_of(order: Ints) -> Ints:
     return np.array([order[[0, 1]], order[[0, 2]], order[[1, 2]]])
 
 
-def _towards(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
+def _directions(p: Floats, some: Ints, at: Ints) -> tuple[Floats, Floats]:
     """Unit vectors (k, 12, 3) and distances from points (k,) to others (k, 12); 0 for -1, which means none."""
     x = p[at] - p[some][:, None]
     length = np.linalg.norm(x, axis=2)
@@ -189,17 +191,17 @@ def _edges_to(some: Ints, at: Ints, triple: Ints) -> Ints:
     return np.column_stack([np.repeat(some, 3), np.take_along_axis(at, triple, 1).ravel()])
 
 
-def farthest(p: Floats, count: int, first: int = 0) -> Ints:
+def farthest_points(p: Floats, count: int, first: int = 0) -> Ints:
     """Indices (count,) of points (N, d): a first one, and each of the others the farthest from all before it."""
-    found = [first]
+    chosen = [first]
     away = np.linalg.norm(p - p[first], axis=1)
-    while len(found) < count:
-        found.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(p - p[found[-1]], axis=1))
-    return np.array(found)
+    while len(chosen) < count:
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(p - p[chosen[-1]], axis=1))
+    return np.array(chosen)
 
 
-def _halves(p: Floats) -> Ints:
+def _order_from_coarse_to_fine(p: Floats) -> Ints:
     """Order (N,) of points: the middle one across the longest extent, the middles of both halves, and so on."""
     order, todo = [], [np.arange(len(p))]
     while todo:
@@ -212,7 +214,7 @@ def _halves(p: Floats) -> Ints:
     return np.array(order)
 
 
-def _spanning_first(p: Floats, order: Ints) -> Ints:
+def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
     """The order (N,) with four points that span space moved to the front, each the earliest possible one."""
     if len(p) < 4:
         raise ValueError(
@@ -220,15 +222,15 @@ def _spanning_first(p: Floats, order: Ints) -> Ints:
         )
     x = p[order] - p[order[0]]
     x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
-    found = [0, 1]
+    chosen = [0, 1]
     for size in (
         lambda: np.linalg.norm(np.cross(x, x[1]), axis=1),
-        lambda: np.abs(x @ np.cross(x[1], x[found[2]])),
+        lambda: np.abs(x @ np.cross(x[1], x[chosen[2]])),
     ):
         fits = np.flatnonzero(size() > 0.2)
         if not len(fits):
             raise ValueError(
                 "points in a plane or on a line cannot be held by three edges each; they need slots"
             )
-        found.append(int(fits[0]))
-    return np.concatenate([order[found], np.delete(order, found)])
+        chosen.append(int(fits[0]))
+    return np.concatenate([order[chosen], np.delete(order, chosen)])

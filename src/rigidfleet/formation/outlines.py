@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.formation.graphs import farthest
+from rigidfleet.formation.graphs import farthest_points
 from rigidfleet.formation.point_files import read_bytes
 from rigidfleet.math import proximity
 from rigidfleet.typing import Floats, Ints
@@ -52,7 +52,7 @@ def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Float
         raise ValueError("; ".join(["has no outline", *said]))
     if notes is not None:
         notes += said
-    return _drawn([x * (1.0, -1.0) for x in drawing.outlines])
+    return _with_extent([x * (1.0, -1.0) for x in drawing.outlines])
 
 
 def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
@@ -73,7 +73,7 @@ def text_outlines(words: str, font: str = "DejaVu Sans") -> list[Floats]:
     if not words.strip():
         raise ValueError("has no outline")
     path = TextPath((0.0, 0.0), words, size=1.0, prop=FontProperties(family=font))
-    return _drawn([np.array(x) for x in path.to_polygons(closed_only=False)])
+    return _with_extent([np.array(x) for x in path.to_polygons(closed_only=False)])
 
 
 def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
@@ -97,19 +97,21 @@ def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
     letters.normalize_rendering(1.0)
     if missing := "".join(x for x in words if x not in letters.all_glyphs):
         raise ValueError(f"has letters that {font!r} lacks: {missing}")
-    return _drawn(
+    return _with_extent(
         [np.array(x, dtype=np.float64) for x in map(list, letters.strokes_for_text(words))]
     )
 
 
-def _drawn(outlines: list[Floats]) -> list[Floats]:
-    found = [x for x in outlines if len(x) > 1 and np.isfinite(x).all() and np.ptp(x, axis=0).any()]
-    if not found:
+def _with_extent(outlines: list[Floats]) -> list[Floats]:
+    extended = [
+        x for x in outlines if len(x) > 1 and np.isfinite(x).all() and np.ptp(x, axis=0).any()
+    ]
+    if not extended:
         raise ValueError("has no outline")
-    return found
+    return extended
 
 
-def on_outlines(outlines: list[Floats], count: int, spacing: float) -> Floats:
+def slots_on_outlines(outlines: list[Floats], count: int, spacing: float) -> Floats:
     """Slots (count, 3) [m] evenly spread over outlines, the nearest two ``spacing`` apart; upright: x east, z up.
 
     Raises
@@ -119,12 +121,12 @@ def on_outlines(outlines: list[Floats], count: int, spacing: float) -> Floats:
     """
     if not 2 <= count <= _MOST:
         raise ValueError(f"an outline takes 2 to {_MOST:,} agents, not {count:,}")
-    dense = _along(outlines, _DENSE * count)
-    flat = dense[spread(dense, count)]
-    return scaled(np.column_stack([flat[:, 0], 0.0 * flat[:, 0], flat[:, 1]]), spacing)
+    dense = _points_along(outlines, _DENSE * count)
+    flat = dense[most_even_points(dense, count)]
+    return scale_to_spacing(np.column_stack([flat[:, 0], 0.0 * flat[:, 0], flat[:, 1]]), spacing)
 
 
-def scaled(points: ArrayLike, spacing: float) -> Floats:
+def scale_to_spacing(points: ArrayLike, spacing: float) -> Floats:
     """Points (N, 3) about their centre, enlarged or reduced until the nearest two are ``spacing`` [m] apart.
 
     Raises
@@ -169,7 +171,7 @@ def scale_in_words(points: Floats, scaled: Floats) -> list[str]:
     return [words]
 
 
-def spread(points: Floats, count: int) -> Ints:
+def most_even_points(points: Floats, count: int) -> Ints:
     """Indices (count,) of points (M, d) that are spread evenly: their least distance is as large as was found.
 
     Two starts, every M/count-th point and the farthest from all chosen before, are improved in turns: each chosen point
@@ -184,7 +186,7 @@ def spread(points: Floats, count: int) -> Ints:
         raise ValueError(f"{len(points):,} points cannot place {count:,} agents; use fewer agents")
     tree = KDTree(points)
     best, most = np.arange(count), -1.0
-    for start in (np.arange(count) * len(points) // count, farthest(points, count)):
+    for start in (np.arange(count) * len(points) // count, farthest_points(points, count)):
         chosen = start
         for _ in range(_ROUNDS):
             least = float(proximity.nearest(points[chosen]).min()) if count > 1 else 0.0
@@ -200,15 +202,15 @@ def spread(points: Floats, count: int) -> Ints:
     return np.sort(best)
 
 
-def _along(outlines: list[Floats], count: int) -> Floats:
+def _points_along(outlines: list[Floats], count: int) -> Floats:
     """About ``count`` points (M, 2) at equal steps along polygons (K, 2)."""
     lengths = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in outlines]
     step = sum(map(np.sum, lengths)) / count
-    found = []
+    parts_of_all = []
     for x, length in zip(outlines, lengths, strict=True):
         closed = np.allclose(x[0], x[-1], atol=1e-9 * float(np.ptp(x, axis=0).max()))
         at = np.concatenate([[0.0], np.cumsum(length)])
         parts = max(1, round(float(at[-1]) / step))
         s = np.linspace(0.0, at[-1], parts + 1)[: -1 if closed and parts > 1 else None]
-        found.append(np.column_stack([np.interp(s, at, column) for column in x.T]))
-    return np.concatenate(found)
+        parts_of_all.append(np.column_stack([np.interp(s, at, column) for column in x.T]))
+    return np.concatenate(parts_of_all)

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import quantity_of
-from rigidfleet._common.tables import Fault, Table, TableError, fault
+from rigidfleet._common.names import meaning_of
+from rigidfleet._common.tables import ContentError, Fault, TextTable, fault
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
 
@@ -73,12 +73,12 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
     suffix, place = Path(name).suffix.lower(), "point"
     try:
         if suffix in (".npy", ".ply"):
-            points, colours, notes = _npy(data) if suffix == ".npy" else _ply(data)
+            points, colours, notes = _read_npy(data) if suffix == ".npy" else _read_ply(data)
             lines = np.arange(1, len(points) + 1)
         else:
-            lines, points, colours, notes = _text(data)
+            lines, points, colours, notes = _read_table(data)
             place = "line"
-    except TableError as error:
+    except ContentError as error:
         raise MissionError(_findings(error.faults, name)) from None
     except ValueError as error:
         remedy = "write it again, with one agent per row: x, y, z [m]"
@@ -111,14 +111,14 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
     return Points(points, colours, notes)
 
 
-def to_csv(slots: Floats, colours: Sequence[str] | None) -> str:
+def csv_of_points(slots: Floats, colours: Sequence[str] | None) -> str:
     """A text of points that `read_points` reads."""
     rows = [",".join(map(repr, row)) for row in (slots + 0.0).tolist()]
     if colours is None:
         return "\n".join(["x,y,z", *rows, ""])
     lights = (",".join(map(str, bytes.fromhex(colour[1:]))) for colour in colours)
-    told = (f"{row},{light}" for row, light in zip(rows, lights, strict=True))
-    return "\n".join(["x,y,z,red,green,blue", *told, ""])
+    coloured = (f"{row},{light}" for row, light in zip(rows, lights, strict=True))
+    return "\n".join(["x,y,z,red,green,blue", *coloured, ""])
 
 
 def _findings(faults: Sequence[Fault], name: str, place: str = "line") -> list[Finding]:
@@ -150,18 +150,18 @@ def _hexadecimal(colours: Floats, *, shares: bool) -> tuple[str, ...]:
     return tuple(f"#{row.tobytes().hex()}" for row in colours.astype(np.uint8))
 
 
-def _text(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str, ...]]:
     """Lines (N,), points (N, 3), colours and notes of a table.
 
     Raises
     ------
     ValueError
-        A column is not understood or there twice, or (TableError) a row has no numbers.
+        A column is not understood or there twice, or (ContentError) a row has no numbers.
     """
     unnamed = {2: _AXES[:2], 3: _AXES, 6: [*_AXES, *_HUES]}
     if re.search(rb"#[0-9a-fA-F]{6}\s", data):
         unnamed[4] = [*_AXES, "colour"]
-    table, notes = Table(data, unnamed), []
+    table, notes = TextTable(data, unnamed), []
     if not table.columns:
         return table.lines, np.zeros((0, 3)), None, ()
     if (
@@ -200,21 +200,21 @@ def _text(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tuple[str,
     return table.lines, points, colours, tuple(notes)
 
 
-def _npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
     """Points (N, 3), colours and notes of an NPY file."""
     try:
-        found = np.load(io.BytesIO(data), allow_pickle=False)
+        array = np.load(io.BytesIO(data), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise ValueError(f"is no whole NPY file: {error}") from None
-    if not isinstance(found, np.ndarray) or found.dtype.kind not in "iuf":
+    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
         raise ValueError("is no array of numbers")
-    if found.ndim != 2 or found.shape[1] not in (2, 3, 6):
-        raise ValueError(f"has an array {found.shape}, not (N, 3), (N, 2) or (N, 6)")
-    points = np.zeros((len(found), 3))
-    points[:, : found.shape[1]] = found[:, :3]
-    if found.shape[1] < 6:
+    if array.ndim != 2 or array.shape[1] not in (2, 3, 6):
+        raise ValueError(f"has an array {array.shape}, not (N, 3), (N, 2) or (N, 6)")
+    points = np.zeros((len(array), 3))
+    points[:, : array.shape[1]] = array[:, :3]
+    if array.shape[1] < 6:
         return points, None, ()
-    hues = found[:, 3:].astype(np.float64)
+    hues = array[:, 3:].astype(np.float64)
     return (
         points,
         _hexadecimal(hues, shares=hues.max(initial=0.0) <= 1.0 and bool((hues % 1.0).any())),
@@ -222,7 +222,7 @@ def _npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
     )
 
 
-def _ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
+def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
     """Points (N, 3), colours and notes: vertices of a PLY file (Turk, The PLY polygon file format, 1994)."""
     head, *body = re.split(rb"end_header(?:\r\n|\n|\r)", data, maxsplit=1)
     lines = [line.split() for line in head.decode("ascii", errors="replace").splitlines()]
@@ -245,12 +245,12 @@ def _ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
         raise ValueError(f"has vertices with a property that is no number: {' '.join(odd)}")
     if order is None or "vertex" not in before or not {*_AXES} <= columns.keys():
         raise ValueError("has no vertices with x, y and z, or another format than 1.0")
-    hues = {quantity_of(name).kind: name for name in columns}
+    hues = {meaning_of(name).kind: name for name in columns}
     names = [*_AXES, *(hues[hue] for hue in _HUES if {*_HUES} <= hues.keys())]
     short = ValueError(f"ends before the last of its {count:,} vertices")
     if order:
         kind = np.dtype([(name, order + str(number)) for name, number in columns.items()])
-        start = _skipped(body[0], order, elements[:k])
+        start = _bytes_before_vertices(body[0], order, elements[:k])
         if len(body[0]) < start + count * kind.itemsize:
             raise short
         rows: Any = np.frombuffer(body[0], kind, count, start)
@@ -275,7 +275,9 @@ def _ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
     return values[:, :3].copy(), _hexadecimal(colours, shares=shares), ()
 
 
-def _skipped(body: bytes, order: str, elements: list[tuple[str, int, list[list[str]]]]) -> int:
+def _bytes_before_vertices(
+    body: bytes, order: str, elements: list[tuple[str, int, list[list[str]]]]
+) -> int:
     """Number of bytes of the elements before the vertices."""
     start = 0
     for _, count, properties in elements:

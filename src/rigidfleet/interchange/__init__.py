@@ -22,7 +22,7 @@ from rigidfleet._common.files import replacing_folder, write_file
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
-from rigidfleet.interchange.curves import Deviation, Motion, deviation, tracked
+from rigidfleet.interchange.curves import Deviation, ExportedMotion, deviation, exported_motion
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights
@@ -52,7 +52,7 @@ class Format(NamedTuple):
     lights : whether it has the vehicles' lights
     """
 
-    write: Callable[[Motion, Any], Iterator[bytes]]
+    write: Callable[[ExportedMotion, Any], Iterator[bytes]]
     read: Callable[[bytes], list[Piecewise]]
     suffix: str
     each: bool
@@ -138,7 +138,7 @@ class Export:
         files = "1 file" if self.files == 1 else f"{self.files} files"
         source = "flown" if self.flown else "reference"
         turned = math.degrees(self.yaw_deviation)
-        within = f"{brief(1e3 * self.deviation)} mm and {brief(turned)} deg"
+        within = f"{brief_number(1e3 * self.deviation)} mm and {brief_number(turned)} deg"
         size = max(1, round(self.size / 1e3))
         # No yaw is flown by points, and none is recorded of vehicles but in their attitudes.
         extra = "; yaw is the reference's, and east where it has none" if self.flown else ""
@@ -193,8 +193,8 @@ def export(
             f"pip install {chosen.distribution}"
         )
     try:
-        motion, cut = tracked(result, flown=flown)
-        off, size, count = _written(motion, chosen, path, setting)
+        motion, cut = exported_motion(result, flown=flown)
+        off, size, count = _write_and_measure(motion, chosen, path, setting)
     except ResultError as error:
         raise ResultError(f"{format}: {error}") from None
     end = motion.end - off.missing
@@ -234,30 +234,30 @@ def _setting(
     name: str, chosen: Format, rate: float | None, tolerance: float | None
 ) -> float | None:
     """The rate [Hz] or the tolerance [m] of an export, whichever its format has."""
-    given = {"rate": rate, "tolerance": tolerance}
+    values = {"rate": rate, "tolerance": tolerance}
     has, lacks = ("rate", "tolerance") if chosen.tolerance is None else ("tolerance", "rate")
-    if given[lacks] is not None:
+    if values[lacks] is not None:
         of = "samples at a rate" if has == "rate" else "curves within a tolerance"
         raise ValueError(f"{lacks} does not apply to {name}, which has {of}; give {has} instead")
-    value = given[has]
+    value = values[has]
     if value is not None and not (math.isfinite(value) and value > 0.0):
         raise ValueError(f"{has} must be positive, not {value!r}")
     return chosen.tolerance if value is None else value
 
 
-def _written(
-    motion: Motion, chosen: Format, path: Path, setting: float | None
+def _write_and_measure(
+    motion: ExportedMotion, chosen: Format, path: Path, setting: float | None
 ) -> tuple[Deviation, int, int]:
     """Write the files, all or none; return how far they are off, and how many bytes and files they are."""
-    found: list[Deviation] = []
+    deviations: list[Deviation] = []
     size = count = 0
     for_each = chosen.write(motion, setting)
 
     def measured() -> Iterator[bytes]:
         nonlocal size, count
         for data in for_each:
-            found.extend(_deviations(motion, chosen, data, len(found)))
-            worst = max(found, key=lambda x: x.position).position
+            deviations.extend(_deviations(motion, chosen, data, len(deviations)))
+            worst = max(deviations, key=lambda x: x.position).position
             if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
                 raise ResultError(
                     f"the tolerance of {1e3 * setting:g} mm cannot be met: what was written is {1e3 * worst:.2g} mm "
@@ -277,10 +277,10 @@ def _written(
         with replacing_folder(path, ours) as folder:
             for i, data in enumerate(measured(), start=1):
                 (folder / f"agent-{i:0{width}}.{chosen.suffix}").write_bytes(data)
-    return Deviation(*(float(np.max(x)) for x in zip(*found, strict=True))), size, count
+    return Deviation(*(float(np.max(x)) for x in zip(*deviations, strict=True))), size, count
 
 
-def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list[Deviation]:
+def _deviations(motion: ExportedMotion, chosen: Format, data: bytes, first: int) -> list[Deviation]:
     """How far the ways in a file are from those of the vehicles from ``first`` on."""
     start = motion.start if chosen.own_time else 0.0
     return [
@@ -289,6 +289,6 @@ def _deviations(motion: Motion, chosen: Format, data: bytes, first: int) -> list
     ]
 
 
-def brief(x: float) -> str:
+def brief_number(x: float) -> str:
     """A deviation with two digits or in whole units; a tiny one as a bound."""
     return "0.001" if x < 1e-3 else f"{x:.2g}" if x < 10.0 else f"{x:.0f}"

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import NAMES, curve_to_rows, rows_to_curve
-from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, fit
+from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 from rigidfleet.typing import Floats
@@ -36,15 +36,15 @@ _END = _PIECE.pack(0, 0)
 _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 1000]))
 
 
-def write_polynomial(motion: Motion, tolerance: float) -> Iterator[bytes]:
+def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One table a vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
     for agent in range(motion.n_agents):
-        rows = curve_to_rows(fit(motion.curve(agent), tolerance))
+        rows = curve_to_rows(fit_curve(motion.curve(agent), tolerance))
         lines = [",".join(f"{x:.9g}" for x in row) for row in rows]
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
 
-def write_poly4d(motion: Motion, tolerance: float) -> Iterator[bytes]:
+def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One memory image a vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
 
     Raises
@@ -54,14 +54,14 @@ def write_poly4d(motion: Motion, tolerance: float) -> Iterator[bytes]:
     """
     for agent in range(motion.n_agents):
         way = motion.curve(agent)
-        curve = fit(way, tolerance)
+        curve = fit_curve(way, tolerance)
         if len(curve.pieces) > PIECES:
-            raise _too_long(
+            raise _error_of_a_long_flight(
                 agent,
                 f"{len(curve.pieces)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}",
                 curve.time[PIECES] - curve.time[0],
                 tolerance,
-                lambda x, way=way: len(fit(way, x).pieces) <= PIECES,
+                lambda x, way=way: len(fit_curve(way, x).pieces) <= PIECES,
             )
         yield np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
 
@@ -72,7 +72,7 @@ def read_poly4d(data: bytes) -> list[Piecewise]:
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
-def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
+def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One compressed image a vehicle: Bernstein coefficients in millimetres and tenths of a degree.
 
     Raises
@@ -89,9 +89,9 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
     for agent in range(motion.n_agents):
         way = motion.curve(agent)
         way = way.on(np.round(way.time / _MS) * _MS)
-        data, ends = _compressed(way, tolerance, agent)
+        data, ends = _compressed_image(way, tolerance, agent)
         if len(data) > MEMORY:
-            raise _too_long(
+            raise _error_of_a_long_flight(
                 agent,
                 f"{len(data)} bytes, and the memory has {MEMORY}",
                 ends[
@@ -99,15 +99,15 @@ def write_compressed(motion: Motion, tolerance: float) -> Iterator[bytes]:
                     1,
                 ],
                 tolerance,
-                lambda x, way=way, agent=agent: len(_compressed(way, x, agent)[0]) <= MEMORY,
+                lambda x, way=way, agent=agent: len(_compressed_image(way, x, agent)[0]) <= MEMORY,
             )
         yield data
 
 
-def _compressed(way: Piecewise, tolerance: float, agent: int) -> tuple[bytes, Floats]:
+def _compressed_image(way: Piecewise, tolerance: float, agent: int) -> tuple[bytes, Floats]:
     """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
-    curve = fit(way, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
+    curve = fit_curve(way, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     duration = np.diff(curve.time)
     position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
     # Yaw is of degree 3, like the reference between samples.
@@ -162,7 +162,7 @@ def read_compressed(data: bytes) -> list[Piecewise]:
     return [rows_to_curve(rows)]
 
 
-def _too_long(
+def _error_of_a_long_flight(
     agent: int, needed: str, until: float, tolerance: float, fits: Callable[[float], bool]
 ) -> ResultError:
     """Error about a flight that does not fit: which tolerance makes it fit, and how many seconds do."""

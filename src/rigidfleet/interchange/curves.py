@@ -22,7 +22,7 @@ _COMPARED = np.array([0.02, 0.25, 0.5, 0.75, 0.98])
 
 
 @dataclass(frozen=True)
-class Motion:
+class ExportedMotion:
     """What is exported: the states of all vehicles at both ends of every interval between samples.
 
     Attributes
@@ -60,7 +60,7 @@ class Motion:
         return curve(self.samples, agent)
 
 
-def fit(
+def fit_curve(
     source: Piecewise, tolerance: float, orders: int = 4, yaw_tolerance: float = YAW_TOLERANCE,
     longest: float = np.inf,
 ) -> Piecewise:  # fmt: skip
@@ -116,7 +116,7 @@ def fit(
     return Piecewise(time[ends], np.concatenate(pieces))
 
 
-def headings(curve: Piecewise) -> tuple[Floats, Floats]:
+def heading_lines(curve: Piecewise) -> tuple[Floats, Floats]:
     """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
 
     Times increase: where yaw jumps, it turns within a millisecond. A line turns by 90 deg at most: from half a turn on,
@@ -169,7 +169,7 @@ def deviation(source: Piecewise, written: Piecewise, until: float = np.inf) -> D
     return Deviation(far, float(abs(turned).max(initial=0.0)), missing)
 
 
-def tracked(result: Result, *, flown: bool) -> tuple[Motion, bool]:
+def exported_motion(result: Result, *, flown: bool) -> tuple[ExportedMotion, bool]:
     """What can be exported of a flight, and whether its beginning or end is left out: no slot is tracked there.
 
     Raises
@@ -177,12 +177,12 @@ def tracked(result: Result, *, flown: bool) -> tuple[Motion, bool]:
     ResultError
         There is no reference at all, or it has gaps, or a value is not finite.
     """
-    given = result.motion(flown=flown)
-    yaw, yaw_rate = given.yaw, given.yaw_rate
+    setpoints = result.motion(flown=flown)
+    yaw, yaw_rate = setpoints.yaw, setpoints.yaw_rate
     if flown:  # a flight without yaw of its own keeps pointing east
         yaw, yaw_rate = np.nan_to_num(yaw), np.nan_to_num(yaw_rate)
     k, n = yaw.shape
-    states = given.state.swapaxes(1, 2).reshape(k, n, 12)
+    states = setpoints.state.swapaxes(1, 2).reshape(k, n, 12)
     every = np.concatenate([states, yaw[..., None], yaw_rate[..., None]], axis=2)
     bad = ~np.asarray(np.isfinite(every).all(axis=2))
     nothing = np.asarray(bad.all(axis=1))
@@ -195,7 +195,7 @@ def tracked(result: Result, *, flown: bool) -> tuple[Motion, bool]:
     kept = slice(first, last)
     if bad[kept].any():
         k, agent = np.argwhere(bad[kept])[0]
-        at = given.time[first + k]
+        at = setpoints.time[first + k]
         name = result.phases[result.phase[first + k]].name
         raise ResultError(
             f"the {which} of agent {agent + 1} has no number at {at:g} s (phase {name!r}). "
@@ -203,5 +203,5 @@ def tracked(result: Result, *, flown: bool) -> tuple[Motion, bool]:
         )
     if last - first < 2:
         raise ResultError(f"the {which} has one sample only. Fly the mission further.")
-    cut = Setpoints(given.time[kept], given.state[kept], yaw[kept], yaw_rate[kept])
-    return Motion(result, cut, flown), last - first < len(nothing)
+    cut = Setpoints(setpoints.time[kept], setpoints.state[kept], yaw[kept], yaw_rate[kept])
+    return ExportedMotion(result, cut, flown), last - first < len(nothing)

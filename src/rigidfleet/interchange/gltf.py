@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import with_headings
-from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, fit, headings
+from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve, heading_lines
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades, has_lights, lights, view
 from rigidfleet.typing import Floats, Ints
@@ -60,7 +60,7 @@ class _File:
         return len(self.accessors) - 1
 
 
-def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
+def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between.
 
     If the flight has lights, each vehicle shines in its own, seen by a camera in front.
@@ -72,11 +72,11 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
     }
     nodes, samplers, channels = [], [], []
     for agent, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
-        curve = fit(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
-        times, yaws = headings(curve)
+        curve = fit_curve(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
+        times, yaws = heading_lines(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
-            ("translation", curve.time, _spline(curve), "CUBICSPLINE"),
+            ("translation", curve.time, _spline_rows(curve), "CUBICSPLINE"),
             ("rotation", times, turned, "LINEAR"),
         ):
             keys = {"input": file.add(time, bounds=True), "output": file.add(values)}
@@ -94,7 +94,7 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
         "accessors": file.accessors,
     }
     if has_lights(motion.result):
-        _light(scene, file, motion)
+        _add_lights(scene, file, motion)
     scene["buffers"] = [{"byteLength": len(file.data)}]
     words = json.dumps(scene).encode()
     parts = [(_JSON, words + b" " * (-len(words) % 4)), (_BINARY, bytes(file.data))]
@@ -104,7 +104,7 @@ def write_gltf(motion: Motion, tolerance: float) -> Iterator[bytes]:
     )
 
 
-def _light(scene: dict[str, Any], file: _File, motion: Motion) -> None:
+def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> None:
     """Add lights and a camera to a scene: a material for each vehicle, whose emission changes.
 
     Programs without the extension show the last colour of each that is not black.
@@ -153,8 +153,8 @@ def read_gltf(data: bytes) -> list[Piecewise]:
         accessor = scene["accessors"][number]
         view = scene["bufferViews"][accessor["bufferView"]]
         each = {name: n for n, name in _TYPES.items()}[accessor["type"]]
-        found = np.frombuffer(binary, "<f4", accessor["count"] * each, view["byteOffset"])
-        return found.astype(float).reshape(-1, each)
+        numbers = np.frombuffer(binary, "<f4", accessor["count"] * each, view["byteOffset"])
+        return numbers.astype(float).reshape(-1, each)
 
     animation = scene["animations"][0]
     channels = [x for x in animation["channels"] if "node" in x["target"]]
@@ -172,7 +172,7 @@ def read_gltf(data: bytes) -> list[Piecewise]:
     return curves
 
 
-def _spline(curve: Piecewise) -> Floats:
+def _spline_rows(curve: Piecewise) -> Floats:
     """Rows (3 K, 3) of a cubic spline: for each key the velocity before, the position and the velocity after."""
     begin, end = (x[..., :3].swapaxes(0, 1) for x in curve.ends(2))
     rows = np.zeros((len(curve.time), 3, 3))

@@ -14,7 +14,7 @@ from rigidfleet.result.lights import Fade
 _END, _SET, _FADE, _FRAME = 0x00, 0x04, 0x08, 0.02
 
 
-def program(changes: list[Fade], agent: int, start: float, end: float) -> Iterator[int]:
+def light_program(changes: list[Fade], agent: int, start: float, end: float) -> Iterator[int]:
     """Bytes of the light program of one vehicle, from a time to another [s]."""
     last = round((end - start) / _FRAME)
     frames = [(round((c.begin - start) / _FRAME), round((c.end - start) / _FRAME)) for c in changes]
@@ -32,9 +32,9 @@ def program(changes: list[Fade], agent: int, start: float, end: float) -> Iterat
 
 def _varint(number: int) -> bytes:
     """A whole number from 0, seven bits to a byte, the lowest first; the eighth bit says that more follow."""
-    found = bytearray()
+    encoded = bytearray()
     while number > 0x7F:
-        found.append(number & 0x7F | 0x80)
+        encoded.append(number & 0x7F | 0x80)
         number >>= 7
-    found.append(number)
-    return bytes(found)
+    encoded.append(number)
+    return bytes(encoded)

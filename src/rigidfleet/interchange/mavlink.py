@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.foreign.curves import through
-from rigidfleet.interchange.curves import Motion
+from rigidfleet.foreign.curves import curve_through_states
+from rigidfleet.interchange.curves import ExportedMotion
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.setpoints import Setpoints, at_times
 from rigidfleet.typing import Floats
@@ -41,15 +41,15 @@ _MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
 _LOCAL_NED, _AUTOPILOT = 1, 1
 
 
-def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
+def write_tlog(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One log a vehicle: at each time the message that asks for position, velocity, acceleration, yaw and yaw rate.
 
     Vehicle i is system i (from 256 on, again from 1). Times are whole milliseconds since the start; states are those
     of these times. If the mission has a geodetic origin, the first message sets it. A vehicle that has landed for good
     is disarmed, and gets no more setpoints.
     """
-    given = _in_milliseconds(motion, rate)
-    every = np.round((given.time - motion.start) * 1e3).astype(np.int64)
+    setpoints = _in_milliseconds(motion, rate)
+    every = np.round((setpoints.time - motion.start) * 1e3).astype(np.int64)
     for agent in range(motion.n_agents):
         system = agent % _SYSTEMS + 1
         off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
@@ -62,9 +62,9 @@ def write_tlog(motion: Motion, rate: float | None) -> Iterator[bytes]:
         records["message"] = _TARGET
         fields = records["fields"]
         fields["time_boot_ms"] = milliseconds
-        fields["state"] = _ned(given.state[flies, :3, agent])
-        fields["yaw"] = (np.pi / 2 - given.yaw[flies, agent] + np.pi) % (2.0 * np.pi) - np.pi
-        fields["yaw_rate"] = -given.yaw_rate[flies, agent]
+        fields["state"] = _swap_enu_and_ned(setpoints.state[flies, :3, agent])
+        fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, agent] + np.pi) % (2.0 * np.pi) - np.pi
+        fields["yaw_rate"] = -setpoints.yaw_rate[flies, agent]
         fields["target_system"], fields["target_component"] = system, _AUTOPILOT
         fields["coordinate_frame"] = _LOCAL_NED
         covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
@@ -80,26 +80,26 @@ def read_tlog(data: bytes) -> list[Piecewise]:
         data = data[first:]
     records: Any = np.frombuffer(data, dtype=_RECORD, count=len(data) // _RECORD.itemsize)
     fields = records["fields"]
-    state = _ned(fields["state"].astype(float)).swapaxes(0, 1)
+    state = _swap_enu_and_ned(fields["state"].astype(float)).swapaxes(0, 1)
     yaw = np.stack(
         [np.unwrap(np.pi / 2 - fields["yaw"].astype(float)), -fields["yaw_rate"].astype(float)]
     )
-    return [through(fields["time_boot_ms"] / 1e3, state[:2], yaw)]
+    return [curve_through_states(fields["time_boot_ms"] / 1e3, state[:2], yaw)]
 
 
-def _in_milliseconds(motion: Motion, rate: float | None) -> Setpoints:
+def _in_milliseconds(motion: ExportedMotion, rate: float | None) -> Setpoints:
     """Setpoints at a rate [Hz], at times that are whole milliseconds after the start."""
-    given = motion.at_rate(rate)
-    wanted = np.unique(np.round((given.time - motion.start) * 1e3)) / 1e3 + motion.start
+    setpoints = motion.at_rate(rate)
+    wanted = np.unique(np.round((setpoints.time - motion.start) * 1e3)) / 1e3 + motion.start
     return at_times(motion.samples, np.minimum(wanted, motion.end))
 
 
-def _ned(x: Floats) -> Floats:
+def _swap_enu_and_ned(x: Floats) -> Floats:
     """Vectors (..., 3) in north, east, down from east, north, up, or back."""
     return np.stack([x[..., 1], x[..., 0], -x[..., 2]], axis=-1)
 
 
-def _origin_record(motion: Motion, system: int) -> bytes:
+def _origin_record(motion: ExportedMotion, system: int) -> bytes:
     if (origin := motion.result.mission.geodetic_origin) is None:
         return b""
     fields = _ORIGIN_FIELDS.pack(

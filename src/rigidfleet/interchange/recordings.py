@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rigidfleet.foreign.curves import through
-from rigidfleet.interchange.curves import Motion
+from rigidfleet.foreign.curves import curve_through_states
+from rigidfleet.interchange.curves import ExportedMotion
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
@@ -65,16 +65,16 @@ _CDR = b"\0\1\0\0"
 _BILLION = 1_000_000_000
 
 
-def write_mcap(motion: Motion, rate: float | None) -> Iterator[bytes]:
+def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One file: topics /agent_i/pose (PoseStamped) and /agent_i/twist (TwistStamped), in world axes, frame "map"."""
     from mcap.writer import Writer
 
-    given = motion.at_rate(rate)
+    setpoints = motion.at_rate(rate)
     n = motion.n_agents
-    poses = np.concatenate([given.state[:, 0], _quaternions(given.yaw)], axis=2)
-    turning = np.zeros((*given.yaw.shape, 3))
-    turning[..., 2] = given.yaw_rate
-    twists = np.concatenate([given.state[:, 1], turning], axis=2)
+    poses = np.concatenate([setpoints.state[:, 0], _quaternions(setpoints.yaw)], axis=2)
+    turning = np.zeros((*setpoints.yaw.shape, 3))
+    turning[..., 2] = setpoints.yaw_rate
+    twists = np.concatenate([setpoints.state[:, 1], turning], axis=2)
     buffer = io.BytesIO()
     writer = Writer(buffer)
     writer.start(profile="ros2", library="rigidfleet")
@@ -85,7 +85,7 @@ def write_mcap(motion: Motion, rate: float | None) -> Iterator[bytes]:
         channels.append(
             [writer.register_channel(f"/agent_{i + 1}/{kind}", "cdr", schema) for i in range(n)]
         )
-    for k, t in enumerate(given.time.tolist()):
+    for k, t in enumerate(setpoints.time.tolist()):
         at = round(t * _BILLION)
         start = _START.pack(_CDR, at // _BILLION, at % _BILLION, len(_FRAME), _FRAME)
         for ids, rows in zip(channels, (poses[k], twists[k]), strict=True):
@@ -99,35 +99,37 @@ def read_mcap(data: bytes) -> list[Piecewise]:
     """The ways in a file of `write_mcap`: cubics through its poses and twists."""
     from mcap.reader import make_reader
 
-    found: dict[str, list[Floats]] = {}
+    rows_of: dict[str, list[Floats]] = {}
     for _, channel, message in make_reader(io.BytesIO(data)).iter_messages():
         sec, nanosec = struct.unpack_from("<iI", message.data, 4)
         numbers = np.frombuffer(message.data, "<f8", offset=_START.size)
-        found.setdefault(channel.topic, []).append(np.append(sec + nanosec / _BILLION, numbers))
+        rows_of.setdefault(channel.topic, []).append(np.append(sec + nanosec / _BILLION, numbers))
     curves = []
-    for i in range(1, len(found) // 2 + 1):
-        pose, twist = (np.array(found[f"/agent_{i}/{kind}"]) for kind in ("pose", "twist"))
+    for i in range(1, len(rows_of) // 2 + 1):
+        pose, twist = (np.array(rows_of[f"/agent_{i}/{kind}"]) for kind in ("pose", "twist"))
         yaw = np.stack([_yaws(pose[:, 4:]), twist[:, 6]])
-        curves.append(through(pose[:, 0], np.stack([pose[:, 1:4], twist[:, 1:4]]), yaw))
+        curves.append(
+            curve_through_states(pose[:, 0], np.stack([pose[:, 1:4], twist[:, 1:4]]), yaw)
+        )
     return curves
 
 
-def write_rrd(motion: Motion, rate: float | None) -> Iterator[bytes]:
+def write_rrd(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One recording: a frame that moves for each vehicle, with a ball of its radius, on the timeline "time"."""
     import rerun as rr
 
-    given = motion.at_rate(rate)
+    setpoints = motion.at_rate(rate)
     recording = rr.RecordingStream("rigidfleet", recording_id=motion.result.mission.name)
     stream = recording.binary_stream()
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    times = rr.TimeColumn("time", duration=given.time)
-    quaternions = _quaternions(given.yaw)
+    times = rr.TimeColumn("time", duration=setpoints.time)
+    quaternions = _quaternions(setpoints.yaw)
     for i, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
         name = f"vehicles/{i + 1}"
         ball = rr.Points3D([[0.0, 0.0, 0.0]], radii=radius, labels=str(i + 1), show_labels=False)
         recording.log(name, ball, static=True)
         moved = rr.Transform3D.columns(
-            translation=given.state[:, 0, i], quaternion=quaternions[:, i]
+            translation=setpoints.state[:, 0, i], quaternion=quaternions[:, i]
         )
         recording.send_columns(name, [times], moved)
     recording.flush()
@@ -161,7 +163,7 @@ def read_rrd(data: bytes) -> list[Piecewise]:
     for number in sorted(curves):
         rows = np.concatenate(curves[number])
         rows = rows[rows[:, 0].argsort()]
-        ways.append(through(rows[:, 0], rows[None, :, 1:4], _yaws(rows[:, 4:])[None]))
+        ways.append(curve_through_states(rows[:, 0], rows[None, :, 1:4], _yaws(rows[:, 4:])[None]))
     return ways
 
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import YAW_TOLERANCE, Motion, fit, headings
-from rigidfleet.interchange.lights import program
+from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve, heading_lines
+from rigidfleet.interchange.lights import light_program
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades
 
@@ -32,7 +32,7 @@ _EAST = 90.0
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
+def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One show: for each drone its home, a way of cubic curves, its yaw and its light.
 
     Raises
@@ -46,22 +46,24 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
     changes = fades(motion.result)
     drones, files = [], {}
     for agent in range(motion.n_agents):
-        curve = fit(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
+        curve = fit_curve(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
-        points = _segments(curve)
+        points = _bezier_segments(curve)
         landing = min(
             round(float(motion.result.motors_off[agent]) - motion.start, 6), points[-1][0]
         )
         files[f"{folder}/trajectory.json"] = {
             "version": 1, "points": points, "takeoffTime": 0, "landingTime": landing
         }  # fmt: skip
-        times, yaws = headings(curve)
+        times, yaws = heading_lines(curve)
         clockwise = -np.degrees(yaws)
         clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
         setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
-        light = base64.b64encode(bytes(program(changes, agent, motion.start, motion.end))).decode()
+        light = base64.b64encode(
+            bytes(light_program(changes, agent, motion.start, motion.end))
+        ).decode()
         files[f"{folder}/lights.json"] = {"version": 1, "data": light}
         settings = {
             "name": name,
@@ -100,10 +102,10 @@ def write_skyc(motion: Motion, tolerance: float) -> Iterator[bytes]:
 
 def read_skyc(data: bytes) -> list[Piecewise]:
     """The ways in a show, from its time zero on. Yaw is on lines between its setpoints."""
-    return list(read_show(data, "skyc")[1])
+    return list(read_show(data).curves)
 
 
-def _segments(curve: Piecewise) -> list[list[Any]]:
+def _bezier_segments(curve: Piecewise) -> list[list[Any]]:
     """Time, end point and inner control points of each cubic piece, and of the start; numbers to a micrometre."""
     points = np.round(Piecewise(curve.time, curve.pieces[:, :3]).bernstein(), 6)
     times = np.round(curve.time, 6)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rigidfleet.interchange.curves import Motion
+from rigidfleet.interchange.curves import ExportedMotion
 from rigidfleet.setpoints import Setpoints, csv
 
 
-def write_table(motion: Motion, rate: float | None) -> Iterator[bytes]:
+def write_table(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One table with a row for each time and vehicle."""
     yield csv(motion.at_rate(rate)).encode()
 
 
-def write_tables(motion: Motion, rate: float | None) -> Iterator[bytes]:
+def write_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One table a vehicle, with the same columns."""
-    given = motion.at_rate(rate)
+    setpoints = motion.at_rate(rate)
     for i in range(motion.n_agents):
         only = slice(i, i + 1)
         part = Setpoints(
-            given.time, given.state[:, :, only], given.yaw[:, only], given.yaw_rate[:, only]
+            setpoints.time,
+            setpoints.state[:, :, only],
+            setpoints.yaw[:, only],
+            setpoints.yaw_rate[:, only],
         )
         yield csv(part, first=i + 1).encode()

@@ -74,17 +74,17 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
         rows, colours, notes = named.read(content, str(path.parent / name))
-        told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
+        origin = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         if notes:
-            told += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
-        digests.append(f"# {named.where}: {told}\n")
+            origin += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
+        digests.append(f"# {named.where}: {origin}\n")
         del named.table[named.key]
         if named.becomes == "trajectories":
             named.table.pop("units", None), named.table.pop("axes", None)
         named.table[named.becomes] = rows
         written = "".join(f"  {row!r},\n" for row in rows)
         line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
-        put = f"# {told}\n{named.becomes} = [\n{written}]"
+        put = f"# {origin}\n{named.becomes} = [\n{written}]"
         if colours is not None and named.becomes == "slots" and "colour" not in named.table:
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"
@@ -126,10 +126,10 @@ def _names(path: Path, named: _Named) -> list[str]:
     found = _inside(path, named.where, name)
     if not named.folder or not found.is_dir():
         return [name]
-    from rigidfleet.foreign.files import files_of
+    from rigidfleet.foreign.files import groups_of_files
 
     try:
-        inside = [file for group in files_of(found) for file in group]
+        inside = [file for group in groups_of_files(found) for file in group]
     except TrajectoryError as error:
         raise _unread(str(path), named.where, error) from None
     return [str(Path(name) / file.relative_to(found)) for file in inside]
@@ -198,7 +198,7 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
     from rigidfleet.foreign.columns import Doubt
-    from rigidfleet.foreign.curves import curve_to_rows, least_jerk
+    from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
     from rigidfleet.foreign.files import read_trajectories
     from rigidfleet.foreign.samples import ASSUMED
 
@@ -216,7 +216,7 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     if read.assumed in ASSUMED.values():
         if any((c.time[[0, -1]] != (begin, end)).any() for c in curves):
             notes.append(f"only the time of which all have data is flown, {begin:g} to {end:g} s")
-        curves = [least_jerk(c.between(begin, end)) for c in curves]
+        curves = [least_jerk_curve(c.between(begin, end)) for c in curves]
     else:
         begin = min(c.time[0] for c in curves)
         curves = [c.on(np.union1d(begin, c.time), stays=True) for c in curves]

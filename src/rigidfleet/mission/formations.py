@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry, graphs, shapes
-from rigidfleet.formation.rest import beside
+from rigidfleet.formation.rest import places_beside
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
@@ -86,7 +86,7 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
     """A formation has slots or distances for all agents, and nothing without effect."""
     path, n = ("formations", name), m.n
     if n is not None and (form.rest is not None or form.agents is not None):
-        m.formations[name] = form = yield from _rested(m, form, n, path)
+        m.formations[name] = form = yield from _with_rest(m, form, n, path)
     right = m.right(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
         yield Breach("slots", "a shape has its own slots", "give either shape and size or slots")
@@ -131,7 +131,7 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
             yield Breach("dimension", problem, "use 3, or move the slots into a plane")
 
 
-def _rested(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
+def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, None, Formation]:
     """A formation of fewer than n agents gets slots for all: those that rest come last."""
     slots = form.slots
     if form.agents is not None:
@@ -169,7 +169,7 @@ def _rested(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breach, 
         yield Breach("rest", "needs two or more slots", "give the places as a list of points")
         return form
     else:
-        places = tuple(map(tuple, beside(slots, waiting).tolist()))
+        places = tuple(map(tuple, places_beside(slots, waiting).tolist()))
     colour = form.colour
     if colour is not None:
         lit = (colour,) * len(slots) if isinstance(colour, str) else colour
@@ -238,7 +238,7 @@ def _graph(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
             yield Breach("reach", problem, remedy, form.reach)
         return
     try:
-        graphs.spans_space(slots)
+        graphs.refuse_flat_shapes(slots)
     except ValueError as error:
         yield Breach("edges", str(error), "use 'neighbours' or give a list of pairs")
 
@@ -254,7 +254,7 @@ def _distances(form: Formation, lengths: Sequence[float], n: int) -> Breaches:
     # The common neighbours of both ends of an edge are at most the neighbours of either end.
     degree = np.bincount(edges.ravel(), minlength=n)
     cliques = (degree[edges].min(axis=1, initial=n).astype(float) ** 2).sum()
-    violations = distance_geometry.unrealisable(edges, lengths) if cliques < _MOST_CLIQUES else []
+    violations = distance_geometry.violations(edges, lengths) if cliques < _MOST_CLIQUES else []
     between = "" if n < 10 else "-"
     names = [
         f"d{between.join(str(i + 1) for i in e)} = {d:g}"

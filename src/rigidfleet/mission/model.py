@@ -15,13 +15,13 @@ from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
-from rigidfleet.formation.assignment import assigned, squashed
+from rigidfleet.formation.assignment import assign_slots, downwash_metric
 from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission.changes import scaled, told_apart
+from rigidfleet.mission.changes import with_own_names, with_scales
 from rigidfleet.mission.check import check, defaults
 from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.files import digests
@@ -129,9 +129,11 @@ class Mission(Contents, Shown):
         """
         parts = check(data, origin)
         if parts["assignment"] == "each":
-            parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+            parts["formations"], parts["phases"] = with_own_names(
+                parts["formations"], parts["phases"]
+            )
         n = len(parts["agents"].position)
-        parts["formations"] = scaled(parts["formations"], parts["phases"], n)
+        parts["formations"] = with_scales(parts["formations"], parts["phases"], n)
         mission = cls.model_construct(set(parts), **defaults() | parts)
         mission._data, mission._text, mission._origin = data, text, origin
         return mission
@@ -317,8 +319,8 @@ class Mission(Contents, Shown):
                 radius = self.agents.radius if self.assignment == "safe" else None
                 metric = None
                 if self.assignment_downwash > 1.0 and axes is not None:
-                    metric = squashed(up, self.assignment_downwash)
-                order, turn = assigned(places, slots, turn=axes, radius=radius, metric=metric)
+                    metric = downwash_metric(up, self.assignment_downwash)
+                order, turn = assign_slots(places, slots, turn=axes, radius=radius, metric=metric)
                 if self.assignment != "each":
                     return dict.fromkeys(self.formations, order), {(before, name): turn}
                 orders[name] = order

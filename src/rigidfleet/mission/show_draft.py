@@ -11,9 +11,9 @@ import numpy as np
 
 from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
-from rigidfleet.formation.assignment import assigned
+from rigidfleet.formation.assignment import assign_slots
 from rigidfleet.formation.point_files import Points
-from rigidfleet.formation.rest import beside
+from rigidfleet.formation.rest import places_beside
 from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
@@ -92,7 +92,7 @@ def _rested(one: Scene, agents: int) -> Scene:
     waiting = agents - len(one.slots)
     if waiting < 1:
         return one
-    slots = np.concatenate([one.slots, beside(one.slots, waiting)])
+    slots = np.concatenate([one.slots, places_beside(one.slots, waiting)])
     told = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
     return Scene(one.name, slots, one.table + told)
 
@@ -104,7 +104,7 @@ def show(
     """Return the TOML text of a show: from a grid through the scenes, and back.
 
     Slots are assigned anew at each change, with the least squares of all ways, so that two agents come no nearer than
-    the spacing over sqrt(2) (`rigidfleet.formation.assignment.assigned`).
+    the spacing over sqrt(2) (`rigidfleet.formation.assignment.assign_slots`).
 
     Raises
     ------
@@ -144,7 +144,7 @@ def show(
     places, lasts, phases, taken = pads.slots, 2.0 * climb, [], set[str]()
     for k, one in enumerate([*scenes, pads]):
         slots = one.slots - one.slots.mean(axis=0)
-        slots = slots[assigned(places, slots, turn=np.eye(3)).order]
+        slots = slots[assign_slots(places, slots, turn=np.eye(3)).order]
         blend = max(4, blend_time(float(np.linalg.norm(slots - places, axis=1).max())))
         title = one.name if one.name not in taken else f"{one.name}, phase {k + 2}"
         shown = _SHOWN if one is not pads else _SETTLED

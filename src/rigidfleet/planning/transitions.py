@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.progress import report
-from rigidfleet.formation.assignment import closest_approach, nearer_than
+from rigidfleet.formation.assignment import closest_approach, pairs_nearer_than
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
@@ -269,7 +269,7 @@ def _stops(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _level_of(nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
+    level = height * _level_of(pairs_nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):

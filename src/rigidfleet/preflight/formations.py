@@ -27,8 +27,8 @@ from rigidfleet.rigidity import (
     realisations,
     spectrum,
 )
-from rigidfleet.rigidity.analysis import WHERE, flattened
-from rigidfleet.rigidity.realisations import lead
+from rigidfleet.rigidity.analysis import WHERE, flatten
+from rigidfleet.rigidity.realisations import positions_led_to
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
@@ -97,7 +97,7 @@ def _formation(
         start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
         if held == "distances" and max(start, _spanned(slots)) == 2:
             space = 2  # which they do not leave
-        points = flattened(slots, space)[0]
+        points = flatten(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
@@ -248,7 +248,7 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]
             pairs = complete_graph(len(r))
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-            led = None if torn else lead(r, edges, lengths, 1e-6 * apart.min(), slots)
+            led = None if torn else positions_led_to(r, edges, lengths, 1e-6 * apart.min(), slots)
             most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
             most *= mission.formations[name].greatest_error(apart.min())
             off, before = np.inf, out.get(name, (0, 0.0))
@@ -291,7 +291,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     first, by = mission.phases[0].establishing, None
     if first is not None and first.formation == f.name:
         by = reference_kind(mission, first, start, slots)
-    end = None if others.leads_to is None else others.found[others.leads_to].kind
+    end = None if others.leads_to is None else others.shapes[others.leads_to].kind
     if by == "shape" and slots is not None and _flattens(start, slots):
         yield _note(
             f"the agents start with the handedness of the mirror image of '{f.name}' and must pass through a plane,"
@@ -302,8 +302,8 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
             f"from the start positions, the distances of '{f.name}' lead to another shape ({end})"
         )
     elif not others.unique:
-        rest = [r for r in others.found if r.kind not in (Kind.SAME, Kind.MIRRORED)]
-        n, share, bent = len(rest), sum(r.found for r in rest), sum(r.bends for r in others.found)
+        rest = [r for r in others.shapes if r.kind not in (Kind.SAME, Kind.MIRRORED)]
+        n, share, bent = len(rest), sum(r.starts for r in rest), sum(r.bends for r in others.shapes)
         families = f", {bent} as a family that bends" * (bent > 0)
         what = "1 other shape has" if n == 1 else f"{n} other shapes have"
         yield _note(

@@ -45,7 +45,7 @@ def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
-    part = Preflight(found.formations, found.gains, [planned_phase(x, most) for x in way])
+    part = Preflight(mission, found.formations, found.gains, [planned_phase(x, most) for x in way])
     judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
     for judge in judges:
         yield from judge(mission, part)

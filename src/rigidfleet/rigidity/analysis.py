@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.rigidity.framework import Flex, Framework, localised
+from rigidfleet.rigidity.framework import Flex, Framework, localised_flexes
 from rigidfleet.rigidity.order import StressEnergy, blocking_stress, finite_flex
 from rigidfleet.typing import Floats, Ints
 
@@ -160,16 +160,16 @@ def analyse(
         An edge names an agent that does not exist, joins an agent to itself or two agents at the same place, or
         occurs twice; a slot is not finite; the shape does not fit into the space; or a mass is not positive.
     """
-    p, e = checked(slots, edges)
+    p, e = as_framework(slots, edges)
     n, d = len(p), distance_geometry.dimension(p)
     space = dimension if space is None else space
-    flat, axes = flattened(p, space)
+    flat, axes = flatten(p, space)
     frame = Framework(flat, e)
     within = analyse(flat[:, :d], e, dimension=d, masses=masses) if 0 < d < space else None
-    motions = localised(frame)
+    motions = localised_flexes(frame)
     to_world = axes[:space]
     flexes = tuple(Flex(agents, motion @ to_world) for agents, motion in motions)
-    rigidity_class, reason, stress, bent = judge(frame, within)
+    rigidity_class, reason, stress, bent = classify(frame, within)
     return Rigidity(
         agents=n,
         edges=e,
@@ -181,7 +181,7 @@ def analyse(
         redundant=frame.redundant(),
         spare=frame.spare(),
         flexes=flexes,
-        index=_index(frame, masses),
+        index=_rigidity_index(frame, masses),
         rigidity_class=rigidity_class,
         reason=reason,
         stress=stress,
@@ -196,7 +196,7 @@ def full_rank(n: int, d: int) -> int:
     return n * d - d * (d + 1) // 2
 
 
-def checked(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
+def as_framework(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
     """Slots (N, 3) and edges (m, 2) as arrays; a ValueError if they are no framework."""
     p = np.asarray(slots, dtype=np.float64)
     if p.ndim != 2 or not len(p) or not 1 <= p.shape[1] <= 3:
@@ -223,7 +223,7 @@ def checked(slots: ArrayLike, edges: ArrayLike) -> tuple[Floats, Ints]:
     return p, e
 
 
-def flattened(p: Floats, space: int) -> tuple[Floats, Floats]:
+def flatten(p: Floats, space: int) -> tuple[Floats, Floats]:
     """Points (N, space) about their centre, exactly flat, in axes (3, 3) of which those of the shape come first.
 
     Raises
@@ -241,20 +241,20 @@ def flattened(p: Floats, space: int) -> tuple[Floats, Floats]:
     return np.pad(x @ axes[:d].T, [(0, 0), (0, space - d)]), axes
 
 
-def _index(frame: Framework, masses: ArrayLike | None) -> float:
+def _rigidity_index(frame: Framework, masses: ArrayLike | None) -> float:
     if masses is None:
         return float(frame.s[-1]) if frame.rank else np.nan
     m = np.asarray(masses, dtype=np.float64)
     if m.shape != (len(frame.p),) or not (m > 0).all() or not np.isfinite(m).all():
         raise ValueError(f"masses must be {len(frame.p)} numbers > 0 [kg]")
     if not frame.rank or (m == m[0]).all():
-        return _index(frame, None)
+        return _rigidity_index(frame, None)
     J = jacobian(frame.p, frame.edges)
     weighted = J * np.repeat(np.sqrt(m.mean() / m), frame.p.shape[1])
     return float(np.linalg.svd(weighted, compute_uv=False)[frame.rank - 1])
 
 
-def judge(
+def classify(
     frame: Framework, within: Rigidity | None = None
 ) -> tuple[RigidityClass, str, Floats | None, Floats | None]:
     """Class, reason, blocking stress, deformed shape."""
@@ -274,21 +274,23 @@ def judge(
         )
     if frame.rank == _generic_rank(frame):
         reason = (
-            f"{_count(k, 'motion')} free, and {frame.rank} is the greatest rank that these edges have at any "
+            f"{_count_in_words(k, 'motion')} free, and {frame.rank} is the greatest rank that these edges have at any "
             "positions, so the motion is finite (Asimow and Roth)"
         )
         return RigidityClass.FLEXIBLE, reason, None, None
     energy = StressEnergy(frame)
     stress, open_flexes, none_exists = blocking_stress(energy)
     if stress is not None:
-        reason = f"{_count(k, 'motion')} free to first order; a self-stress blocks all of them"
+        reason = (
+            f"{_count_in_words(k, 'motion')} free to first order; a self-stress blocks all of them"
+        )
         return RigidityClass.PRESTRESS_STABLE, reason, stress, None
     bent, goes_on = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
         reason = "a finite motion that keeps all distances was found and followed"
         return RigidityClass.FLEXIBLE, reason, None, bent
     reason = (
-        f"{_count(k, 'motion')} free to first order; "
+        f"{_count_in_words(k, 'motion')} free to first order; "
         + ("no self-stress blocks all of them" if none_exists else "no blocking stress was found")
         + (
             "; one extends to second order, but could not be followed further"
@@ -299,7 +301,7 @@ def judge(
     return RigidityClass.UNDECIDED, reason, None, None
 
 
-def _count(k: int, what: str) -> str:
+def _count_in_words(k: int, what: str) -> str:
     return f"{k} {what}{'s' * (k != 1)}"
 
 

@@ -68,7 +68,7 @@ def design(
         Two slots coincide; or no edges within range hold the shape (the message gives a sufficient range).
     """
     p = numbers("slots [m]", slots)
-    flat = _flat(p)
+    flat = _in_own_axes(p)
     n, d = flat.shape
     edges = complete_graph(n)
     length = distances(p, edges)
@@ -84,28 +84,28 @@ def design(
     rank = full_rank(n, d)
     if rank == 0:
         return near if extra == "complete" else near[:0]
-    rows = _rows(flat, edges)
+    rows = _rows_of_jacobian(flat, edges)
     _assert_holds(rows, length, reach, rank)
     wanted = len(near) if extra == "complete" else min(rank + extra, len(near))
     if wanted == len(near):
         return near
     rows = rows[length <= reach]
-    meshes = [np.arange(len(near)), *_meshes(flat, near)]
-    starts = [_grown(rows, _thin(rows, some, wanted), wanted) for some in meshes]
-    chosen = max(starts, key=lambda some: _least(rows[some]))
+    meshes = [np.arange(len(near)), *_edges_of_meshes(flat, near)]
+    starts = [_grow(rows, _thin(rows, some, wanted), wanted) for some in meshes]
+    chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
-    best, best_w = chosen, _least(rows[chosen])
+    best, best_w = chosen, _least_eigenvalue(rows[chosen])
     work, idle = 0.0, 0
     while True:
         chosen, used = _exchange(rows, chosen)
-        w = _least(rows[chosen])
+        w = _least_eigenvalue(rows[chosen])
         idle += 1
         if w > best_w * (1 + 1e-9):
             best, best_w, idle = chosen, w, 0
         work += used
         if work + used > _WORK or idle == _PATIENCE:
             return near[np.sort(best)]
-        chosen = _perturbed(rows, best, rng)
+        chosen = _perturb(rows, best, rng)
 
 
 def limits(slots: ArrayLike) -> str:
@@ -156,7 +156,7 @@ def mission_fragment(
     return "\n".join([*lines, "]", ""])
 
 
-def _flat(p: Floats) -> Floats:
+def _in_own_axes(p: Floats) -> Floats:
     """Points (N, d) in axes of the shape's own dimension d."""
     if p.ndim != 2 or p.shape[1] != 3 or not len(p) or not np.isfinite(p).all():
         raise ValueError(f"slots must be (N, 3) finite numbers [m] with N >= 1, not {p.shape}")
@@ -165,7 +165,7 @@ def _flat(p: Floats) -> Floats:
     return x if d == 3 else x @ np.linalg.svd(x)[2][:d].T
 
 
-def _rows(flat: Floats, edges: Ints) -> Floats:
+def _rows_of_jacobian(flat: Floats, edges: Ints) -> Floats:
     """Rows of J (m, r) in coordinates of the non-rigid motions."""
     n, d = flat.shape
     rigid = rigid_motions(flat)
@@ -176,7 +176,7 @@ def _rows(flat: Floats, edges: Ints) -> Floats:
     return np.einsum("md,mdr->mr", u[at, i], rest[i] - rest[j])
 
 
-def _least(rows: Floats) -> float:
+def _least_eigenvalue(rows: Floats) -> float:
     """Smallest eigenvalue of the sum of a a^T over rows a (m, r)."""
     if len(rows) < rows.shape[1]:
         return 0.0
@@ -184,31 +184,33 @@ def _least(rows: Floats) -> float:
 
 
 def _assert_holds(rows: Floats, length: Floats, reach: float, rank: int) -> None:
-    def reached(r: float) -> int:
+    def rank_within(r: float) -> int:
         within = rows[length <= r]
         return int(np.linalg.matrix_rank(within.T @ within, tol=1e-10)) if len(within) else 0
 
-    got = reached(reach)
+    got = rank_within(reach)
     if got == rank:
         return
     steps = np.unique(np.round(length, 9))
     low, high = -1, len(steps) - 1
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (low, middle) if reached(steps[middle] * (1 + 1e-8)) == rank else (middle, high)
+        low, high = (
+            (low, middle) if rank_within(steps[middle] * (1 + 1e-8)) == rank else (middle, high)
+        )
     raise ValueError(
         f"a sensing range of {reach:.6g} m gives only {got} of the {rank} independent edges that "
         f"hold this shape; {steps[high]:.6g} m is enough"
     )
 
 
-def _meshes(flat: Floats, near: Ints) -> list[Ints]:
+def _edges_of_meshes(flat: Floats, near: Ints) -> list[Ints]:
     """The edges, as indices into `near`, of Delaunay's triangulation and of the convex hull of points (N, d)."""
     from scipy.spatial import ConvexHull, Delaunay, QhullError
 
     if flat.shape[1] < 2:
         return []
-    found = []
+    meshes = []
     number = {tuple(edge): k for k, edge in enumerate(near.tolist())}
     for mesh in (Delaunay, ConvexHull):
         try:
@@ -216,8 +218,8 @@ def _meshes(flat: Floats, near: Ints) -> list[Ints]:
         except QhullError:
             continue
         pairs = {pair for cell in cells for pair in combinations(sorted(cell), 2)}
-        found.append(np.array(sorted(number[p] for p in pairs if p in number), dtype=np.int64))
-    return found
+        meshes.append(np.array(sorted(number[p] for p in pairs if p in number), dtype=np.int64))
+    return meshes
 
 
 def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
@@ -225,7 +227,7 @@ def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
 
     Without row a, tr M^-1 grows by |M^-1 a|^2 / (1 - a^T M^-1 a).
     """
-    if len(chosen) <= wanted or _least(rows[chosen]) < _SINGULAR:
+    if len(chosen) <= wanted or _least_eigenvalue(rows[chosen]) < _SINGULAR:
         return chosen[:wanted]
     share = 0.1
     while (surplus := len(chosen) - wanted) > 0:
@@ -236,19 +238,19 @@ def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
         loss = np.where(left > 1e-9, (GA**2).sum(axis=1) / np.maximum(left, 1e-9), np.inf)
         drop = max(1, int(share * surplus))
         keep = np.sort(np.argsort(loss, kind="stable")[drop:])
-        if drop > 1 and _least(A[keep]) < 1e-3 * _least(A):
+        if drop > 1 and _least_eigenvalue(A[keep]) < 1e-3 * _least_eigenvalue(A):
             share /= 2  # rank lost: remove fewer at a time
             continue
         chosen = chosen[keep]
     return chosen
 
 
-def _grown(rows: Floats, chosen: Ints, wanted: int) -> Ints:
+def _grow(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     """The chosen rows and the most useful of the others, (wanted,); arbitrary others if the chosen rows lack rank."""
     while len(chosen) < wanted:
         A = rows[chosen]
         other = np.setdiff1d(np.arange(len(rows)), chosen)
-        w = _least(A)
+        w = _least_eigenvalue(A)
         if w < _SINGULAR:
             return np.append(chosen, other[: wanted - len(chosen)])
         BG = rows[other] @ np.linalg.inv(A.T @ A - 0.5 * w * np.eye(A.shape[1]))
@@ -264,7 +266,7 @@ def _exchange(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
     for barrier in _BARRIERS:
         for _ in range(4 * r):
             work += 0.1 * m * r**2 + 2.0 * r**3 + 5e5
-            swap = _best_swap(rows, chosen, barrier * _least(rows[chosen]))
+            swap = _best_swap(rows, chosen, barrier * _least_eigenvalue(rows[chosen]))
             if swap is None or work > _WORK:
                 break
             chosen = np.append(np.delete(chosen, swap[0]), swap[1])
@@ -298,7 +300,7 @@ def _best_swap(rows: Floats, chosen: Ints, t: float) -> tuple[int, int] | None:
     return int(a), int(other[b])
 
 
-def _perturbed(rows: Floats, chosen: Ints, rng: np.random.Generator) -> Ints:
+def _perturb(rows: Floats, chosen: Ints, rng: np.random.Generator) -> Ints:
     """The design with some edges exchanged at random."""
     m, wanted = len(rows), len(chosen)
     other = np.setdiff1d(np.arange(m), chosen)
@@ -312,7 +314,7 @@ def _perturbed(rows: Floats, chosen: Ints, rng: np.random.Generator) -> Ints:
         if gone == add:
             break
         keep[k] = False
-        if _least(rows[some[keep]]) < _SINGULAR:
+        if _least_eigenvalue(rows[some[keep]]) < _SINGULAR:
             keep[k] = True
         else:
             gone += 1

@@ -117,11 +117,11 @@ class Framework:
         # Pivoting takes the largest remainder, so weights make short edges come first. The pivots still span the
         # range, since each is independent of those before.
         weight = self.lengths.min() / self.lengths
-        kept = _independent(weight[:, None] * self.span)
+        kept = _independent_rows(weight[:, None] * self.span)
         return np.setdiff1d(np.arange(len(self.edges)), kept)
 
 
-def _independent(rows: Floats) -> Ints:
+def _independent_rows(rows: Floats) -> Ints:
     """Indices (k,) of k independent rows of ``rows`` (., k), which has full rank; large rows first.
 
     QR with column pivoting: each is the row with the largest part outside the span of those before.
@@ -145,7 +145,7 @@ def _independent(rows: Floats) -> Ints:
     return kept
 
 
-def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
+def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
     """A basis of the flexes, each moving few agents: [(agents, motion (N, d))], fewest first.
 
     A flex plus any rigid motion is the same flex, so which agents are at rest is a choice. Candidates are the motions
@@ -159,18 +159,18 @@ def localised(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
     if k == 0:
         return []
     basis = _Basis(F)
-    for motion in _single(frame):
+    for motion in _motions_of_single_agents(frame):
         basis.add(motion)
     if basis.rank < k:
-        found = sparse(F, frame.rigid, n)
-        for motion in sorted(found, key=lambda f: int(np.count_nonzero(f.any(axis=1)))):
+        motions = sparse_flexes(F, frame.rigid, n)
+        for motion in sorted(motions, key=lambda f: int(np.count_nonzero(f.any(axis=1)))):
             basis.add(motion)
     for motion in F.T:
         basis.add(motion.reshape(n, d))
-    return _apart(basis.chosen)
+    return _without_common_parts(basis.chosen)
 
 
-def _apart(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
+def _without_common_parts(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
     """Motions (N, d) with their moving agents, fewest first, without parts that fewer agents already have."""
     out: list[tuple[tuple[int, ...], Floats]] = []
     for motion in sorted(motions, key=lambda f: int(np.count_nonzero(np.any(f, axis=1)))):
@@ -207,22 +207,22 @@ class _Basis:
             self.chosen.append(motion / np.linalg.norm(motion, axis=1).max())
 
 
-def _single(frame: Framework) -> list[Floats]:
+def _motions_of_single_agents(frame: Framework) -> list[Floats]:
     """Motions of one agent that all its edges leave free; agents with few edges come first."""
     n, d = frame.p.shape
     J = jacobian(frame.p, frame.edges).reshape(-1, n, d)
     degree = np.bincount(frame.edges.ravel(), minlength=n)
-    found = []
+    motions = []
     for i in np.argsort(degree, kind="stable"):
         _, s, vt = np.linalg.svd(J[(frame.edges == i).any(axis=1), i], full_matrices=True)
         for direction in vt[np.count_nonzero(s > ZERO) :]:
             motion = np.zeros((n, d))
             motion[i] = direction
-            found.append(motion)
-    return found
+            motions.append(motion)
+    return motions
 
 
-def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
+def sparse_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:
     """Flexes (N, d) that move few agents: for each agent, the one with the least sum of speeds in which it moves.
 
     It moves in the direction in which flexes can move it most; if there are several, in each of them.
@@ -238,14 +238,14 @@ def sparse(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[F
     # Reweighting costs N d k^2 per step; with many agents and flexes, some are skipped to stay below a second.
     most = min(most, max(8, int(1.5e9 / (20.0 * V.shape[0] * V.shape[1] ** 2))))
     seeds = np.flatnonzero(strength[:, 0] > _STILL)
-    found = []
+    motions = []
     for i in seeds[:: max(1, -(-len(seeds) // most))]:
-        for way in _along_axes(part[i][:, strength[i] > (1.0 - _ALIKE) * strength[i, 0]]):
-            found.append(_cleaned(_of_least_speed(way @ blocks[i], V, n), V))
-    return found
+        for way in _basis_near_axes(part[i][:, strength[i] > (1.0 - _ALIKE) * strength[i, 0]]):
+            motions.append(_put_to_rest(_motion_of_least_speed(way @ blocks[i], V, n), V))
+    return motions
 
 
-def _of_least_speed(c: Floats, V: Floats, n: int) -> Floats:
+def _motion_of_least_speed(c: Floats, V: Floats, n: int) -> Floats:
     """The motion V a (n, d) with c a = 1 whose sum of speeds is least, by iteratively reweighted least squares."""
     speed = np.ones(n)
     for sharp in np.logspace(0, -7, 20):
@@ -256,7 +256,7 @@ def _of_least_speed(c: Floats, V: Floats, n: int) -> Floats:
     return motion
 
 
-def _along_axes(U: Floats) -> list[Floats]:
+def _basis_near_axes(U: Floats) -> list[Floats]:
     """A basis of the span of U (d, k), orthonormal, as near to the axes as it can be: the same on any machine."""
     rest, basis = U @ U.T, []
     for _ in range(U.shape[1]):
@@ -268,7 +268,7 @@ def _along_axes(U: Floats) -> list[Floats]:
     return basis
 
 
-def _cleaned(motion: Floats, V: Floats) -> Floats:
+def _put_to_rest(motion: Floats, V: Floats) -> Floats:
     """The nearest motion in the span of V in which nearly resting agents are at rest."""
     n = len(motion)
     speed = np.linalg.norm(motion, axis=1)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.rigidity.framework import Framework, sparse
+from rigidfleet.rigidity.framework import Framework, sparse_flexes
 from rigidfleet.typing import Floats, Ints
 
 #: A stress blocks all flexes if its least energy exceeds this share of its greatest energy.
@@ -52,7 +52,7 @@ class StressEnergy:
         """Nearest self-stress to forces z (m,)."""
         return z - self.frame.span @ (self.frame.span.T @ z)
 
-    def form(self, force: Floats) -> Floats:
+    def matrix(self, force: Floats) -> Floats:
         """Matrix E (k, k) of a self-stress (m,): energy q^T E q of the flex with coordinates q."""
         omega = np.zeros((self.n, self.n))
         np.add.at(omega, (self._i, self._j), -force / self._length)
@@ -67,12 +67,12 @@ class StressEnergy:
         reach = diagonal[self._i] + diagonal[self._j] - 2 * G[self._i, self._j]
         return self.stress(reach / self._length)
 
-    def left_over(self, q: Floats) -> Floats:
+    def residual(self, q: Floats) -> Floats:
         """Residual (m,) that stops a flex with coordinates q at second order; 0 if nothing stops it."""
         return self.adjoint(np.outer(q, q))
 
-    def left_over_rate(self, q: Floats) -> Floats:
-        """Derivative (m, k) of `left_over`."""
+    def residual_rate(self, q: Floats) -> Floats:
+        """Derivative (m, k) of `residual`."""
         step = self._F[:, self._i] - self._F[:, self._j]
         rate = 2 * np.einsum("qm,qmk->mk", step @ q, step) / self._length[:, None]
         return rate - self.frame.span @ (self.frame.span.T @ rate)
@@ -96,12 +96,12 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     if frame.stresses == 0:
         return None, np.eye(energy.k), True
     if frame.stresses > 1:
-        return _search(energy)
+        return _search_blocking_stress(energy)
     z = np.zeros(len(frame.edges))
     z[(frame.span**2).sum(axis=1).argmin()] = 1
     force = energy.stress(z)
     force /= np.abs(force).max()
-    value, vector = np.linalg.eigh(energy.form(force))
+    value, vector = np.linalg.eigh(energy.matrix(force))
     if value.sum() < 0:
         force, value, vector = -force, -value[::-1], vector[:, ::-1]
     small = _DEFINITE * max(value[-1], 1.0)
@@ -110,17 +110,17 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     return None, vector[:, value < small] if value[0] > -small else vector, True
 
 
-def _search(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
+def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     from scipy.optimize import minimize
 
     unit = np.eye(energy.k)
-    found: list[Floats] = []
+    blocking: list[Floats] = []
 
     def lack(z: Floats) -> tuple[float, Floats]:
         force = energy.stress(z)
-        value, vector = np.linalg.eigh(unit - energy.form(force))
+        value, vector = np.linalg.eigh(unit - energy.matrix(force))
         if value[-1] < 0.9 and 1 - value[-1] > _DEFINITE * (1 - value[0]):
-            found.append(force)
+            blocking.append(force)
             raise StopIteration
         Y = (vector * np.maximum(value, 0)) @ vector.T
         return 0.5 * float((Y**2).sum()), -energy.adjoint(Y)
@@ -133,8 +133,8 @@ def _search(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     try:
         best = minimize(lack, start, jac=True, method="L-BFGS-B", options=options)
     except StopIteration:
-        return found[-1] / np.abs(found[-1]).max(), unit[:, :0], False
-    value, vector = np.linalg.eigh(unit - energy.form(energy.stress(best.x)))
+        return blocking[-1] / np.abs(blocking[-1]).max(), unit[:, :0], False
+    value, vector = np.linalg.eigh(unit - energy.matrix(energy.stress(best.x)))
     Y = (vector * np.maximum(value, 0)) @ vector.T
     proven = bool(np.linalg.norm(energy.adjoint(Y)) < 1e-4 * np.linalg.norm(Y))
     return None, vector[:, value > 1e-3], proven
@@ -150,38 +150,38 @@ def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[F
     frame = energy.frame
     if energy.k == 0:
         return None, False  # a stress nearly blocks every flex
-    few = sparse(energy.flexes, frame.rigid, energy.n, starts)
+    few = sparse_flexes(energy.flexes, frame.rigid, energy.n, starts)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
     candidates += list(np.random.default_rng(seed).normal(size=(starts, energy.k)))
     goes_on = False
     for q in candidates:
-        flex = _second_order(energy, q)
+        flex = _extend_to_second_order(energy, q)
         if flex is None:
             continue
         goes_on = True
         for way in (flex, -flex):
-            bent = _follow(frame, (energy.flexes @ way).reshape(frame.p.shape))
+            bent = _follow_flex(frame, (energy.flexes @ way).reshape(frame.p.shape))
             if bent is not None:
                 return bent, True
     return None, goes_on
 
 
-def _second_order(energy: StressEnergy, q: Floats) -> Floats | None:
+def _extend_to_second_order(energy: StressEnergy, q: Floats) -> Floats | None:
     """A flex (k,) near q that extends to second order, by Gauss-Newton on the unit sphere."""
     q = q / max(np.linalg.norm(q), 1e-9)
     for _ in range(40):
-        rest = energy.left_over(q)
+        rest = energy.residual(q)
         if np.linalg.norm(rest) < 1e-11:
             break
-        rate = energy.left_over_rate(q)
+        rate = energy.residual_rate(q)
         rate -= np.outer(rate @ q, q)
         damping = 0.3 * np.linalg.norm(rest) * np.eye(energy.k)
         q = q - np.linalg.solve(rate.T @ rate + damping, rate.T @ rest)
         q = q / np.linalg.norm(q)
-    return q if np.linalg.norm(energy.left_over(q)) < 1e-6 else None
+    return q if np.linalg.norm(energy.residual(q)) < 1e-6 else None
 
 
-def _follow(frame: Framework, direction: Floats) -> Floats | None:
+def _follow_flex(frame: Framework, direction: Floats) -> Floats | None:
     """The farthest point of a walk along the curve of equal lengths, from the framework in a direction."""
     p = frame.p
     size = np.linalg.norm(p - p.mean(axis=0), axis=1).max()
@@ -189,8 +189,8 @@ def _follow(frame: Framework, direction: Floats) -> Floats | None:
     direction = direction / np.linalg.norm(direction)
     here, best, most = p, p, 0.0
     for _ in range(80):
-        there = restore(here + step * direction, frame.edges, frame.lengths, _EQUAL * size)
-        moved = np.zeros_like(p) if there is None else aligned(there, here) - here
+        there = restore_lengths(here + step * direction, frame.edges, frame.lengths, _EQUAL * size)
+        moved = np.zeros_like(p) if there is None else align(there, here) - here
         if not 0.5 * step < np.linalg.norm(moved) < 2 * step:
             if here is p or step < 1e-3 * size:
                 break
@@ -198,14 +198,14 @@ def _follow(frame: Framework, direction: Floats) -> Floats | None:
             continue
         here, direction = here + moved, moved / np.linalg.norm(moved)
         step = min(1.5 * step, 0.05 * size * np.sqrt(len(p)))
-        gone = np.linalg.norm(aligned(here, p) - p, axis=1).max()
+        gone = np.linalg.norm(align(here, p) - p, axis=1).max()
         best, most = (here, gone) if gone > most else (best, most)
         if most > _FAR * size:
             break
     return best if most > _FINITE * size else None
 
 
-def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | None:
+def restore_lengths(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | None:
     """Points near p (N, d) whose edges have the given lengths within tol [m], or None.
 
     Levenberg-Marquardt with the error itself as damping, which converges quadratically even if J loses rank
@@ -227,7 +227,7 @@ def restore(p: Floats, edges: Ints, lengths: Floats, tol: float) -> Floats | Non
     return None
 
 
-def joined(frame: Framework, goal: Floats, strides: int) -> bool:
+def are_joined(frame: Framework, goal: Floats, strides: int) -> bool:
     """Whether shapes with the same lengths lead from a framework to another one, (N, d), in small steps.
 
     The walk goes towards the other shape as far as the flexes let it. Where it would turn back, it goes on: a
@@ -237,7 +237,7 @@ def joined(frame: Framework, goal: Floats, strides: int) -> bool:
     size = np.linalg.norm(here - here.mean(axis=0), axis=1).max()
     step = most = _STRIDE * size * np.sqrt(len(here))
     for _ in range(strides):
-        gap = (aligned(goal, here) - here).ravel()
+        gap = (align(goal, here) - here).ravel()
         if np.linalg.norm(gap) <= step:
             return True
         flexes = Framework(here, frame.edges).flexes
@@ -245,8 +245,8 @@ def joined(frame: Framework, goal: Floats, strides: int) -> bool:
         ahead = flexes.T @ way if ahead @ flexes.T @ way < 0 else ahead
         ahead = flexes @ ahead / max(np.linalg.norm(ahead), 1e-12)
         there = here + step * ahead.reshape(here.shape)
-        there = restore(there, frame.edges, frame.lengths, 1e-9 * size)
-        if there is None or not 0.5 < np.linalg.norm(aligned(there, here) - here) / step < 2:
+        there = restore_lengths(there, frame.edges, frame.lengths, 1e-9 * size)
+        if there is None or not 0.5 < np.linalg.norm(align(there, here) - here) / step < 2:
             step /= 3  # round a sharp bend
             if step < 1e-3 * most:
                 return False
@@ -255,7 +255,7 @@ def joined(frame: Framework, goal: Floats, strides: int) -> bool:
     return False
 
 
-def aligned(p: Floats, onto: Floats) -> Floats:
+def align(p: Floats, onto: Floats) -> Floats:
     """Points p (N, d) moved rigidly, without reflection in their d dimensions, to fit others."""
     x, y = p - p.mean(axis=0), onto - onto.mean(axis=0)
     u, _, vt = np.linalg.svd(y.T @ x)

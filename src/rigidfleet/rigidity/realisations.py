@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -9,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.rigidity.analysis import RigidityClass, checked, flattened, judge
+from rigidfleet.rigidity.analysis import RigidityClass, as_framework, classify, flatten
 from rigidfleet.rigidity.framework import Framework
-from rigidfleet.rigidity.order import STRIDES, aligned, joined
+from rigidfleet.rigidity.order import STRIDES, align, are_joined
 from rigidfleet.typing import Floats, Ints
 
 #: Shapes whose all-pairs distances differ by less than this share of their size count as equal.
@@ -38,7 +39,7 @@ class Realisation:
     ----------
     kind : same; mirror image; folded (other all-pairs distances); coincident (folded, two agents at the same place)
     slots : (N, 3) [m], rotated to fit the intended shape
-    found : number of starts that led to this shape
+    starts : number of starts that led to this shape
     deviation : greatest difference of an all-pairs distance from the intended [m]
     closest : least distance between two agents [m]
     rigid : whether it is infinitesimally rigid
@@ -47,17 +48,23 @@ class Realisation:
 
     kind: Kind
     slots: Floats
-    found: int
+    starts: int
     deviation: float
     closest: float
     rigid: bool
     bends: bool = False
 
+    @property
+    def found(self) -> int:
+        """The former name of `starts`."""
+        warnings.warn("Realisation.found is now .starts", DeprecationWarning, stacklevel=2)
+        return self.starts
+
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
             "kind": str(self.kind),
-            "found": self.found,
+            "found": self.starts,
             "deviation": self.deviation,
             "closest": self.closest,
             "rigid": self.rigid,
@@ -72,20 +79,26 @@ class Realisations:
 
     Attributes
     ----------
-    found : the shapes, the intended one and its mirror image first, then the most frequent first
+    shapes : the shapes, the intended one and its mirror image first, then the most frequent first
     starts, converged : number of starts, and number of them that met all distances
-    leads_to : index into `found` of the shape to which the given start leads; None if there is none
+    leads_to : index into `shapes` of the shape to which the given start leads; None if there is none
     """
 
-    found: tuple[Realisation, ...]
+    shapes: tuple[Realisation, ...]
     starts: int
     converged: int
     leads_to: int | None = None
 
     @property
+    def found(self) -> tuple[Realisation, ...]:
+        """The former name of `shapes`."""
+        warnings.warn("Realisations.found is now .shapes", DeprecationWarning, stacklevel=2)
+        return self.shapes
+
+    @property
     def unique(self) -> bool:
         """Whether the search found only the intended shape and its mirror image."""
-        return all(r.kind in (Kind.SAME, Kind.MIRRORED) for r in self.found)
+        return all(r.kind in (Kind.SAME, Kind.MIRRORED) for r in self.shapes)
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -94,7 +107,7 @@ class Realisations:
             "converged": self.converged,
             "unique": self.unique,
             "leads_to": self.leads_to,
-            "found": [r.data() for r in self.found],
+            "found": [r.data() for r in self.shapes],
         }
 
 
@@ -130,13 +143,13 @@ def realisations(
     ValueError
         As `analyse`; or the start is not (N, 3).
     """
-    p, e = checked(slots, edges)
+    p, e = as_framework(slots, edges)
     drawn = p - p.mean(axis=0)
-    p, axes = (drawn, np.eye(3)) if dimension == 3 else flattened(p, dimension)
+    p, axes = (drawn, np.eye(3)) if dimension == 3 else flatten(p, dimension)
     n, length = len(p), np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
     size = float(np.linalg.norm(p, axis=1).max(initial=0.0))
     if n < 2 or not len(e):
-        return Realisations((_describe(p, p, e, 1, size, axes),), starts, starts)
+        return Realisations((_realisation(p, p, e, 1, size, axes),), starts, starts)
     rng = np.random.default_rng(seed)
     spread = np.sqrt((p**2).sum() / (dimension * n))
     at = rng.normal(scale=spread, size=(starts, n, dimension))
@@ -152,16 +165,16 @@ def realisations(
             groups.add(end, 1)
     end = None
     if start is not None:
-        begin = aligned(_positions(start, n), drawn) @ axes[:dimension].T
-        end = lead(begin, e, length, _REACHED * size)
+        begin = align(_as_positions(start, n), drawn) @ axes[:dimension].T
+        end = positions_led_to(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
     first = groups.families(e)
     counts = np.bincount(first, [seen for _, seen in groups.shapes]).astype(int).tolist()
-    found = {k: _describe(groups.shapes[k][0], p, e, counts[k], size, axes) for k in set(first)}
+    shapes = {k: _realisation(groups.shapes[k][0], p, e, counts[k], size, axes) for k in set(first)}
     rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
-    order = sorted(found, key=lambda k: (rank.get(found[k].kind, 2), -found[k].found, k))
+    order = sorted(shapes, key=lambda k: (rank.get(shapes[k].kind, 2), -shapes[k].starts, k))
     return Realisations(
-        tuple(found[k] for k in order),
+        tuple(shapes[k] for k in order),
         starts,
         converged,
         None if last is None else order.index(first[last]),
@@ -178,14 +191,14 @@ class _Groups:
 
     def add(self, p: Floats, count: int) -> int:
         """Count a shape; return its number."""
-        pairs = _pairs(p)
+        pairs = _distances_of_pairs(p)
         alike = [np.abs(known - pairs).max() <= self._tol for known in self._pairs]
         for k, (q, seen) in enumerate(self.shapes):
             if alike[k] and (not alike[0] or self._fits(p, q)):
                 self.shapes[k] = (q, seen + count)
                 return k
         self._pairs.append(pairs)
-        self.shapes.append((aligned(p, self._intended), count))
+        self.shapes.append((align(p, self._intended), count))
         return len(self.shapes) - 1
 
     def families(self, e: Ints) -> list[int]:
@@ -199,43 +212,45 @@ class _Groups:
                 for j in sorted(bend, key=lambda j: np.abs(self._pairs[j] - self._pairs[k]).max()):
                     nearest.setdefault(first[j], j)
                 for family, j in nearest.items():
-                    if family < k and joined(frames[k], frames[j].p, strides):
+                    if family < k and are_joined(frames[k], frames[j].p, strides):
                         first = [family if i == k else i for i in first]
                         break
         return first
 
     def _fits(self, p: Floats, q: Floats) -> bool:
         # Distance errors e make a flat shape sqrt(e) thick, so a wide gap must distinguish a mirror image.
-        return bool(np.linalg.norm(aligned(p, q) - q, axis=1).max() <= 30 * self._tol)
+        return bool(np.linalg.norm(align(p, q) - q, axis=1).max() <= 30 * self._tol)
 
 
-def _describe(q: Floats, p: Floats, e: Ints, found: int, size: float, axes: Floats) -> Realisation:
-    deviation = float(np.abs(_pairs(q) - _pairs(p)).max(initial=0.0))
-    closest = float(_pairs(q).min(initial=np.inf))
+def _realisation(
+    q: Floats, p: Floats, e: Ints, starts: int, size: float, axes: Floats
+) -> Realisation:
+    deviation = float(np.abs(_distances_of_pairs(q) - _distances_of_pairs(p)).max(initial=0.0))
+    closest = float(_distances_of_pairs(q).min(initial=np.inf))
     if deviation <= _ALIKE * size:
-        same = np.linalg.norm(aligned(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
+        same = np.linalg.norm(align(q, p) - p, axis=1).max(initial=0.0) <= 30 * _ALIKE * size
         kind = Kind.SAME if same else Kind.MIRRORED
     else:
         kind = Kind.COINCIDENT if closest <= _ALIKE * size else Kind.FOLDED
     frame = Framework(q, e)
     rigid = frame.flexes.shape[1] == 0
-    bends = not rigid and judge(frame)[0] is RigidityClass.FLEXIBLE
-    return Realisation(kind, q @ axes[: q.shape[1]], found, deviation, closest, rigid, bends)
+    bends = not rigid and classify(frame)[0] is RigidityClass.FLEXIBLE
+    return Realisation(kind, q @ axes[: q.shape[1]], starts, deviation, closest, rigid, bends)
 
 
-def _pairs(p: Floats) -> Floats:
+def _distances_of_pairs(p: Floats) -> Floats:
     i, j = np.triu_indices(len(p), 1)
     return np.linalg.norm(p[i] - p[j], axis=1)
 
 
-def _positions(start: ArrayLike, n: int) -> Floats:
+def _as_positions(start: ArrayLike, n: int) -> Floats:
     at = np.asarray(start, dtype=np.float64)
     if at.shape != (n, 3) or not np.isfinite(at).all():
         raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
     return at
 
 
-def lead(
+def positions_led_to(
     start: Floats, e: Ints, length: Floats, tol: float, slots: Floats | None = None
 ) -> Floats | None:
     """Positions (N, d) to which lengths (m,) lead that go from those at the start to the desired ones in small steps.
@@ -245,7 +260,7 @@ def lead(
     """
     at = start[None]
     now = ((start[e[:, 0]] - start[e[:, 1]]) ** 2).sum(axis=1)
-    goal = None if slots is None else aligned(slots, start)
+    goal = None if slots is None else align(slots, start)
     steps = 50
     for k in range(1, steps + 1):
         squares = now + (length**2 - now) * (k / steps)
@@ -268,7 +283,7 @@ def _descend(
     i, j = e.T
     rows, size = np.arange(len(e)), d * n
     lane = np.arange(count)
-    c = _lack(at, i, j, length)
+    c = _length_errors(at, i, j, length)
     for _ in range(iterations):
         x = (at[:, i] - at[:, j]) / length[:, None]
         J = np.zeros((len(at), len(e), n, d))
@@ -278,7 +293,7 @@ def _descend(
         K[:, np.arange(size), np.arange(size)] += damping[:, None] + 1e-14
         step = np.linalg.solve(K, (J.transpose(0, 2, 1) @ c[..., None]))[..., 0]
         new = at - step.reshape(at.shape)
-        after = _lack(new, i, j, length)
+        after = _length_errors(new, i, j, length)
         better = (after**2).sum(axis=1) < (c**2).sum(axis=1)
         at, c = np.where(better[:, None, None], new, at), np.where(better[:, None], after, c)
         damping = np.where(better, damping * 0.2, np.minimum(damping * 4, 1e6))
@@ -291,6 +306,6 @@ def _descend(
     return ends, done
 
 
-def _lack(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
+def _length_errors(p: Floats, i: Ints, j: Ints, length: Floats) -> Floats:
     """(L^2 - d^2) / (2 d) [m], which is smooth if agents meet, and equals L - d near the solution."""
     return (((p[:, i] - p[:, j]) ** 2).sum(axis=2) - length**2) / (2 * length)
