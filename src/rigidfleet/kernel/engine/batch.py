@@ -30,7 +30,7 @@ from rigidfleet.kernel.problem import (
     Disturbance,
     Problem,
     Reference,
-    padded_size,
+    eights,
     workspace,
 )
 from rigidfleet.kernel.records import (
@@ -300,7 +300,7 @@ def fly_all(
 
     def in_lanes(x: Floats) -> LaneArray:
         if count % WIDTH:  # unused lanes of the last vector repeat the last flight
-            x = x[np.minimum(np.arange(padded_size(count)), count - 1)]
+            x = x[np.minimum(np.arange(eights(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def begin() -> Callable[..., None]:

@@ -60,7 +60,7 @@ class Packed(NamedTuple):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy has words of its own: the arrays of the tuple lie elsewhere."""
-        return pack, (self.of,)
+        return pack_anew, (self.of,)
 
 
 #: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded, and what keeps its code.
@@ -173,7 +173,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
             words.append(int(value))
 
 
-def pack(x: Any) -> Packed:
+def pack_anew(x: Any) -> Packed:
     """Convert a named tuple to words.
 
     Raises
@@ -208,12 +208,12 @@ _last = _Last()
 _KEPT = 32
 
 
-def pack_once(x: Any) -> Packed:
-    """`pack`, unless the named tuple is among the last ones that the thread has used."""
+def pack(x: Any) -> Packed:
+    """`pack_anew`, unless the named tuple is among the last ones that the thread has used."""
     kept = _last.packed
     last = kept.pop(id(x), None)
     if last is None or last.of is not x:
-        last = pack(x)
+        last = pack_anew(x)
         if len(kept) >= _KEPT:
             del kept[next(iter(kept))]
     kept[id(x)] = last

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.kernel.avoidance import Avoidance
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_once
+from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_anew
 from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
@@ -64,19 +64,19 @@ def _pack(
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
-    law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
-    recorded = pack_once(UNRECORDED)
+    law = pack_anew(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
+    recorded = pack(UNRECORDED)
     call = segment._replace(
         recorder=native.recorder_address(), segment=law.address, record=recorded.address
     )
-    states = pack_once(problem), pack_once(workspace), pack_once(flight), pack_once(state)
+    states = pack(problem), pack(workspace), pack(flight), pack(state)
     if avoidance is None:
-        return *states, pack(call), law, recorded
+        return *states, pack_anew(call), law, recorded
     kept = _of(avoidance, problem, workspace)
     call = call._replace(
         guard=native.avoidance_library().addresses["avoid"], avoidance=kept.address
     )
-    return *states, pack(call), law, recorded, kept
+    return *states, pack_anew(call), law, recorded, kept
 
 
 def avoid(
@@ -89,14 +89,14 @@ def avoid(
     """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
     kept = _of(avoidance, problem, workspace)
     return native.avoidance_library().avoid(
-        pack_once(flight).address, pack_once(state).address, kept.address, 0
+        pack(flight).address, pack(state).address, kept.address, 0
     )
 
 
 def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
     """Avoidance that knows the law whose forces it changes."""
-    avoidance.law[:] = pack_once(problem).address, pack_once(workspace).address
-    return pack_once(avoidance)
+    avoidance.law[:] = pack(problem).address, pack(workspace).address
+    return pack(avoidance)
 
 
 def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
@@ -141,10 +141,10 @@ def derivatives(
     """
     none = np.zeros((len(S), 3))
     out = np.empty_like(S)
-    call = pack(
+    call = pack_anew(
         Evaluation(
             S, command, none if air is None else air, none if push is None else push, np.eye(3), out
         )
     )
-    native.sampled_library().evaluate(pack_once(flight).address, call.address)
+    native.sampled_library().evaluate(pack(flight).address, call.address)
     return out
