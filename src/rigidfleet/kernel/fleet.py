@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.kernel.problem import Workspace, eights, zeros
+from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
 from rigidfleet.solids.records import Solids, join
 from rigidfleet.typing import Bools, Floats, Ints
@@ -478,7 +478,7 @@ def _frame(q: Floats | None) -> Floats:
 def _work(n: int, m: int) -> SampledWork:
     size = 6 * n + m + 4
     return SampledWork(
-        zeros(7, eights(n * STATES)), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
+        zeros(7, padded(n * STATES)), zeros(3, n, 3), np.eye(3), np.zeros((5, 3)), np.zeros((4, 4)), np.zeros(1),
         np.zeros((1, size)), np.zeros(size),
     )  # fmt: skip
 

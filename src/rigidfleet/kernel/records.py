@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, eights, zeros
+from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, padded, zeros
 from rigidfleet.typing import Bools, Floats, Ints
 
 PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
@@ -189,7 +189,7 @@ def integrator(
     """
     n = len(y)
     count = np.empty(FIRST_ROW + 1, dtype=np.int64)
-    state = IntegratorState(np.empty(n), zeros(10, eights(n)), np.empty(3), count, rtol, trail)
+    state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
     return integrator_in(state, y, t, rtol=rtol, atol=atol, step=step)
 
 
