@@ -27,8 +27,8 @@ from crowds import PERIOD, THRUST, kernel, on_parabolas
 
 from rigidfleet.kernel.avoidance import candidates, sight
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import Packed, packed
-from rigidfleet.solids.records import Solids, ball, joined, single
+from rigidfleet.kernel.engine.packing import Packed, pack
+from rigidfleet.solids.records import Solids, ball, join, single
 from rigidfleet.typing import Floats
 
 #: Speeds of vehicles, and greatest speeds of obstacles [m/s].
@@ -144,7 +144,7 @@ def asked(r: Floats, v: Floats, slots: Floats, speed: float, t: float) -> Floats
 def solids(given: Scene) -> Solids:
     """The obstacles of a scene, for a minute."""
     ends = np.array([0.0, 60.0])
-    return joined(
+    return join(
         [
             single(ball(place, BALL), ends, np.outer(ends, w))
             for place, w in zip(given.place, given.velocity, strict=True)
@@ -159,9 +159,9 @@ def prepared(given: Scene, method: str) -> tuple[Any, list[Packed]]:
         len(given.slots), radius=RADIUS, solids=things, separation=0.1, clearance=0.05,
         seen=sight(things, RANGE, NOISE, SWERVE), **METHODS[method],
     )  # fmt: skip
-    law = [packed(problem), packed(work)]
+    law = [pack(problem), pack(work)]
     a.law[:] = [each.address for each in law]
-    return state, [packed(flight), packed(state), packed(a), *law]
+    return state, [pack(flight), pack(state), pack(a), *law]
 
 
 def take_least(least: Floats, x: Floats, w: Floats, rise: Floats) -> None:
@@ -175,7 +175,7 @@ def take_least(least: Floats, x: Floats, w: Floats, rise: Floats) -> None:
 def fly(scenes: list[Scene], method: str) -> Flown:
     """Fly scenes of one kind, tick by tick together; they know nothing of each other."""
     count, n, speed = len(scenes), len(scenes[0].slots), scenes[0].speed
-    made, avoid = [prepared(each, method) for each in scenes], native.avoiding().avoid
+    made, avoid = [prepared(each, method) for each in scenes], native.avoidance_library().avoid
     slots = np.array([each.slots for each in scenes])
     place, velocity = (np.array([each[k] for each in scenes])[:, None] for k in (2, 3))
     r, v = slots.copy(), np.zeros((count, n, 3)) + [speed, 0.0, 0.0]
@@ -232,7 +232,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=1000, help="scenes of each kind")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    native.avoiding()
+    native.avoidance_library()
     print(
         "| vehicles | speed [m/s] | obstacles' speed | feasible | flown with | contacts | of the infeasible"
         " | least distance [m] | arrive | median time [s] | cost [us] |"

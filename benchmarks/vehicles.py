@@ -89,7 +89,7 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
         integral = plan.state()[6 * len(S) : 6 * len(S) + m]
         if state is None:
             state = fleet.begin(flight, S, work)
-        state = fleet.renewed(state, work, integral)
+        state = fleet.under_problem(state, work, integral)
         times = plan.start + 0.1 * np.arange(1, round(10.0 * (plan.t_end - plan.start)) + 1)
         call = fleet.segment(len(S), m, plan.t_end, times)
         begun_at = time.process_time()

@@ -15,6 +15,7 @@ from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangl
 from rigidfleet import physics, simulate
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
+from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, bernstein
 from rigidfleet.math import attitude, pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
@@ -471,8 +472,57 @@ def moving_obstacles() -> Figure:
     return fig
 
 
+def monitor() -> Figure:
+    """The trail, from which the integrator's steps are searched, and the bound by which a step is passed over."""
+    fig = Figure(figsize=(9.0, 3.1))
+    ax = fig.add_axes((0.01, 0.0, 0.5, 1.0))
+    ax.set(xlim=(-0.3, 10.3), ylim=(0.0, 7.2))
+    ax.axis("off")
+    colours = [PALE] * 3 + [ORANGE] + [BLUE] * 4 + [PALE] * 2
+    for row, colour in enumerate(colours):
+        alpha = 1.0 if colour == PALE else 0.35
+        ax.add_patch(
+            Rectangle((row, 3.0), 0.92, 1.3, facecolor=colour, alpha=alpha, linewidth=0, zorder=1)
+        )
+        ax.add_patch(Rectangle((row, 3.0), 0.92, 1.3, fill=False, edgecolor=GREY, linewidth=0.9))
+    notes = (
+        (1.4, 5.4, "searched:\nroom for others", GREY), (3.46, 1.5, "searched, stays:\nits end may be\na peak", ORANGE),
+        (5.95, 5.4, "steps to search", BLUE), (8.46, 1.5, "the integrator\nwrites the next\nstep here", INK),
+    )  # fmt: skip
+    for x, y, text, colour in notes:
+        up = y > 3.6
+        ax.text(x, y, text, ha="center", va="bottom" if up else "top", fontsize=8.5, color=colour)
+        start, end = (y - 0.1, 4.4) if up else (y + 0.1, 2.9)
+        arrow(ax, (x, start), (x, end), colour=colour)
+    back = (9.96, 3.65), (10.2, 3.65), (10.2, 6.9), (-0.2, 6.9), (-0.2, 3.65), (-0.02, 3.65)
+    arrow(ax, *back, colour=FAINT)
+    ax.text(
+        5.0, 6.8, "the first row follows the last", ha="center", va="top", fontsize=8.5, color=GREY
+    )
+    ax = fig.add_axes((0.58, 0.17, 0.4, 0.73))
+    points, x = np.array([3.1, 1.5, 1.1, 2.3, 2.6]), np.linspace(0.0, 1.0, 200)
+    ax.plot(x, bernstein(x) @ points, color=BLUE, linewidth=2, label="value over a step")
+    for half, label in ((0.0, "control points of its halves"), (1.0, None)):
+        part = FROM_KNOTS @ (bernstein((KNOTS + half) / 2.0) @ points)
+        ax.plot(
+            (KNOTS + half) / 2.0,
+            part,
+            "o-",
+            color=GREEN,
+            linewidth=0.8,
+            markersize=3.5,
+            label=label,
+        )
+    ax.plot(KNOTS, points, "o--", color=FAINT, linewidth=0.9, markersize=4, label="control points")
+    ax.axhline(1.35, color=RED, linewidth=1.2)
+    ax.text(0.99, 1.3, "worst so far", color=RED, ha="right", va="top", fontsize=8.5)
+    ax.set(xlabel="share of the step", ylim=(0.9, 3.6), xlim=(-0.02, 1.02))
+    ax.legend(loc="upper right", fontsize=8)
+    return fig
+
+
 DIAGRAMS: Sequence[Callable[[], Figure]] = (
     edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
     overshoot, solvers, blend, no_inverse, realisations, error_budget, way_found,
-    moving_obstacles,
+    moving_obstacles, monitor,
 )  # fmt: skip

@@ -2,7 +2,7 @@
 
 `python docs/tables.py` rewrites them in place, each between `<!-- table: NAME -->` and `<!-- end -->`;
 tests/test_docs.py fails where they are out of date. NAME is a table of the JSON schema; `A-B` the keys of A
-which B lacks; `shapes`, `result`, `metrics` and `margins` what their names say.
+which B lacks; `shapes`, `missions`, `result`, `metrics` and `margins` what their names say.
 """
 
 import json
@@ -20,7 +20,9 @@ from rigidfleet.math.margins import (
     margins,
     tracking_loops,
 )
-from rigidfleet.mission import bounds, json_schema
+from rigidfleet.mission import bounds, json_schema, load_mission
+from rigidfleet.mission.kinds import KINDS
+from rigidfleet.mission.text import GROUPS
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS
 
@@ -35,12 +37,20 @@ def render(page: str) -> str:
         name = match[1]
         special = {
             "result": _result, "shapes": _shapes, "metrics": _metrics, "bounds": _bounds,
-            "magnitudes": _magnitudes, "margins": _margins,
+            "magnitudes": _magnitudes, "margins": _margins, "missions": _missions,
         }  # fmt: skip
         text = special[name]() if name in special else _keys(schema, name)
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
 
     return re.sub(r"<!-- table: ([\w-]+) -->\n.*?<!-- end -->", table, page, flags=re.DOTALL)
+
+
+def kinds_without_section(page: str) -> set[str]:
+    """Kinds of phases without a section of a page; `hold` needs none, as its keys are those of every kind."""
+    sections = re.findall(r"^### `\[\[phases\]\]` of kinds? (.*)$", page, re.MULTILINE)
+    return (
+        {*KINDS} - {"hold"} - {kind for text in sections for kind in re.findall(r"`(\w+)`", text)}
+    )
 
 
 def _keys(schema: dict[str, Any], name: str) -> str:
@@ -137,6 +147,17 @@ def _shapes() -> str:
     """The named shapes: name, agents, slots."""
     rows = [(f"`{name}`", agents_taken(name), shape.text) for name, shape in SHAPES.items()]
     return _table(("shape", "agents", "slots"), rows)
+
+
+def _missions() -> str:
+    """The shipped missions in their groups: name, what it shows, where in the paper."""
+    rows = []
+    for group, names in GROUPS.items():
+        rows.append((f"**{group}**", "", ""))
+        for name in names:
+            mission = load_mission(name)
+            rows.append((f"`{name}`", mission.title, mission.source))
+    return _table(("mission", "what it shows", "in the paper"), rows)
 
 
 def _result() -> str:

@@ -36,7 +36,8 @@ def code(answer: int) -> bytes:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     text = "define i64 @{}(i64, i64, i64, i64) {{ ret i64 {} }}"
-    module = llvm.parse_assembly("\n".join(text.format(e, answer) for e in objects.ENTRIES))
+    symbols = map(objects.symbol, objects.ENTRIES["flight"])
+    module = llvm.parse_assembly("\n".join(text.format(name, answer) for name in symbols))
     return objects.target_machine().emit_object(module)
 
 
@@ -48,7 +49,7 @@ def answer() -> int:
 
 def forget() -> None:
     """Let the next warning be the first."""
-    native.told.clear()
+    native.warned.clear()
 
 
 @pytest.fixture(autouse=True)
@@ -69,7 +70,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", {})
     file = native._file("flight")
-    file.write_bytes(objects.concatenated([code(PLANTED)]))
+    file.write_bytes(objects.concatenate([code(PLANTED)]))
     file.chmod(0o600)
     forget()
     yield folder
@@ -238,7 +239,7 @@ def test_an_access_list(base, monkeypatch):
 def test_owners_without_a_number(which, base, monkeypatch):
     """In a container of an ordinary user the machine's root shows as nobody, who may own what leads to the cache where
     not everyone can make a folder, but neither the cache nor what is in it."""
-    monkeypatch.setattr(cache, "_unnamed", lambda: SOMEONE)
+    monkeypatch.setattr(cache, "_overflow_user", lambda: SOMEONE)
     chosen = {"last": place(base), "file": planted(base)}.get(which, base)
     os.chown(chosen, SOMEONE, -1)
     if which == "shared":
@@ -253,7 +254,7 @@ def test_users_without_a_number():
     """Where every user has a number, as outside of containers, nobody is only nobody."""
     whole = Path("/proc/self/uid_map").read_text().split() == ["0", "0", "4294967295"]
     nobody = int(Path("/proc/sys/kernel/overflowuid").read_text())
-    assert cache._unnamed() == (None if whole else nobody)
+    assert cache._overflow_user() == (None if whole else nobody)
 
 
 @pytest.mark.parametrize("home", ["/dev/null", "", "unknown"])

@@ -24,6 +24,7 @@ from rigidfleet.formation.graphs import neighbours
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.formation.shapes import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
+from rigidfleet.mission.text import FIRST, GROUPS
 from rigidfleet.plotting import figure_names
 from rigidfleet.result import Result
 from rigidfleet.rigidity import jacobian, spectrum
@@ -160,11 +161,18 @@ def test_bad_input(capsys, tokens, words):
 
 
 def test_missions(capsys):
-    """Each shipped mission has one line, with its table or figure of the paper."""
+    """Each shipped mission has one line below its group, with its table or figure of the paper."""
     assert cli.main(["missions"]) == codes.PASSED
-    head, *lines = capsys.readouterr().out.splitlines()
+    head, *lines, empty, first = capsys.readouterr().out.splitlines()
     assert "in the paper" in head
-    assert [line.split()[0] for line in lines] == mission_names()
+    groups = [line.strip() for line in lines if not line.startswith("  ")]
+    assert groups == [*GROUPS]
+    lines = [line.strip() for line in lines if line.startswith("  ")]
+    assert [line.split()[0] for line in lines] == [
+        name for names in GROUPS.values() for name in names
+    ]
+    assert empty == ""
+    assert all(name in first for name in FIRST)
     passage = next(line for line in lines if line.startswith("narrow-passage"))
     assert "unfold" in passage
     assert "Table 3" in passage
@@ -945,7 +953,7 @@ def test_piped_output_is_plain():
     """What goes to a pipe has no colours and no animation, and no row of a table is broken."""
     done = command("missions", TERM="xterm-256color")
     assert "\x1b" not in done.stdout + done.stderr
-    assert len(done.stdout.splitlines()) == 1 + len(mission_names())
+    assert len(done.stdout.splitlines()) == 1 + len(GROUPS) + len(mission_names()) + 2
 
 
 @pytest.mark.parametrize("arguments", [["missions"], ["missions", "--schema"], ["--help"]])

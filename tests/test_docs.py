@@ -66,6 +66,15 @@ def test_tables_are_up_to_date():
         assert page(path.name) == tables.render(page(path.name))
 
 
+def test_every_kind_of_phase_has_its_section():
+    """No kind of phase is without a section; the section of `brake`, taken away, is missed."""
+    tables, missions = script("tables"), page("missions.md")
+    assert not tables.kinds_without_section(missions)
+    assert tables.kinds_without_section(missions.replace("of kind `brake`", "of brakes")) == {
+        "brake"
+    }
+
+
 @pytest.mark.long
 def test_flown_tables_are_up_to_date():
     """Tables that are flown have the numbers of today's flights: to a digit or 3 %, errors 1e-N to a factor 3."""
@@ -313,7 +322,7 @@ def test_equations_are_spelt_alike(folder):
 
 
 def test_missions_and_figures_exist():
-    """Missions and figures that paper.md names are shipped and drawn; no mission is left out."""
+    """Missions and figures that paper.md names are shipped and drawn; no mission of the paper is left out."""
     known = set(mission_names())
     figures = [row for row in rows("Figures") if row[0].isdigit()]
     named = {name for row in figures for name in re.findall(r"`([\w-]+)`", row[2])}
@@ -322,7 +331,9 @@ def test_missions_and_figures_exist():
     assert named <= known
     assert drawn
     assert drawn <= set(figure_names())
-    assert all(f"`{name}`" in page("paper.md") for name in known)
+    of_the_paper = {name for name in known if "source" in tomllib.loads(mission_text(name))}
+    assert len(of_the_paper) > 15
+    assert all(f"`{name}`" in page("paper.md") for name in of_the_paper)
 
 
 HOMES = "kernel|planning|simulation|formation|math|physics|rigidity|result|assessment|mission|plotting|errors"

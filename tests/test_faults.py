@@ -181,7 +181,7 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
 
 def test_a_full_disk_while_the_kernel_is_kept():
     """A kernel that cannot be written to its cache flies all the same; a warning names the folder and the reason."""
-    native.told.clear()
+    native.warned.clear()
     double: Any = jit.compiled(lambda x: 2.0 * x)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
@@ -198,7 +198,7 @@ def test_a_full_disk_while_the_kernel_is_kept():
 def test_a_full_disk_while_machine_code_is_kept(tmp_path, monkeypatch):
     """Nothing is left of machine code that could not be written, but a warning."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    native.told.clear()
+    native.warned.clear()
     file = native._file("flight")
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))

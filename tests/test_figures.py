@@ -24,6 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import curves, sketches, space, style
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
+from rigidfleet.result.quantities import samples
 
 START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
 TRIANGLE = {"shape": "triangle", "size": 4.0}
@@ -463,7 +464,7 @@ def test_clearance_shows_limits_and_the_worst(triangle):
     k = int(triangle.clearance.argmin())
     thing = triangle.mission.obstacles[triangle.clearance_obstacle[k]].name
     assert any(
-        text.endswith(f"agent {triangle.clearance_agent[k] + 1} to {thing}")
+        text.endswith(f"agent {triangle.clearance_agent[k] + 1}, {thing}")
         for text in texts(plotting.clearance(triangle))
     )
 
@@ -601,10 +602,12 @@ def test_room_below_counts_only_agents_above_each_other():
     result = a_flight(n=2, formation=None, samples=2)
     position = np.array([[[0, 0, 0], [0.4, 0, 2.0]], [[0, 0, 0], [0.6, 0, 2.0]]])
     np.testing.assert_allclose(
-        curves.room_below(a_flight(n=2, formation=None, samples=2, position=position)),
+        samples(
+            a_flight(n=2, formation=None, samples=2, position=position), "separation_below"
+        ).worst,
         [1.5, np.nan],
     )
-    assert len(curves.room_below(result)) == 2
+    assert len(samples(result, "separation_below").worst) == 2
 
 
 def test_every_edge_has_a_line_and_few_legend_entries(cube):
@@ -776,6 +779,7 @@ def test_a_flight_has_no_empty_figures(tmp_path):
         "rotors",
         "vehicles",
         "operation",
+        "motion",
     }
     assert "still air" in texts(plotting.disturbance(calm))
     unknown = np.full((181, 4), np.nan)
@@ -783,7 +787,7 @@ def test_a_flight_has_no_empty_figures(tmp_path):
     missing = set(plotting.figure_names()) - set(plotting.figure_names(free))
     assert missing == {
         "distances", "attitude", "constraint_force", "constraint_error", "formations",
-        "rotors", "vehicles", "operation",
+        "rotors", "vehicles", "operation", "motion",
     }  # fmt: skip
     assert "no body frame attached" in texts(plotting.attitude(free))
     alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})

@@ -4,7 +4,7 @@ Hypothesis writes them: sound missions of every kind, and the same with some of 
 for huge, tiny, negative, missing or senseless ones. Nothing may end in a traceback, hang, or come back
 with numbers that are not finite and a verdict that is content.
 
-Beside them `mutations.py` changes shipped missions and a result's file in structure, values, types, sizes and bytes,
+Beside them `input_fuzzer.py` changes shipped missions and a result's file in structure, values, types, sizes and bytes,
 and gives them to the command, each within a limit of time and memory.
 """
 
@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import mutations
+import input_fuzzer
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -285,9 +285,9 @@ def faults(kind: str, count: int, folder: Path) -> list[str]:
     """What was no good end, of so many cases; a process that hangs, dies or fills its memory ends none well."""
     whole = None
     if kind == "result":
-        mutations.a_flight(folder)
+        input_fuzzer.a_flight(folder)
         whole = folder / "whole.nc"
-    found = list(mutations.attack(kind, 0, count, whole))
+    found = list(input_fuzzer.attack(kind, 0, count, whole))
     assert len(found) == count
     return [f"{kind} {case['seed']}: {case['fault']}" for case in found if case["fault"]]
 
@@ -322,5 +322,5 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / "rigidfleet" / "cli" / "app.py").write_text(f"def main(_):\n    {body}\n")
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         monkeypatch.setenv("MUTATIONS_SECONDS", "1")
-        (case,) = mutations.attack("check", 0, 1)
+        (case,) = input_fuzzer.attack("check", 0, 1)
         assert words in case["fault"]

@@ -144,6 +144,36 @@ def test_take_off_and_landing(obstacle):
     assert np.isfinite(result.motors_off).all()
 
 
+def test_take_off_and_landing_on_a_slope():
+    """Terrain and a roof of one slope lead to the same flight, up to a level height and down to the slope."""
+    x, y = np.array([1.0, 5.0, 4.0]), np.array([6.0, 4.0, 7.0])
+    stands = mission(SLOPED).height_at(x, y) + 0.3
+    agents = {"vehicle": "drone", "position": np.column_stack([x, y, stands]).tolist()}
+    phases = [
+        {"kind": "takeoff", "height": 3.0, "duration": 5.0},
+        {"kind": "establish", "formation": "triangle", "blend": 4.0, "duration": 5.0},
+        {"kind": "land", "stagger": 6.0, "by": "vehicles", "duration": 18.0},
+    ]
+    terrain, roof = flights([SLOPED, PITCHED], agents=agents, phases=phases)
+    np.testing.assert_allclose(roof.position, terrain.position, atol=1e-7)
+    end = terrain.position[-1]
+    above = end[:, 2] - mission(SLOPED).height_at(*end[:, :2].T) - terrain.mission.fleet.radius
+    np.testing.assert_allclose(above, 0.0, atol=0.06)
+
+
+@pytest.mark.parametrize(
+    "change", [{"zone": True}, {"velocity": [1.0, 0.0, 0.0]}, {"vanishes": 9.0}]
+)
+def test_what_is_no_ground_is_none_to_land_on(change):
+    """A zone, and a box that moves or goes, are refused before the flight, as no ground is."""
+    phases = [
+        {"kind": "establish", "formation": "triangle", "blend": 2.5, "until": 3.0},
+        {"kind": "land", "duration": 6.0},
+    ]
+    with pytest.raises(MissionError, match="needs a ground, and the mission has none"):
+        mission(LEVEL["roof"] | change, phases=phases)
+
+
 def test_nothing_below_is_refused():
     """A landing beside the terrain is an error that names the vehicle and the place."""
     phases = [

@@ -820,7 +820,7 @@ if not {helped}:
     second.kill()
 made, apart = [], build.apart
 build.apart = lambda: made.append(1) or apart()
-assert len(build.machine_code(second)) == len(objects.ENTRIES)
+assert len(build.machine_code(second)) == len(objects.ENTRIES["flight"])
 assert len(made) == {int(not helped)}
 """
     environment = os.environ | {"NUMBA_OPT": "0"}
@@ -837,7 +837,7 @@ if sys.argv[1] == "other":
     numba_internals.TESTED = ()
     assert not numba_internals.known()
     from rigidfleet.kernel.engine import build, native
-    native._loaded["flight"] = native._linked(build.machine_code())
+    native._loaded["flight"] = native._link("flight", build.machine_code())
 import rigidfleet as rf
 print(hashlib.sha256(rf.simulate("establish-triangle").position.tobytes()).hexdigest())
 """
@@ -921,9 +921,9 @@ def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkey
         seen.add(type(x).__name__)
         return real(x)
 
-    real = packing.pack
-    monkeypatch.setattr(packing, "pack", pack)
-    monkeypatch.setattr(native, "pack", pack)
+    real = packing.pack_anew
+    monkeypatch.setattr(packing, "pack_anew", pack)
+    monkeypatch.setattr(native, "pack_anew", pack)
     packing._last.packed.clear()
     simulate(mission).evaluate()
     assert {"Problem", "Workspace", "IntegratorState", "Monitor", "Record", "Segment"} <= seen
@@ -933,7 +933,9 @@ def test_the_kernel_for_three_agents_is_the_kernel(monkeypatch):
     """Of the same source, but for the lengths of its loops: the same flight to rounding."""
     own = simulate("narrow-passage")
     code = native._code()
-    monkeypatch.setitem(native._loaded, "flight", code._replace(integrate_three=code.integrate))
+    monkeypatch.setitem(
+        native._loaded, "flight", native.Library(**vars(code) | {"integrate_three": code.integrate})
+    )
     other = simulate("narrow-passage")
     assert own.statistics["steps"] == other.statistics["steps"]
     assert np.abs(own.position - other.position).max() < 1e-9
@@ -944,7 +946,9 @@ def test_the_kernel_for_three_agents_is_for_them_alone(monkeypatch):
         raise AssertionError("called")
 
     code = native._code()
-    monkeypatch.setitem(native._loaded, "flight", code._replace(integrate_three=refused))
+    monkeypatch.setitem(
+        native._loaded, "flight", native.Library(**vars(code) | {"integrate_three": refused})
+    )
     for mission in ("two-agents", "square", "hexagon"):
         assert simulate(mission).complete
 

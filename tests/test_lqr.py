@@ -27,7 +27,7 @@ from rigidfleet.math.lqr import (
     quintic_pieces,
 )
 from rigidfleet.mission.schema import Lqr, Regulator, Tracking
-from rigidfleet.planning.body_trajectories import RegulatedTrajectory
+from rigidfleet.planning.body_trajectories import regulated_motion
 from rigidfleet.planning.reference import Pose
 
 CASE = json.loads((Path(__file__).parent / "data/reference_lqr_finite_gains.json").read_text())
@@ -594,7 +594,7 @@ def test_planned_motions_are_those_of_the_regulators():
     T, T1 = (dcm_from_rotation_vector(x) for x in rng.normal(0.0, 0.8, (2, 3)))
     phi = rotation_vector_from_dcm(T @ T1.T)
     ends = Pose(r, v, T, omega), Pose(r1, v1, T1, omega1)
-    motion = RegulatedTrajectory(laws, tracking, *ends, t0, arrival, t_end).motion()
+    motion = regulated_motion(laws, tracking, *ends, t0, arrival, t_end)
     assert motion.knots[[0, -1]] == pytest.approx([t0, t_end])
     np.testing.assert_array_equal(motion.T1, T1)
 

@@ -92,7 +92,7 @@ def test_triple_pole_with_a_lag(tau):
     r = np.array([[0.0, 0, 1], [0, 0, -1]])
     law = Feedback(solver="exact")
     loops = formation_loops(r, [[0, 1]], [1.0, 2.0], law, [Lag(1.0, 5.0, tau)] * 2)
-    (held,) = [loop for loop in loops if loop.constrained]
+    (held,) = [loop for loop in loops if loop.is_constrained]
     assert largest_pole([held], law) == pytest.approx(8 / (9 * tau), rel=1e-3)
 
 
@@ -120,7 +120,7 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
         # Side by side, a distance holds horizontal motion alone.
         r = np.array([[1.0, 0, 0], [-1, 0, 0]])
         loops = formation_loops(r, [[0, 1]], [1, 1], law, [delayed(lag, delay)] * 2)
-        loops = [loop for loop in loops if loop.constrained]
+        loops = [loop for loop in loops if loop.is_constrained]
         pid = [2 * law.alpha, law.beta**2, law.gamma]
     else:
         loops = [x for x in tracking_loops([delayed(lag, delay)]) if not x.channels[0][1]]

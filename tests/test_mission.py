@@ -27,6 +27,8 @@ from rigidfleet.mission import (
 )
 
 SHIPPED = [
+    "bridge-inspection",
+    "change-of-picture",
     "crazyflies",
     "cube-passage",
     "cube-passage-quadrotors",
@@ -37,7 +39,10 @@ SHIPPED = [
     "establish-cube",
     "establish-cube-as-printed",
     "establish-triangle",
+    "falling-light",
+    "ferris-wheel",
     "hexagon",
+    "hill-search",
     "line-singular",
     "moving-obstacles",
     "narrow-passage",
@@ -47,8 +52,18 @@ SHIPPED = [
     "show-1000",
     "single-waypoint",
     "square",
+    "statue",
     "two-agents",
     "windy-passage",
+]
+
+SCENES = [
+    "bridge-inspection",
+    "change-of-picture",
+    "falling-light",
+    "ferris-wheel",
+    "hill-search",
+    "statue",
 ]
 
 HELD = [{"kind": "hold", "duration": 5.0}]
@@ -122,7 +137,7 @@ def test_all_missions_of_the_paper_are_shipped():
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_mission_is_in_order(name):
-    """A shipped mission loads, carries its name, says what it shows and where it is from."""
+    """A shipped mission loads, carries its name, says what it shows and, but for the scenes, where it is from."""
     mission = load_mission(name)
     assert mission.name == name
     assert mission.title
@@ -132,6 +147,7 @@ def test_shipped_mission_is_in_order(name):
         "delayed",
         "downwash-cube",
         "moving-obstacles",
+        *SCENES,
     )
     assert mission.text == mission_text(name)
     assert mission.text.startswith("# ")
@@ -914,7 +930,7 @@ def test_windows_files_are_read(tmp_path):
     [
         ("narow-passage", "did you mean 'narrow-passage'?"),
         ("missions/establish-cub.toml", "did you mean 'establish-cube'?"),
-        ("zzz", "shipped missions: crazyflies, "),
+        ("zzz", "shipped missions: bridge-inspection, "),
     ],
 )
 def test_unknown_missions_are_near_known_ones(name, remedy):
@@ -1054,6 +1070,19 @@ def test_reading_missions_waits_for_no_compiler():
         "sys.exit(any(m in sys.modules for m in ('numba', 'scipy', 'matplotlib', 'xarray')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_mission_builds_the_models_that_it_has():
+    """Models of what it lacks are not built, and what reads files of others is not imported."""
+    code = (
+        "import sys; from rigidfleet.mission import load_mission, kinds, obstacles, schema; load_mission('square'); "
+        "unused = [schema.Vehicle, schema.Autopilot, schema.Constraint, schema.Tracking, schema.Disturbances, "
+        "kinds.Go, kinds.Follow, obstacles.Heights]; "
+        "print(*(m.__name__ for m in unused if m.__pydantic_complete__)); "
+        "print(*(m for m in ('difflib', 'rigidfleet.foreign.files', 'rigidfleet._common.tables') if m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == []
 
 
 @pytest.mark.parametrize("value", [REMOVED, 0, []])

@@ -12,7 +12,7 @@ from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import KNOWN, UNKNOWN, avoidance, sight
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, box, half_space, joined, single
+from rigidfleet.solids.records import ball, box, half_space, join, single
 
 #: Period of the commands [s].
 T = 0.02
@@ -57,7 +57,7 @@ def passing(place, velocity, radius=0.7):
 def test_the_filter_is_the_conditional_mean(swerve):
     """Estimate and variance are those of the Gaussian of all places and velocities, given all measurements at once."""
     noise, ticks, velocity = 0.05, 30, np.array([1.0, -2.0, 0.5])
-    things = joined([single(half_space(-90.0)), passing([5.0, 0, 0], velocity)])
+    things = join([single(half_space(-90.0)), passing([5.0, 0, 0], velocity)])
     fly = One(things, reach=50.0, noise=noise, swerve=swerve, seed=3)
     for k in range(ticks):
         fly(k * T, np.zeros(3), np.zeros(3), np.zeros(3))

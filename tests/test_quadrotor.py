@@ -441,7 +441,7 @@ def test_allocation_keeps_its_priorities():
         PAPER, rotors=[[0.2, 0.15, 0], [0.15, -0.2, 0], [-0.2, -0.15, 0], [-0.15, 0.25, 0]]
     )
     for vehicle in (PAPER, uneven):
-        B = vehicle.unmixed(G)
+        B = vehicle.allocation(G)
         for _ in range(100):
             thrust, tau = (
                 rng.uniform(-5, 30),

@@ -197,15 +197,15 @@ def test_vehicles_with_rotors(calm, quick):
 def test_side_by_side(calm, hasty, quick):
     """Of several flights the page tells what differs: numbers, keys of the missions, overlaid figures."""
     page = contents([calm, hasty], ["calm", "hasty"], None)
-    assert {row["key"] for row in page["keys"]} == {
+    assert {row.cells[0] for row in page["keys"].rows} == {
         "constraint.alpha", "constraint.beta", "constraint.gamma", "limits.geofence.max",
         "limits.speed", "phases[2].duration",
     }  # fmt: skip
-    numbers = {row["name"]: row for row in page["numbers"]}
-    assert numbers["length of the flight"]["cells"] == ["12", "7"]
-    assert not numbers["greatest speed of a vehicle"]["same"]
-    assert numbers["greatest speed of a vehicle"]["change"][1].startswith(("+", "×"))
-    assert numbers["least distance between two vehicles' surfaces"]["same"]
+    numbers = {name: cells for name, *cells in (row.cells for row in page["numbers"].rows)}
+    assert [cell.text for cell in numbers["length of the flight [s]"]] == ["12", "7"]
+    assert numbers["greatest speed of a vehicle [m/s]"][1].small.startswith(("+", "×"))
+    one, other = numbers["least distance between two vehicles' surfaces [m]"]
+    assert one == other
     assert len(page["overlays"]) == 2
     text = Page(html_page([calm, hasty], labels=["calm", "hasty"])).text
     for words in ("2 flights side by side", "Differences", "calm", "hasty", "Passed", "Failed"):
@@ -216,8 +216,8 @@ def test_flights_of_one_mission_are_numbered(calm, quick):
     """Two flights of one mission are told apart, and their missions found to be the same."""
     page = contents([calm, calm], None, None)
     assert [flight["label"] for flight in page["flights"]] == ["pair (1)", "pair (2)"]
-    assert page["keys"] == []
-    assert all(row["same"] for row in page["numbers"])
+    assert page["keys"].rows == []
+    assert all(one == other for _, one, other in (row.cells for row in page["numbers"].rows))
 
 
 def test_gains_mean_what_they_do():
@@ -288,7 +288,8 @@ phases = [{{kind = "hold", duration = 1}}]
 """
     page = contents([simulate(Mission.from_toml(text))], None, None)
     (flight,) = page["flights"]
-    assert [v["name"] for v in flight["vehicles"]] == [str(i) for i in range(17, 41)]
+    shown = [row.cells[0].text for row in flight["vehicles"].rows]
+    assert shown == [str(i) for i in range(17, 41)]
     assert flight["vehicles_left_out"] == 16
 
 

@@ -493,7 +493,7 @@ assert "numba" not in sys.modules
 
 def test_points_do_not_load_the_code_of_quadrotors():
     """Point flights leave the second library alone; once it is compiled, quadrotors fly without the compiler."""
-    native.sampled()
+    native.sampled_library()
     subprocess.run([sys.executable, "-c", LIBRARIES, str(Path(__file__).parent)], check=True)
 
 
@@ -502,12 +502,12 @@ def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
     code = native._read("sampled")
     assert code is not None
     others = {part: x for part, x in native._loaded.items() if part != "sampled"}
-    made = native._linked_sampled(code, code)
+    made = native._link("sampled", code, code)
     monkeypatch.setattr(native, "_loaded", others | {"sampled": made})
     given = native.bequeath()
     monkeypatch.setattr(native, "_loaded", others)
     native.inherit(given)
-    assert native.sampled().unkept == code
+    assert native.sampled_library().unkept == code
 
 
 def test_a_flight_goes_on_under_another_problem():
@@ -519,7 +519,7 @@ def test_a_flight_goes_on_under_another_problem():
     assert m != len(work.c)
     with pytest.raises(ValueError, match=r"fleet\.renewed"):
         sampled.fly_ticks(other, wide, flight, state, fleet.segment(8, m, flight.start + 0.2))
-    state = fleet.renewed(state, wide, np.full(m, 0.01))
+    state = fleet.under_problem(state, wide, np.full(m, 0.01))
     fly(other, wide, flight, state, flight.start + 0.2)
     assert state.count[fleet.TICKS] == 100
     np.testing.assert_allclose(state.integral[0], 0.01, rtol=0, atol=5e-3)

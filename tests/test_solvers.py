@@ -432,7 +432,7 @@ def test_velocities_are_held_to_what_places_are():
 def test_large_formations_do_not_creep_into_a_phase(monkeypatch):
     """Their first step is found from two evaluations: fewer steps, and the same flight."""
     found = simulate(flight("exact", "henneberg"))
-    monkeypatch.setattr("rigidfleet.simulation.active_phase.first_step", lambda *_: 1e-3)
+    monkeypatch.setattr("rigidfleet.simulation.point_phase.first_step", lambda *_: 1e-3)
     crept = simulate(flight("exact", "henneberg"))
     assert found.statistics["steps"] <= crept.statistics["steps"] - 2
     assert found.statistics["rejected"] <= crept.statistics["rejected"]

@@ -9,6 +9,8 @@ import sys
 
 def main() -> int:
     """Run the command; return its exit code."""
+    # No plugin of pydantic concerns missions, and to look for some reads about all packages that are installed.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")
     try:
         import signal
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import degrees, inf
 from operator import attrgetter
 from typing import Any, Literal
 
@@ -17,7 +18,7 @@ Who = Literal["agent", "pair", "edge", "obstacle", "formation"]
 Sense = Literal["least", "greatest", "size"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Quantity:
     """A quantity of a flight.
 
@@ -36,12 +37,12 @@ class Quantity:
     nothing : words if there is nothing to judge; "" for "the flight has no speed to judge"
     monitored : whether the kernel's monitor finds it in continuous time
     by_phase : whether a verdict has its worst value for each phase
-    metric, page : whether it is a metric of sweeps, and a row of the safety page
+    checked : whether a verdict checks or reports it, and a sweep keeps it
     """
 
     name: str
     unit: str
-    text: str
+    text: str = ""
     who: Who = "agent"
     sense: Sense = "greatest"
     key: str = ""
@@ -53,8 +54,7 @@ class Quantity:
     nothing: str = ""
     monitored: bool = True
     by_phase: bool = False
-    metric: bool = True
-    page: bool = True
+    checked: bool = True
 
     @property
     def called(self) -> str:
@@ -68,7 +68,9 @@ class Quantity:
 
     def rank(self, values: Any) -> Any:
         """Numbers that are greater the worse values are."""
-        return -values if self.at_least else abs(values) if self.sense == "size" else values
+        if self.sense == "least":
+            return -values
+        return abs(values) if self.sense == "size" else values
 
     def limit_of(self, mission: Any) -> Any:
         """The limit that a mission sets, in `unit`, or those of the agents; None if it sets none."""
@@ -76,30 +78,22 @@ class Quantity:
         return None if limit is None else limit(mission)
 
 
-def _motions() -> list[Quantity]:
-    """Sizes of velocity, acceleration and jerk: in all directions, over the ground, and up and down.
+def _motion(order: int, way: str, what: str, unit: str) -> Quantity:
+    """The size of a velocity, an acceleration or a jerk in a direction.
 
-    What a vehicle's jerk is nobody measures: the one that is limited is that of the slots it tracks.
+    Nobody measures the jerk of a vehicle: the one that is limited is that of the slots that are tracked.
     """
-    found = []
-    for order, (what, unit, of) in enumerate(
-        (
-            ("speed", "m/s", "a vehicle"),
-            ("acceleration", "m/s^2", "a vehicle"),
-            ("jerk", "m/s^3", "a slot that is tracked"),
-        ),
-        start=1,
-    ):
-        for way in ("", "horizontal", "vertical"):
-            name = f"{way}_{what}".lstrip("_")
-            found.append(
-                Quantity(
-                    name=name, unit=unit, order=order, way=way, key=f"limits.{name}", monitored=order < 3,
-                    text=f"greatest {name.replace('_', ' ')} of {of}{', if it has a limit' if way else ''}",
-                    by_phase=order < 3 and not way, nothing="no slots are tracked" if order == 3 else "",
-                )
-            )  # fmt: skip
-    return sorted(found, key=lambda q: bool(q.way))
+    name = f"{way}_{what}".lstrip("_")
+    text = f"greatest {name.replace('_', ' ')} of a {'vehicle' if order < 3 else 'slot'}"
+    nothing = "" if order < 3 else "no slots are tracked"
+    return Quantity(
+        name, unit, f"{text}, if it is limited" if way else text, key=f"limits.{name}", order=order, way=way,
+        nothing=nothing, monitored=order < 3, by_phase=order < 3 and not way,
+    )  # fmt: skip
+
+
+def _no_fence(mission: Any) -> bool:
+    return mission.limits.geofence is None
 
 
 #: Quantities in the order in which verdicts and pages have them.
@@ -107,103 +101,89 @@ QUANTITIES: dict[str, Quantity] = {
     q.name: q
     for q in (
         Quantity(
-            name="separation", unit="m", who="pair", sense="least", key="limits.separation", by_phase=True,
-            limit=lambda mission: mission.limits.separation_always or 0.0,
-            text="least distance between two vehicles' surfaces",
+            "separation", "m", "least distance between two vehicles' surfaces", "pair", "least", "limits.separation",
+            lambda mission: mission.limits.separation_always or 0.0, by_phase=True,
             words="{who} come within {worst} of each other at {when:.2f} s (limit {limit:g} m)",
         ),
         Quantity(
-            name="separation_flying", unit="m", who="pair", sense="least", key="limits.separation",
-            limit=lambda m: None if m.limits.separation_altitude is None else m.limits.separation,
-            text="the same, one at limits.separation_altitude or above",
+            "separation_flying", "m", "the same, one at limits.separation_altitude or above", "pair", "least",
+            "limits.separation", lambda m: None if m.limits.separation_altitude is None else m.limits.separation,
         ),
         Quantity(
-            name="separation_as_planned", unit="m", who="pair", key="limits.separation_allowance", monitored=False,
-            text="greatest distance by which two vehicles come nearer than the plan of the phase proves",
+            "separation_as_planned", "m", "greatest distance by which vehicles come nearer than a phase's plan proves",
+            "pair", key="limits.separation_allowance", monitored=False,
         ),
         Quantity(
-            name="clearance", unit="m", who="obstacle", sense="least", by_phase=True,
-            limit=lambda mission: 0.0 if mission.obstacles else None,
-            text="least distance of a vehicle's surface to an obstacle or the ground",
+            "clearance", "m", "least distance of a vehicle's surface to an obstacle or the ground", "obstacle",
+            "least", limit=lambda mission: 0.0 if mission.obstacles else None, by_phase=True,
         ),
         Quantity(
-            name="lost", unit="m", who="pair", sense="least", limit=lambda _: 0.0, metric=False, page=False,
-            text="least distance of a lost vehicle to one that still flies",
+            "lost", "m", "least distance of a lost vehicle to one that still flies", "pair", "least",
+            limit=lambda mission: None if mission.first_loss == inf else 0.0,
         ),
         Quantity(
-            name="separation_below", unit="m", who="pair", sense="least", key="limits.separation_below",
-            text="least height between surfaces of two vehicles, one below the other",
+            "separation_below", "m", "least height between surfaces of two vehicles, one below the other", "pair",
+            "least", "limits.separation_below", nothing="no agent flies below another",
             words="{who} fly one below the other, {worst} apart at {when:.2f} s (limit {limit:g} m)",
-            nothing="no agent flies below another",
         ),
         Quantity(
-            name="geofence", unit="m", key="limits.geofence",
-            limit=lambda mission: None if mission.limits.geofence is None else 0.0,
-            text="greatest distance of a vehicle's centre outside the geofence; negative inside",
+            "geofence", "m", "greatest distance of a vehicle's centre outside the geofence; negative inside",
+            key="limits.geofence", limit=lambda m: None if _no_fence(m) else 0.0,
         ),
         Quantity(
-            name="lowest", unit="m", sense="least", metric=False, text="least altitude of a vehicle's centre",
-            limit=lambda m: None if m.limits.geofence is None else m.limits.geofence.min[2],
+            "lowest", "m", "least altitude of a vehicle's centre", sense="least", checked=False,
+            limit=lambda m: None if _no_fence(m) else m.limits.geofence.min[2],
         ),
         Quantity(
-            name="highest", unit="m", metric=False, text="greatest altitude of a vehicle's centre",
-            limit=lambda m: None if m.limits.geofence is None else m.limits.geofence.max[2],
+            "highest", "m", "greatest altitude of a vehicle's centre", checked=False,
+            limit=lambda m: None if _no_fence(m) else m.limits.geofence.max[2],
         ),
-        *_motions(),
-        Quantity(
-            name="corner", unit="m/s", monitored=False, metric=False, page=False,
-            text="greatest jump of a velocity where a curve that others made turns at once",
-        ),
-        Quantity(
-            name="thrust", unit="N", key="agents.thrust_limit", order=2, way="thrust", by_phase=True,
-            text="thrust of the vehicle that comes nearest to its limit; the greatest if none has one",
+        *(
+            _motion(order, way, what, unit)
+            for ways in (("",), ("horizontal", "vertical"))
+            for order, what, unit in ((1, "speed", "m/s"), (2, "acceleration", "m/s^2"), (3, "jerk", "m/s^3"))
+            for way in ways
         ),
         Quantity(
-            name="thrust_margin", unit="N", metric=False, page=False, text="greatest thrust minus its limit",
+            "thrust", "N", "thrust of the vehicle that comes nearest to its limit; the greatest if none has one",
+            key="agents.thrust_limit", order=2, way="thrust", by_phase=True,
         ),
+        Quantity("thrust_margin", "N", "greatest thrust minus its limit", checked=False),
         Quantity(
-            name="rotor_force", unit="N", metric=False, monitored=False,
-            text="force of the rotor that comes nearest to its limit",
+            "rotor_force", "N", "force of the rotor that comes nearest to its limit", monitored=False,
             limit=lambda m: [v.rotor_limit for v in m.vehicle_models or ()], nothing="flown by points",
         ),
         Quantity(
-            name="saturation", unit="%", key="limits.saturation", scale=100.0, monitored=False,
-            limit=lambda mission: 100.0 * mission.limits.saturation,
-            text="greatest share of a phase in which a vehicle is asked for more than its rotors give",
+            "saturation", "%", "greatest share of a phase in which a vehicle is asked for more than its rotors give",
+            key="limits.saturation", limit=lambda m: 100.0 * m.limits.saturation, scale=100.0, monitored=False,
             nothing="no vehicle is asked for more than its rotors give",
         ),
         Quantity(
-            name="tilt", unit="deg", key="limits.tilt_deg", order=2, way="tilt", monitored=False,
-            scale=57.29577951308232, text="greatest tilt of a vehicle", nothing="no slots are tracked",
+            "tilt", "deg", "greatest tilt of a vehicle; of points, of the thrust that their slots need",
+            key="limits.tilt_deg", order=2, way="tilt", scale=degrees(1.0), nothing="no slots are tracked",
+            monitored=False,
         ),
         Quantity(
-            name="tracking_error", unit="m", key="limits.tracking_error", monitored=False,
-            text="greatest distance of a vehicle from its slot", nothing="no slots are tracked",
+            "tracking_error", "m", "greatest distance of a vehicle from its slot", key="limits.tracking_error",
+            nothing="no slots are tracked", monitored=False,
         ),
         Quantity(
-            name="guarantee", unit="m", who="pair", sense="least", limit=lambda _: 0.0, monitored=False,
-            metric=False, page=False, text="least distance that is left if vehicles brake at once",
+            "guarantee", "m", "least distance to others or obstacles that is left if vehicles brake at once", "pair",
+            "least", monitored=False,
+        ),
+        Quantity("clearance_guarantee", "m", "", "obstacle", "least", monitored=False, checked=False),
+        Quantity(
+            "constraint", "m", "greatest constraint error |c| = |L - d|: edge length minus reference", "edge", "size",
+            by_phase=True,
+        ),
+        Quantity("constraint_force", "N", "greatest constraint force on a vehicle", by_phase=True),
+        Quantity(
+            "tension", "N", "tension of greatest size in an edge; negative: compression", "edge", "size",
+            by_phase=True,
         ),
         Quantity(
-            name="clearance_guarantee", unit="m", who="obstacle", sense="least", limit=lambda _: 0.0, monitored=False,
-            metric=False, page=False, text="least distance to an obstacle that is left if a vehicle brakes at once",
-        ),
-        Quantity(
-            name="constraint", unit="m", who="edge", by_phase=True, page=False, sense="size",
-            text="greatest constraint error |c| = |L - d|: edge length minus reference",
-        ),
-        Quantity(
-            name="constraint_force", unit="N", by_phase=True, page=False,
-            text="greatest constraint force on a vehicle",
-        ),
-        Quantity(
-            name="tension", unit="N", who="edge", sense="size", by_phase=True, page=False,
-            text="tension of greatest size in an edge; negative: compression",
-        ),
-        Quantity(
-            name="singular_value", unit="", who="formation", sense="least", by_phase=True, page=False,
-            monitored=False, text="least singular value of the constraint Jacobian",
-            words="smallest singular value of J {worst} at {when:.2f} s",
+            "singular_value", "", "least singular value of the constraint Jacobian", "formation", "least",
+            words="smallest singular value of J {worst} at {when:.2f} s", monitored=False, by_phase=True,
         ),
     )
 }  # fmt: skip
@@ -211,6 +191,12 @@ QUANTITIES: dict[str, Quantity] = {
 MOTIONS = tuple(
     q for q in QUANTITIES.values() if q.way in ("", "horizontal", "vertical") and q.order
 )
+#: Keys of limits that are numbers and that curves are judged by.
+LIMITS_OF_CURVES = [
+    name
+    for name, q in QUANTITIES.items()
+    if q.monitored and q.key == f"limits.{name}" and not q.limit
+]
 
 
 def shown(unit: str) -> str:
@@ -225,5 +211,5 @@ def quantity(name: str) -> Quantity:
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
-    whole = QUANTITIES.get(name.rpartition("_")[0], Quantity(name=name, unit="", text=""))
+    whole = QUANTITIES.get(name.rpartition("_")[0], Quantity(name, ""))
     return replace(whole, name=name)

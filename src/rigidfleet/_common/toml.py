@@ -22,8 +22,8 @@ def to_toml(data: Mapping[str, Any]) -> str:
     TypeError
         A value has no TOML form.
     """
-    text = tomli_w.dumps(_plain(data))
-    return _NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())[:-1]}]", text)
+    text = tomli_w.dumps(plain_data(data))
+    return _NUMBERS.sub(lambda match: f"[{' '.join(match[1].split())[:-1]}]", text)
 
 
 def toml_key(key: str) -> str:
@@ -31,14 +31,21 @@ def toml_key(key: str) -> str:
     return tomli_w.dumps({key: 0}).removesuffix(" = 0\n")
 
 
-def _plain(value: Any) -> Any:
+def plain_data(value: Any) -> Any:
+    """A copy of data as TOML has it: lists instead of NumPy's arrays and tuples, and no keys whose value is None.
+
+    Raises
+    ------
+    TypeError
+        A value has no TOML form.
+    """
     if hasattr(value, "tolist"):  # NumPy's arrays and scalars
         value = value.tolist()
     match value:
         case bool() | int() | float() | str():
             return value
         case list() | tuple():
-            return [_plain(item) for item in value]
+            return [plain_data(item) for item in value]
         case Mapping():
-            return {str(key): _plain(item) for key, item in value.items() if item is not None}
+            return {str(key): plain_data(item) for key, item in value.items() if item is not None}
     raise TypeError(f"a {type(value).__name__} has no place in a mission: {value!r}")

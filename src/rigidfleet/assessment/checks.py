@@ -25,6 +25,7 @@ from rigidfleet.assessment.outcome import (
     value,
 )
 from rigidfleet.result import LABELS, PAD, Result
+from rigidfleet.result.quantities import Samples
 
 # Greatest overlap of a vehicle that stands on an obstacle [m]; more is a collision.
 _CONTACT = 1e-6
@@ -50,6 +51,7 @@ def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[C
     )
     for q in QUANTITIES.values():
         yield from _CHECKS.get(q.name, _limited)(measured, q)
+    yield from _corner(measured)
 
 
 def _failures_or_nearest(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -270,7 +272,7 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         )
 
 
-def _corner(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _corner(measured: Measurements) -> Iterator[CheckResult]:
     """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
     result = measured.result
     if result.interpolation is None or not np.isfinite(result.acceleration).any():
@@ -286,7 +288,9 @@ def _corner(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     judged = any(x.limit_of(measured.mission) for x in MOTIONS if x.order == 2)
     if judged:
         words += f" (limit {_CORNER:g} m/s where accelerations are limited)"
-    yield bounded(q, e, _CORNER if judged else None, words, passed=not judged)
+    yield bounded(
+        Quantity("corner", "m/s"), e, _CORNER if judged else None, words, passed=not judged
+    )
 
 
 def _separation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
@@ -410,13 +414,13 @@ def _geofence(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
 
 def _thrust(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the vehicle nearest to its own thrust limit; report the greatest thrust if another vehicle has it."""
-    e, beyond = measured.worst(q.name), measured.worst("thrust_margin")
-    if e is None:
+    if (e := measured.worst(q.name)) is None:
         return  # nobody knows what a trajectory from elsewhere needs
+    limits, margin = measured.mission.fleet.thrust_limit, QUANTITIES["thrust_margin"]
+    beyond = measured.among(margin.name, Samples(margin, measured.thrust - limits))
     if beyond is None:
         yield bounded(q, e, None)
         return
-    limits = q.limit_of(measured.mission)
 
     def limit(who: str) -> float:
         return float(limits[int(who.removeprefix("agent ")) - 1])
@@ -492,7 +496,6 @@ _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = 
     "clearance": _clearance,
     "lost": _lost,
     "geofence": _geofence,
-    "corner": _corner,
     "thrust": _thrust,
     "rotor_force": _rotor_force,
     "saturation": _saturation,

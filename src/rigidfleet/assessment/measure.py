@@ -4,44 +4,34 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
-from functools import cached_property, partial
+from collections.abc import Iterator
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, quantity
-from rigidfleet._common.text import agent_names
-from rigidfleet.assessment.fits import Fit, Laid, angle_between, length
+from rigidfleet._common.quantities import QUANTITIES, quantity
+from rigidfleet.assessment.fits import Fit, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.math.bernstein import SIZES
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
+from rigidfleet.result.quantities import (
+    SAMPLED,
+    Samples,
+    closeness,
+    length,
+    of_left,
+    owner_name,
+    samples,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
-
-#: What has a value: by its sample, and its place there, the indices that its quantity needs to name it (from 0).
-Owner = Callable[..., tuple[int, ...]]
-
-
-class Samples:
-    """Values (K, ...) of a quantity at samples, with their owners.
-
-    Attributes
-    ----------
-    rank : of each value (K, places): greater is worse; -infinity if the value is not finite
-    """
-
-    def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i: (i, -1)) -> None:
-        self.quantity, self.values, self.owner = q, values, owner
-        rank = q.rank(values)
-        self.rank = np.where(np.isfinite(rank), rank, -np.inf).reshape(len(rank), -1)
 
 
 class Measurements:
@@ -59,60 +49,30 @@ class Measurements:
         #: Quantities of which the record tells what happens between samples.
         self.told = set[str]().union(*(p.extremes for p in result.phases))
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
-        self._nearest: dict[tuple[float, int], int] = {}
         self._sampled: dict[str, Samples] = {}
         #: Distances to each other and to obstacles at samples.
-        self.close = proximity.closeness(
-            result.position,
-            self.mission.agents.radius,
-            self.mission.obstacles,
-            result.time,
-            self.left,
-        )
-        thrust = length(result.input_force, result.constraint_force)
-        if self.mission.agents.saturate:
-            thrust = np.minimum(thrust, self.mission.agents.thrust_limit)
-        if result.rotor_force is not None:  # what was given, not what was asked
-            thrust = result.rotor_force.sum(axis=2)
-        self.thrust = self.of_left(np.maximum(thrust, result.thrust))
+        self.close = closeness(result)
         self.measured = {q.name: self.sampled(q.name) for q in QUANTITIES.values() if q.by_phase}
+        self.thrust = self.measured["thrust"].values
         #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
         self.rank = {name: [-math.inf] * len(result.phases) for name in self.measured}
         starts = np.array([self.samples[k].start for k in self.flown])
-        for name, samples in self.measured.items():
-            if places := samples.rank.shape[1]:
-                most = np.maximum.reduceat(samples.rank.reshape(-1), places * starts).tolist()
+        for name, sampled in self.measured.items():
+            if places := sampled.rank.shape[1]:
+                most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
                 for k, rank in zip(self.flown, most, strict=True):
                     self.rank[name][k] = rank
-        #: The last sample of each phase flown, and positions (F, N, 3) there.
-        self.last = [self.samples[k].stop - 1 for k in self.flown]
-        self.ends = result.position[self.last]
-
-    def of_left(self, values: Floats) -> Floats:
-        """Values (K, N), NaN for lost agents."""
-        return values if self.whole else np.where(self.left, values, np.nan)
 
     def first(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
-
-    def owner(self, q: Quantity, who: int, other: int = -1) -> str:
-        """Name of the owner of a value: an agent, two agents, an edge, or an agent and an obstacle (from 0)."""
-        match q.who:
-            case "pair":
-                return agent_names(sorted((who, other)))
-            case "edge":
-                return f"edge {who + 1}-{other + 1}"
-            case "obstacle":
-                return f"agent {who + 1}, {self.mission.obstacles[other].name}"
-        return f"agent {who + 1}" if q.who == "agent" else ""
 
     # -- at samples -----------------------------------------------------------------------------------
 
     def sampled(self, name: str) -> Samples:
         """Values of a quantity at samples."""
         if name not in self._sampled:
-            self._sampled[name] = Samples(QUANTITIES[name], *_SAMPLED[name](self))
+            self._sampled[name] = samples(self.result, name, self.close)
         return self._sampled[name]
 
     def worst_sample(
@@ -129,7 +89,11 @@ class Measurements:
         at = (k,) if values.ndim == 1 else (k, place)
         phase, who = result.phases[result.phase.item(k)].name, samples.owner(*at)
         return Extreme(
-            values.item(at), result.time.item(k), self.owner(samples.quantity, *who), phase, alone
+            values.item(at),
+            result.time.item(k),
+            owner_name(result, samples.quantity, *who),
+            phase,
+            alone,
         )
 
     # -- between samples ------------------------------------------------------------------------------
@@ -144,7 +108,7 @@ class Measurements:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
         size = abs(x.value) if name == "constraint" else q.scale * x.value
-        return Extreme(size, x.time, self.owner(q, x.who, x.other), phase)
+        return Extreme(size, x.time, owner_name(self.result, q, x.who, x.other), phase)
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
@@ -152,7 +116,7 @@ class Measurements:
             every = [worst[name] for worst in self.worst_of if name in worst]
             rank = QUANTITIES[name].rank
             return max(every, key=lambda e: rank(e.value), default=None)
-        return self.among(name, self.sampled(name) if name in _SAMPLED else None)
+        return self.among(name, self.sampled(name) if name in SAMPLED else None)
 
     def among(self, name: str, samples: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``samples``, or between them."""
@@ -172,14 +136,14 @@ class Measurements:
     def worst_of(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         found: list[dict[str, Extreme]] = [{} for _ in self.samples]
-        for name, samples in self.measured.items():
+        for name, sampled in self.measured.items():
             ranks, alone = self.rank[name], name not in self.told
             for k, phase in enumerate(self.result.phases):
                 x, rank, worst = phase.extremes.get(name), ranks[k], None
-                if x is not None and rank < samples.quantity.rank(x.value):
+                if x is not None and rank < sampled.quantity.rank(x.value):
                     worst = self.recorded(name, x, phase.name)
                 elif rank != -math.inf:
-                    worst = self.worst_sample(samples, self.samples[k], alone=alone)
+                    worst = self.worst_sample(sampled, self.samples[k], alone=alone)
                 if worst is not None:
                     found[k][name] = worst
         return found
@@ -191,9 +155,9 @@ class Measurements:
         every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
         if every:
             return self.between(f"{name}_first", every[0])
-        samples = self.sampled(name)
-        k = int(np.argmax(samples.values <= 0.0))
-        return self.worst_sample(samples, slice(k, k + 1), alone=True) or e
+        sampled = self.sampled(name)
+        k = int(np.argmax(sampled.values <= 0.0))
+        return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
 
     def clearances(self) -> dict[str, Extreme | None]:
         """Least clearance to obstacles [m] in flight, and of vehicles standing on one at the start or end.
@@ -202,7 +166,7 @@ class Measurements:
         the end.
         """
         time = self.result.time
-        clearance, nearest = self.of_left(self.close.each), self.close.nearest
+        clearance, nearest = of_left(self.result, self.close.each), self.close.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.told & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
@@ -250,7 +214,10 @@ class Measurements:
                 if name in vars(result):  # else it would be made of these very positions
                     stored[name] = getattr(result, name) - getattr(self.close, name), "m"
         stored |= {
-            "distance": (self.off_lengths, "m"),
+            "distance": (
+                np.abs(proximity.lengths(r, result.edges).T - result.distance),
+                "m",
+            ),
             "thrust": (self.thrust - result.thrust, "N"),
         }
         for name, (off, unit) in stored.items():
@@ -299,19 +266,6 @@ class Measurements:
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
 
-    @property
-    def off_lengths(self) -> Floats:
-        """Greatest size (K,) [m] by which a recorded length of an edge differs from that between positions."""
-        r, edges, given = self.result.position, self.result.edges, self.result.distance
-        greatest = np.zeros(len(r))
-        some = max(1, proximity.CACHED * len(r) // r.size)  # of some samples at a time
-        for k in range(0, len(r), some):
-            part = slice(k, k + some)
-            off = proximity.lengths(r[part], edges)
-            off -= given[part].T
-            np.fmax.reduce(np.abs(off, out=off), axis=0, initial=0.0, out=greatest[part])
-        return greatest
-
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
         result, samples = self.result, self.samples[index]
@@ -328,38 +282,25 @@ class Measurements:
             t_end=record.t_end,
             settled=record.settled,
             finished=finished,
-            constraint=self.constraints.get(index),
-            distances=self.distances.get(index),
+            constraint=_greatest(result.constraint[samples.stop - 1]) if flown else None,
+            distances=self.edge_error(index) if flown else None,
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
-            flip=self.flips.get(index),
+            flip=self.flip(index),
             order=None if fit is None else fit.in_order,
-            waypoint=self.misses.get(("target", index)) if finished else None,
-            stay=self.misses.get(("stay", index)) if finished else None,
+            waypoint=self.miss(index, record.target) if finished else None,
+            stay=self.miss(index, record.stay) if finished else None,
             through=tuple(self.passed(index)),
             worst=self.worst_of[index],
         )
 
-    @cached_property
-    def constraints(self) -> dict[int, float | None]:
-        """Greatest |c| [m] of an edge at the end of each phase flown."""
-        return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
-
-    @cached_property
-    def distances(self) -> dict[int, float | None]:
-        """Greatest error [m] of an edge against its formation at the end of each phase that has one."""
-        alike: dict[str, list[int]] = {}
-        for i, k in enumerate(self.flown):
-            if (name := self.result.phases[k].formation) is not None:
-                alike.setdefault(name, []).append(i)
-        found: dict[int, float | None] = {}
-        for name, every in alike.items():
-            # Some edges may be lost later
-            for group in [every] if self._same_edges else [[i] for i in every]:
-                edges, intended = self.edges(name, self.last[group[0]])
-                off = (proximity.lengths(self.ends[group], edges) - intended[:, None]).T
-                found |= zip([self.flown[i] for i in group], _greatest(off), strict=True)
-        return found
+    def edge_error(self, index: int) -> float | None:
+        """Greatest error [m] of an edge against the formation at the end of a phase flown; None without one."""
+        name, k = self.result.phases[index].formation, self.samples[index].stop - 1
+        if name is None:
+            return None
+        (edges, intended), r = self.edges(name, k), self.result.position[k]
+        return _greatest(length(r[edges[:, 0]] - r[edges[:, 1]]) - intended)
 
     @property
     def _same_edges(self) -> bool:
@@ -386,116 +327,78 @@ class Measurements:
 
     @cached_property
     def fits(self) -> dict[int, Fit]:
-        """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
-        alike: dict[int, list[tuple[int, Floats, Floats, Ints | None]]] = {}
-        known = np.atleast_1d(np.isfinite(self.ends).all(axis=(1, 2)))
-        for index, end, finite in zip(self.flown, self.ends, known, strict=True):
-            name = self.result.phases[index].formation
-            slots = None if name is None else self.formation(name)[0]
-            if slots is None or not finite:
-                continue
-            one = index, end, slots, None
-            if not self.whole:
-                left = np.flatnonzero(self.left[self.samples[index].stop - 1])
-                one = index, end[left], slots[left], left
-            if len(one[1]) > 1:
-                alike.setdefault(len(one[1]), []).append(one)
+        """Fits of the formations at the end of each phase."""
         fits = {}
-        for group in alike.values():
-            laid = Laid(np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group]))
-            for k, (index, p, slots, left) in enumerate(group):
-                fit = fits[index] = Fit(p, slots, left, laid, k)
-                form = self.mission.formations[self.result.phases[index].formation or ""]
-                fit.limit = form.greatest_error(fit.shortest)
+        for index in self.flown:
+            k, name = self.samples[index].stop - 1, self.result.phases[index].formation
+            slots = None if name is None else self.formation(name)[0]
+            p, left = self.result.position[k], np.flatnonzero(self.left[k])
+            if name is None or slots is None or len(left) < 2 or not np.isfinite(p).all():
+                continue
+            fit = fits[index] = Fit(p[left], slots[left], left)
+            fit.limit = self.mission.formations[name].greatest_error(fit.shortest)
         return fits
 
     @cached_property
-    def flips(self) -> dict[int, float]:
-        """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
-        flat = {k: fit for k, fit in self.fits.items() if fit.dimension in (1, 2)}
-        if not flat:
-            return {}
-        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        last = [self.samples[k].stop - 1 for k in flat]
-        q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
-        axes = np.array([fit.axis for fit in flat.values()])
-        aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
-        found = {}
-        for i, (k, fit) in enumerate(flat.items()):
-            some = aims[:, i].tolist()
-            if fit.dimension == 1:
-                # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-                some = some[:1] if self.result.phases[k].control == "tracking" else []
-            angles = (angle_between(fit.points, aim) for aim in some)
-            angle = next(filter(math.isfinite, angles), None)
-            if angle is not None:
-                found[k] = angle
-        return found
+    def turns(self) -> dict[int, Floats]:
+        """Matrices (2, 3, 3) from the slots' axes to how they should lie at the end of each phase flown.
+
+        A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+        """
+        last = [self.samples[k].stop - 1 for k in self.flown]
+        q = np.stack([self.result.attitude_reference[last], self.result.frame[last]], axis=1)
+        return dict(zip(self.flown, att.dcm_from_quaternion(q).swapaxes(2, 3), strict=True))
+
+    def flip(self, index: int) -> float | None:
+        """Angle [deg] of a line or plane from its intended direction at the end of a phase that has one."""
+        fit = self.fits.get(index)
+        if fit is None or fit.dimension not in (1, 2):
+            return None
+        aims = (self.turns[index] @ fit.axis).tolist()
+        if fit.dimension == 1:
+            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
+            aims = aims[:1] if self.result.phases[index].control == "tracking" else []
+        angles = (angle_between(fit.points, aim) for aim in aims)
+        return next(filter(math.isfinite, angles), None)
 
     def nearest(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
-        known, time, samples = self._nearest.get((t, index)), self.result.time, self.samples[index]
-        if known is None:
-            after = bisect_left(time, t, samples.start, samples.stop - 1)
-            before = max(after - 1, samples.start)
-            known = after if abs(time[after] - t) < abs(time[before] - t) else before
-            self._nearest[t, index] = known
-        return known
+        time, samples = self.result.time, self.samples[index]
+        after = bisect_left(time, t, samples.start, samples.stop - 1)
+        before = max(after - 1, samples.start)
+        return after if abs(time[after] - t) < abs(time[before] - t) else before
 
-    @cached_property
-    def misses(self) -> dict[tuple[str, int], Waypoint]:
-        """Miss of the ``target`` of each phase that has one, and of its place to ``stay`` at its end.
+    def miss(self, index: int, target: dict[str, Any] | None) -> Waypoint | None:
+        """Miss of the target of a phase, or of its place to stay at its end; None without one.
 
         A target is due at its time, or at the end of a phase that settles earlier. Where no formation is held, each
         vehicle has a place of its own: the vehicle furthest from it counts.
         """
-        result = self.result
-        targets = [
-            ((what, k), x)
-            for k in self.flown
-            for what in ("target", "stay")
-            if (x := getattr(result.phases[k], what)) is not None
-        ]
-        if not targets:
-            return {}
-        at = [self.nearest(target["time"], k) for (_, k), target in targets]
-        miss: dict[str, dict[int, float]] = {}
+        if target is None:
+            return None
+        result, k = self.result, self.nearest(target["time"], index)
+        off: dict[str, float] = {}
         for name, values in (
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
             ("rates", result.rates),
         ):  # fmt: skip
-            rows = values[at].tolist()
-            # Where the quantity is asked for, and known.
-            asked = {
-                i: wanted for i, ((_, target), row) in enumerate(zip(targets, rows, strict=True))
-                if (wanted := target.get(name)) is not None and all(map(math.isfinite, row))
-            }  # fmt: skip
-            rows = [rows[i] for i in asked]
-            if name == "attitude" and rows:
-                off = np.degrees(att.angle_between(rows, [*asked.values()])).tolist()
+            x, wanted = values[k], target.get(name)
+            if wanted is None or not all(map(math.isfinite, x.tolist())):
+                continue
+            if name == "attitude":
+                off[name] = math.degrees(att.angle_between(x, np.array(wanted)))
             else:
-                off = map(math.dist, rows, asked.values())
-            miss[name] = dict(zip(asked, off, strict=True))
-        for i, off in miss["position"].items():
-            if result.phases[targets[i][0][1]].formation is None:
-                own = float(np.fmax.reduce(self.off_slot[at[i]]))
-                # With a vehicle lost, the centre of those left says nothing of their places.
-                miss["position"][i] = max(off, own) if self.left[at[i]].all() else own
-        return {
-            k: Waypoint(
-                time=t,
-                position=miss["position"].get(i),
-                velocity=miss["velocity"].get(i),
-                attitude=miss["attitude"].get(i),
-                rates=math.degrees(miss["rates"][i]) if i in miss["rates"] else None,
-            )
-            for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
-        }
-
-    @cached_property
-    def off_slot(self) -> Floats:
-        """Distance (K, N) [m] of each vehicle from its slot; NaN where slots are not tracked."""
-        return self.of_left(length(self.result.position - self.result.slot_position))
+                off[name] = math.dist(x.tolist(), wanted)
+        if "position" in off and result.phases[index].formation is None:
+            own = float(np.fmax.reduce(self.sampled("tracking_error").values[k]))
+            # With a vehicle lost, the centre of those left says nothing of their places.
+            off["position"] = max(off["position"], own) if self.left[k].all() else own
+        if "rates" in off:
+            off["rates"] = math.degrees(off["rates"])
+        return Waypoint(
+            result.time.item(k),
+            *(off.get(x) for x in ("position", "velocity", "attitude", "rates")),
+        )
 
     def passed(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""
@@ -514,106 +417,7 @@ def _meets(there: list[list[float]], phase: PhaseRecord) -> bool:
     return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
 
 
-def _greatest(values: Floats) -> list[float | None]:
-    """Greatest finite size of each row of values (G, m); None if there is none."""
-    sizes = np.abs(values)
-    if not sizes.shape[1]:
-        return [None] * len(sizes)
-    return [
-        most if math.isfinite(most) else max(filter(math.isfinite, row.tolist()), default=None)
-        for most, row in zip(sizes.max(axis=1).tolist(), sizes, strict=True)
-    ]
-
-
-# -- values at samples -------------------------------------------------------------------------------
-
-
-def _motion(m: Measurements, q: Quantity) -> tuple[Floats, ...]:
-    """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
-    x = (m.result.velocity, m.result.acceleration, m.result.slot_jerk)[q.order - 1]
-    if x is None:
-        return (np.full(m.left.shape, np.nan),)
-    return (m.of_left(SIZES[q.way](x) if q.way else length(x)),)
-
-
-def _separation(m: Measurements) -> tuple[Floats, Owner]:
-    pair = m.close.pair
-    return m.close.separation, lambda k: pair[k].tolist()
-
-
-def _below(m: Measurements) -> tuple[Floats, Owner]:
-    """Least height (K,) [m] between two agents, one below the other."""
-    least, pair = proximity.headroom(m.result.position, m.mission.agents.radius, m.left)
-    return least, lambda k: pair[k]
-
-
-def _clearance(m: Measurements) -> tuple[Floats, Owner]:
-    close = m.close
-    return close.clearance, lambda k: (close.agent.item(k), close.obstacle.item(k))
-
-
-def _fallen(m: Measurements) -> tuple[Floats, Owner]:
-    """Least distance (K,) [m] between a lost agent and one still flying; NaN if no agent is lost."""
-    r, radius = m.result.position, m.mission.fleet.radius
-    least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
-    for i in np.flatnonzero(~m.left[-1]):
-        separation = np.linalg.norm(r - r[:, [i]], axis=2) - radius - radius[i]
-        separation = np.where(m.left & ~m.left[:, [i]], separation, np.inf)
-        j = separation.argmin(axis=1)
-        separation = np.where(m.left[:, i], np.nan, separation[np.arange(len(r)), j])
-        closer = np.fmin(separation, least) != least
-        closer &= np.isfinite(separation)
-        least[closer] = separation[closer]
-        who[closer] = np.column_stack([np.full(len(r), i), j])[closer]
-    return least, lambda k: who[k]
-
-
-def _outside(m: Measurements) -> tuple[Floats, ...]:
-    """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
-    r, fence = m.result.position, m.mission.limits.geofence
-    if fence is None:
-        return (np.full(m.left.shape, np.nan),)
-    return (m.of_left(np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
-
-
-def _altitude(m: Measurements) -> tuple[Floats, ...]:
-    return (m.of_left(m.result.position[..., 2]),)
-
-
-def _tilt(m: Measurements) -> tuple[Floats, ...]:
-    """Tilt (K, N) [deg] of each vehicle; of points, of the thrust that the slots they track need."""
-    q, wanted = m.result.vehicle_attitude, m.result.slot_acceleration
-    if q is not None:
-        up = att.dcm_from_quaternion(q)[..., 2, 2]
-    elif wanted is not None:
-        force = wanted + np.array([0.0, 0.0, m.mission.gravity])
-        up = force[..., 2] / np.maximum(length(force), 1e-300)
-    else:
-        up = np.full(m.left.shape, np.nan)
-    return (m.of_left(np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
-
-
-def _edges(m: Measurements, values: Floats) -> tuple[Floats, Owner]:
-    edges = m.result.edges
-    return values, lambda _k, e: edges[e].tolist()
-
-
-#: Values of quantities at samples, with their owners where these are no single agents.
-_SAMPLED: dict[str, Callable[[Measurements], tuple[Any, ...]]] = {
-    **{q.name: partial(_motion, q=q) for q in MOTIONS},
-    "separation": _separation,
-    "separation_below": _below,
-    "clearance": _clearance,
-    "lost": _fallen,
-    "geofence": _outside,
-    "lowest": _altitude,
-    "highest": _altitude,
-    "thrust": lambda m: (m.thrust,),
-    "thrust_margin": lambda m: (m.thrust - m.mission.fleet.thrust_limit,),
-    "tilt": _tilt,
-    "tracking_error": lambda m: (m.off_slot,),
-    "constraint": lambda m: _edges(m, np.abs(m.result.constraint)),
-    "tension": lambda m: _edges(m, -m.result.multiplier),
-    "constraint_force": lambda m: (m.of_left(length(m.result.constraint_force)),),
-    "singular_value": lambda m: (m.result.singular_value, lambda _k: (0,)),
-}
+def _greatest(values: Floats) -> float | None:
+    """Greatest finite size of values (m,); None if there is none."""
+    sizes = np.abs(values[np.isfinite(values)])
+    return float(sizes.max()) if sizes.size else None

@@ -120,7 +120,7 @@ def _dips(measured: Measurements) -> Iterator[str]:
         return
     e = measured.worst("lowest")
     if e is not None and e.value < -DIP:
-        z = measured.of_left(measured.result.position[..., 2])
+        z = measured.sampled("lowest").values
         low = np.flatnonzero((z < -DIP).any(axis=0))
         others = f" ({agent_names(low)} are below 0 at times)" if len(low) > 1 else ""
         words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"

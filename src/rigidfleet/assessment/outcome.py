@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from rigidfleet._common.facts import Fact, value
 from rigidfleet._common.quantities import Quantity
 
 #: Share of a limit, or of a unit if this is more, by which rounding may exceed it.
@@ -70,6 +71,15 @@ class CheckResult:
         """What was checked, in words, marked if it is known at samples alone."""
         return self.check.replace("_", " ") + (", at samples" if self.at_samples else "")
 
+    @property
+    def fact(self) -> Fact:
+        """The check to show; of things that touch, with the first contact, which is what the reader needs."""
+        when, who = self.when, self.who or self.phase
+        if self.first is not None:
+            when, who = self.first.when, f"first {self.first.who}"
+        level = "fails" if not self.passed else "ok" if self.judged else ""
+        return Fact(self.name, self.worst, self.unit, self.limit, self.at_least, when, who, level)
+
     def fill(self, words: str) -> str:
         """Words with {worst}, {limit} and {who} put in."""
         worst, limit = ("" if x is None else value(x, self.unit) for x in (self.worst, self.limit))
@@ -128,12 +138,6 @@ class PhaseVerdict:
     worst: dict[str, Extreme]
 
 
-def value(x: float, unit: str = "") -> str:
-    """A number to three digits, with its unit."""
-    number = f"{x:.3g}" if x == 0 or 1e-3 <= abs(x) < 1e5 else f"{x:.1e}"
-    return f"{number} {unit}".rstrip()
-
-
 def bounded(
     q: Quantity,
     e: Extreme | None,
@@ -144,10 +148,11 @@ def bounded(
     first: Extreme | None = None,
 ) -> CheckResult:
     """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
+    at_least = q.at_least and limit is not None
     if e is None:
         words = words or q.nothing or f"the flight has no {q.called} to judge"
         return CheckResult(
-            q.name, True, words, None, limit, q.unit, q.at_least, judged=limit is not None
+            q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
     if not words:
         bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
@@ -159,7 +164,8 @@ def bounded(
     if passed is None and limit is not None:
         greatest = limit + SLACK * max(1.0, abs(limit))
         passed = e.value >= limit - SLACK and e.value > 0 if q.at_least else e.value <= greatest
+    passed = passed is None or bool(passed)
     return CheckResult(
-        q.name, passed is not False, words, e.value, limit, q.unit, q.at_least, e.when, e.who, e.phase,
+        q.name, passed, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,
         limit is not None, e.at_samples, first,
     )  # fmt: skip

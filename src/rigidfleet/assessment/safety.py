@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rigidfleet._common.facts import Fact
 from rigidfleet._common.quantities import QUANTITIES, shown
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import Extreme
@@ -45,6 +46,12 @@ class Safety:
         return -rest if self.at_least else rest
 
     @property
+    def fact(self) -> Fact:
+        """The quantity to show."""
+        worst = None if self.worst is None else self.worst.value
+        return Fact(self.quantity, worst, self.unit, self.limit, self.at_least)
+
+    @property
     def used(self) -> float | None:
         """Worst value as a share of the limit, 1 at the limit; None if the limit is a least value."""
         if self.at_least or not self.limit or self.worst is None:
@@ -58,7 +65,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     Limits are those of the verdict; those of the altitude are the geofence's. What the flight does not have, such as a
     vehicle below another one, has no row.
     """
-    measured, checks = Measurements(result), {check.check: check for check in verdict.checks}
+    measured, checks = Measurements(result), verdict.by_name
     rows = []
     for q in QUANTITIES.values():
         limit, worst, passed = None, None, True
@@ -68,7 +75,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
                 worst = Extreme(check.worst, check.when, check.who, check.phase, check.at_samples)
         elif q.monitored and not q.way:
             limit, worst = q.limit_of(result.mission), measured.worst(q.name)
-        if q.page and (limit is not None or worst is not None):
+        if (q.key or q.limit) and (limit is not None or worst is not None):
             limit = None if limit is None or not np.isfinite(limit) else limit
             row = Safety(q.called, q.text, shown(q.unit), q.at_least, limit, worst, passed)
             beyond = check is None and row.margin is not None and row.margin < -1e-9

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table, worst_values
 from rigidfleet._common.plain import plain
-from rigidfleet._common.quantities import QUANTITIES
+from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 from rigidfleet.assessment.outcome import (
     FLIPPED,
     CheckResult,
@@ -20,6 +19,8 @@ from rigidfleet.assessment.outcome import (
     PhaseVerdict,
 )
 
+#: Checks that say nothing of a flight without edges.
+_OF_EDGES = {"constraint", "constraint_force", "tension", "singular_value"}
 #: What a passed verdict says about a check's worst value.
 _PRAISE = {
     "shape": "shapes are within {worst}",
@@ -39,7 +40,7 @@ _PRAISE = {
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(Shown):
     """What `assess` finds: all checks, the numbers of each phase, and notes, which fail nothing.
 
     Attributes
@@ -72,6 +73,16 @@ class Verdict:
     def passed(self) -> bool:
         """Whether every check holds."""
         return all(check.passed for check in self.checks)
+
+    @property
+    def by_name(self) -> dict[str, CheckResult]:
+        """Each check by its name; of those that several phases fail, the one with the worst value."""
+        found: dict[str, CheckResult] = {}
+        for check in self.checks:
+            rank, known = quantity(check.check).rank, found.setdefault(check.check, check)
+            if check.worst is not None and known.worst is not None:
+                found[check.check] = max(known, check, key=lambda c: rank(c.worst))
+        return found
 
     @property
     def worst(self) -> dict[str, Extreme]:
@@ -140,22 +151,57 @@ class Verdict:
         ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
         return f"<Verdict {self.mission}: {ending} checks>"
 
-    def _repr_html_(self) -> str:
-        """The verdict as a notebook shows it: the judged checks, then the summary and notes."""
-        from rigidfleet._common import markup
-        from rigidfleet.assessment.table import check_row
+    def facts(self) -> Sheet:
+        """The tables of phases, waypoints and checks, the notes, and the verdict in words."""
+        has_edges = any("constraint" in p.worst for p in self.phases)
+        checks = [
+            check.fact
+            for check in self.checks
+            if (has_edges or check.check not in _OF_EDGES)
+            and (check.worst is not None or check.when is not None or not check.passed)
+        ]
+        meaning = (
+            "|c|: how far an edge's length is off the commanded one; the greatest of all edges."
+        )
+        parts = [
+            _phases(self.phases),
+            *([Line(meaning)] if has_edges else []),
+            _waypoints(self.phases),
+            worst_values("check", checks),
+            *(Line(f"Note: {note}.", "note") for note in self.notes),
+            Line(self.summary, "ok" if self.passed else "fails"),
+        ]
+        return Sheet(self.mission, self.title, parts)
 
-        rows = [map(str, check_row(check)) for check in self.checks if check.judged]
-        words = "\n".join([self.summary, *(f"Note: {note}." for note in self.notes)])
-        heads = ("check", "worst", "limit", "at [s]", "who or where", "")
-        return markup.shown(self.mission, self.title, heads, rows, words)
 
-    def __rich__(self) -> RenderableType:
-        from rich.text import Text
+def _phases(phases: list[PhaseVerdict]) -> Table:
+    """Worst values of each phase."""
+    worst = ("constraint", "shape", "separation", "clearance", "speed", "thrust")
+    rows = []
+    for p in phases:
+        values = {name: e.value for name, e in p.worst.items()} | {"shape": p.shape}
+        rows.append(Row((p.name, f"{p.t_end:.2f}", p.constraint, *map(values.get, worst))))
+    heads = ("phase", "end [s]", "|c| at end [m]", "worst |c| [m]", "shape off [m]", "apart [m]",
+             "clear [m]", "speed [m/s]", "thrust [N]")  # fmt: skip
+    return Table(heads, rows)
 
-        from rigidfleet.assessment.table import rendered
 
-        head = Text.assemble((self.mission, "bold"), f"  {self.title}")
-        notes = [Text(f"Note: {note}.", "yellow") for note in self.notes]
-        summary = Text(self.summary, "bold green" if self.passed else "bold red")
-        return rendered(head, self.phases, self.checks, [*notes, summary])
+def _waypoints(phases: list[PhaseVerdict]) -> Table:
+    """Miss of each waypoint, in position, velocity, attitude and rates."""
+
+    def met() -> Iterator[Row]:
+        for p in phases:
+            points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
+            points += [] if p.waypoint is None else [(p.name, p.waypoint)]
+            for name, w in points:
+                yield Row((name, f"{w.time:.2f}", w.position, w.velocity, w.attitude, w.rates))
+
+    heads = (
+        "waypoint, missed by",
+        "at [s]",
+        "position [m]",
+        "velocity [m/s]",
+        "attitude [deg]",
+        "rates [deg/s]",
+    )
+    return Table(heads, [*met()])

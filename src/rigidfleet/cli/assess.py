@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from cyclopts import Parameter
+
+from rigidfleet._common.quantities import LIMITS_OF_CURVES
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.outputs import Files, keep_existing
@@ -13,6 +16,7 @@ from rigidfleet.errors import RigidfleetError
 
 #: Options that a mission replaces.
 _OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
+_LIMITS = f"Further limits, KEY=VALUE, may be repeated: {', '.join(LIMITS_OF_CURVES)}."
 #: Options that say how files are read.
 _READ = ("interpolation", "spans", "gaps", "units", "axes")
 
@@ -22,7 +26,7 @@ def assess(
     mission: str | None = None,
     separation: float | None = None,
     separation_altitude: float | None = None,
-    limits: list[str] | None = None,
+    limits: Annotated[list[str] | None, Parameter(help=_LIMITS)] = None,
     radius: float | None = None,
     ground: float | None = None,
     interpolation: Literal["cubic", "linear"] | None = None,
@@ -52,8 +56,7 @@ def assess(
         Altitude z [m] from which on separation holds: vehicles that are both below it, as on their pads, may be nearer
         to each other. Default: it always holds.
     limits : list
-        Further limits, KEY=VALUE, may be repeated: speed, acceleration, horizontal_speed, vertical_speed,
-        horizontal_acceleration, vertical_acceleration, separation_below.
+        Further limits, KEY=VALUE, may be repeated.
     radius : float
         Radius of every vehicle [m]. Default: 0, distances are centre to centre.
     ground : float

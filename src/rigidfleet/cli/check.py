@@ -51,8 +51,7 @@ def check(
     from rigidfleet._common.files import write_file
     from rigidfleet._common.progress import watched_by
     from rigidfleet._common.toml import to_toml
-    from rigidfleet.mission import ending, goal, load_mission
-    from rigidfleet.mission.files import digests
+    from rigidfleet.mission import load_mission
     from rigidfleet.planning.timing import spelled_out, timed
 
     keep_existing(expand, force=force, other="give another path")
@@ -62,7 +61,7 @@ def check(
             found = load_mission(mission)
             if expand is not None:
                 found = spelled_out(found)
-                write_file(expand, (digests(found.text) + to_toml(found.to_dict())).encode())
+                write_file(expand, (found.about + to_toml(found.to_dict())).encode())
             found = timed(found)
     except MissionError as error:
         if not json:
@@ -85,20 +84,9 @@ def check(
     if json:
         console.print_json({"mission": mission, "right": True} | facts(found) | ahead.data())
         return PASSED if ahead.passed else FAILED
-    table = console.table("#", "phase", "kind", "to", "ends", "control")
-    for n, phase in enumerate(found.phases, start=1):
-        table.add_row(str(n), phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-    console.out().print(f"{found.name}: valid: {found.size_in_words}")
-    console.print_table(table)
-    console.out().print()
-    console.print_words(ahead.describe())
-    if ahead.remarks:
-        console.out().print()
-        console.print_words((remark.level, remark.text) for remark in ahead.remarks)
+    console.show(ahead.facts())
     if expand is not None:
         console.out().print(f"\nMission  {expand}", soft_wrap=True)
-    verdict = "no problems found" if ahead.passed else "the flight will fail"
-    console.out().print(f"\n{found.name}: {verdict}", style=None if ahead.passed else "bold red")
     return PASSED if ahead.passed else FAILED
 
 

@@ -9,7 +9,6 @@ import os
 import sys
 import threading
 from collections import deque
-from collections.abc import Iterable
 from functools import cache
 from io import TextIOWrapper
 from time import perf_counter
@@ -18,10 +17,10 @@ from typing import IO, TYPE_CHECKING, Self
 from rigidfleet.errors import MissionError
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console
     from rich.progress import Progress
-    from rich.table import Table
 
+    from rigidfleet._common.facts import Sheet
     from rigidfleet.simulation.flight import Progress as FlightProgress
     from rigidfleet.sweep import SweepProgress
 
@@ -111,32 +110,13 @@ def warn(message: object, *_where: object) -> None:
     err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
 
 
-def table(*columns: str) -> Table:
-    """Return an empty table without borders."""
-    from rich.table import Table
+def show(sheet: Sheet) -> None:
+    """Print facts: in a file or a pipe, rows of tables are not wrapped."""
+    from rigidfleet._common.facts import Table
 
-    return Table(*columns, box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold")
-
-
-def print_table(rows: RenderableType) -> None:
-    """Print tables: wrapped to the width of a terminal, otherwise unwrapped."""
     wide = out() if out().is_terminal else console(stderr=False, width=_WIDE)
-    wide.print(rows)
-
-
-def print_words(rows: Iterable[tuple[str, str]]) -> None:
-    """Print facts with their headings, wrapped to the terminal. A repeated heading is printed once."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table, before = Table.grid(padding=(0, 2, 0, 0)), ""
-    table.add_column(no_wrap=True, max_width=24)
-    table.add_column(overflow="fold")
-    for heading, text in rows:
-        style = "bold red" if heading == "fails" else "bold"
-        table.add_row(Text("" if heading == before else heading, style=style), Text(text))
-        before = heading
-    out().print(table)
+    for block in sheet.blocks:
+        (wide if isinstance(block, Table) and not block.bare else out()).print(block)
 
 
 class _Screen:

@@ -75,6 +75,7 @@ def design(
     """
     from json import dumps
 
+    from rigidfleet._common.facts import Row, Table
     from rigidfleet._common.files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.formation.point_files import csv_of_points
@@ -117,10 +118,8 @@ def design(
         found = {what: data for what, (data, _) in judged.items()}
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
         return PASSED
-    table = console.table("graph", "edges", "rank", "index", "cond.", "longest", "class")
-    table.columns[0].no_wrap = True
-    for what, (_, cells) in judged.items():
-        table.add_row(what, *cells)
+    heads = ("graph", "edges", "rank", "index", "condition", "longest [m]", "class")
+    table = Table(heads, [Row((what, *cells)) for what, (_, cells) in judged.items()], ("class",))
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
     if kinds:
@@ -156,32 +155,29 @@ def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
         raise ValueError(f"--reach must be a positive number, not {reach:g}")
 
 
-def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[str, ...]]:
+def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ...]]:
     """Rigidity of slots (N, 3) with a graph: as data, and as cells of a row of the table."""
     import numpy as np
 
     from rigidfleet.formation.distance_geometry import distances
     from rigidfleet.rigidity import analyse, jacobian, spectrum
 
-    longest = f"{distances(slots, edges).max(initial=0.0):.3g} m"
+    longest = float(distances(slots, edges).max(initial=0.0))
     if len(slots) <= _DENSE:
         found = analyse(slots, edges)
         # The smallest non-zero value counts, as in the index.
         held = len(edges) > 0 and found.w > 0
         ratio = float(np.linalg.norm(jacobian(slots, edges), 2) ** 2) / found.w if held else None
-        condition = "" if ratio is None else f"{ratio:.3g}"
-        cells = (f"{found.index:.4f}", condition, longest)
-        rank = f"{found.rank} of {found.needed}"
         data = found.data() | {"condition": ratio}
-        return data, (str(len(edges)), rank, *cells, str(found.rigidity_class))
-    ends = spectrum(slots, edges, [1.0] * len(slots))
-    rigidity_class = "flexible to first order" if ends.free else "infinitesimally rigid"
-    rank = "" if ends.free else "full"
-    cells = (f"{ends.index:.3g}", f"{ends.condition:.3g}", longest)
-    data = {"edges": len(edges), "index": ends.index, "w": ends.w, "free": ends.free}
-    data["condition"] = ends.condition if ends.w > 0 else None
-    data["rigidity_class"] = rigidity_class
-    return data, (f"{len(edges):,}", rank, *cells, rigidity_class)
+        rank = f"{found.rank} of {found.needed}"
+    else:
+        ends = spectrum(slots, edges, [1.0] * len(slots))
+        rigidity_class = "flexible to first order" if ends.free else "infinitesimally rigid"
+        data = {"edges": len(edges), **ends.data(), "rigidity_class": rigidity_class}
+        rank = "" if ends.free else "full"
+    condition, kind = data["condition"], data["rigidity_class"]
+    index = f"{data['index']:.4f}" if len(slots) <= _DENSE else data["index"]
+    return data, (f"{len(edges):,}", rank, index, condition, longest, kind)
 
 
 def points_of(

@@ -74,8 +74,8 @@ def new(
     """
     from rigidfleet._common.files import write_file
     from rigidfleet.formation.shapes import SHAPES
-    from rigidfleet.mission import Mission, draft
-    from rigidfleet.mission.files import completed
+    from rigidfleet.mission import draft
+    from rigidfleet.mission.loading import mission_of_file
     from rigidfleet.preflight.check import check as preflight
 
     given: dict[str, Any] = {
@@ -102,7 +102,7 @@ def new(
             text = draft.draft(file.stem, file=str(file), **asked)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
-    mission = Mission.from_toml(completed(text, file), str(file))
+    mission = mission_of_file(text, str(file))
     fails = [r.text for r in preflight(mission, search=False).remarks if r.level == "fails"]
     if fails:
         raise RigidfleetError(

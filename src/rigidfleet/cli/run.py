@@ -134,7 +134,7 @@ def run(
 def missions(
     *, print_: Annotated[str, Parameter(name="--print")] = "", schema: bool = False
 ) -> int:
-    """List the shipped missions.
+    """List the shipped missions, in groups.
 
     Parameters
     ----------
@@ -143,7 +143,8 @@ def missions(
     schema : bool
         Print the JSON schema of mission files instead, for editors.
     """
-    from rigidfleet.mission import json_schema, mission_names, mission_text
+    from rigidfleet.mission import json_schema, mission_text
+    from rigidfleet.mission.text import FIRST, GROUPS
 
     if print_ and schema:
         raise RigidfleetError("--print and --schema cannot be combined. Give one of them.")
@@ -154,11 +155,19 @@ def missions(
     else:
         import tomllib
 
-        table = console.table("mission", "what it shows", "in the paper")
-        for name in mission_names():
+        from rigidfleet._common.facts import Row, Sheet, Table
+
+        def row(name: str) -> Row:
             head = tomllib.loads(mission_text(name))
-            table.add_row(name, head.get("title", ""), head.get("source", ""))
-        console.print_table(table)
+            return Row((f"  {name}", head.get("title"), head.get("source")))
+
+        rows = [
+            x for group, names in GROUPS.items() for x in (Row((group, "", "")), *map(row, names))
+        ]
+        heads = ("mission", "what it shows", "in the paper")
+        first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
+        console.show(Sheet("", "", [Table(heads, rows, heads)]))
+        console.out().print(first, soft_wrap=True)
     return PASSED
 
 

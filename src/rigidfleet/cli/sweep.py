@@ -129,7 +129,7 @@ def sweep(
     if json:
         console.print_exactly(found.json() + "\n")
     elif not quiet:
-        console.print_table(found)
+        console.show(found.facts())
     drawn = [] if no_figures else figures.plot(
         table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
         titles=not no_titles,

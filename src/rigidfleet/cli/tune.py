@@ -88,10 +88,7 @@ def tune(
     if json:
         console.print_json(tuned.to_dict()["result"])
     elif not quiet:
-        head = f"{tuned.mission}: {tuned.flights} flights of {console.count(tuned.candidates, 'choice')} of gains;"
-        console.out().print(f"{head} {tuned.refused} refused for their margins", soft_wrap=True)
-        console.print_table(tuned)
-        console.out().print(tuned.conclusion, soft_wrap=True)
+        console.show(tuned.facts())
         console.out().print(f"\nMission  {tuned.file}", soft_wrap=True)
         console.out().print(f"Study    {folder / 'study.json'}", soft_wrap=True)
     return PASSED

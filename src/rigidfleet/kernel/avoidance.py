@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, joined
+from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, join
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of `Avoidance.count`: ticks, entries of the list of neighbours, whether the list is too short.
@@ -103,9 +103,9 @@ class Avoidance(NamedTuple):
     lag: Floats  # (N,) time until a command acts [s]
     ahead: Floats  # (N, 3, 3) lags of each axis: a1 [s], a2 [s^2], of the guard's commands [s]; 0 of points
     lead: Floats  # (N, 3) by which the point that obeys at once is ahead [s]
-    asked: Floats  # (N, 3) acceleration that the laws ask for [m/s^2]
-    given: Floats  # (N, 3) acceleration last commanded [m/s^2]
-    led: Ints  # (N,) 1 if that was not what the laws asked for
+    requested: Floats  # (N, 3) acceleration that the laws ask for [m/s^2]
+    commanded: Floats  # (N, 3) acceleration last commanded [m/s^2]
+    overruled: Ints  # (N,) 1 if that was not what the laws asked for
     soft: Floats  # (N,) speed below which braking fades [m/s]
     tilt: Floats  # (N,) greatest tilt of the thrust [rad]
     spare: Floats  # (N,) by which D and R are widened [m]
@@ -194,7 +194,7 @@ def avoidance(
 
     Obstacles that move are known in advance, without ``seen``.
     """
-    solids = joined([]) if solids is None else solids
+    solids = join([]) if solids is None else solids
     n, count = len(b), len(solids.kind)
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     radius = np.asarray(radius, dtype=float)
@@ -205,8 +205,8 @@ def avoidance(
         inverse=1.0 / _each(mass, n),
         g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
         ahead=lags, lead=lags[:, :, 0] + lags[:, :, 2], soft=np.where(lags[:, 0, 0] > 0.0, b * np.asarray(lag), 0.0),
-        tilt=_each(tilt, n), asked=np.zeros((n, 3)), given=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
-        led=np.zeros(n, dtype=np.int64),
+        tilt=_each(tilt, n), requested=np.zeros((n, 3)), commanded=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
+        overruled=np.zeros(n, dtype=np.int64),
         room=radius + 0.5 * separation, reach=radius + clearance,
         solids=solids, sight=sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
@@ -221,19 +221,24 @@ def avoidance(
     )  # fmt: skip
 
 
-def renewed(given: Avoidance) -> Avoidance:
+def of_next_phase(avoidance: Avoidance) -> Avoidance:
     """The same avoidance in the next phase, which has a record of its own."""
-    given.count[TICKS] = 0
-    return given._replace(**_record(len(given.b)))
+    avoidance.count[TICKS] = 0
+    return avoidance._replace(**_record(len(avoidance.b)))
 
 
-def among(given: Avoidance, solids: Solids) -> Avoidance:
+def among(avoidance: Avoidance, solids: Solids) -> Avoidance:
     """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
-    before, seen = given.sight, sight(solids, given.sight.reach, 0.0, given.sight.swerve)
+    before, seen = (
+        avoidance.sight,
+        sight(solids, avoidance.sight.reach, 0.0, avoidance.sight.swerve),
+    )
     seen = seen._replace(noise=before.noise, normals=before.normals)
     for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
         mine[: len(old)] = old
-    return given._replace(solids=solids, sight=seen, **_by_obstacle(len(given.b), len(solids.kind)))
+    return avoidance._replace(
+        solids=solids, sight=seen, **_by_obstacle(len(avoidance.b), len(solids.kind))
+    )
 
 
 def _by_obstacle(n: int, count: int) -> dict[str, Any]:
@@ -247,10 +252,10 @@ def _by_obstacle(n: int, count: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def holding(given: Avoidance, edges: int) -> Avoidance:
+def holding(avoidance: Avoidance, edges: int) -> Avoidance:
     """The same avoidance for so many other edges; neighbours are listed again."""
-    given.count[LISTED] = 0
-    return given._replace(pull=np.zeros(edges))
+    avoidance.count[LISTED] = 0
+    return avoidance._replace(pull=np.zeros(edges))
 
 
 def _record(n: int) -> dict[str, Any]:

@@ -11,7 +11,9 @@ import math
 
 import numpy as np
 
+from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.solids.distance import box_normal, from_box
 
 #: Accuracy of a least value [m, m/s].
 CLOSE = 1e-9
@@ -52,6 +54,7 @@ def lowest(work, degree, floor):
                 best, at = value, piece[start] + piece[width]
         elif value < best:
             best, at = value, piece[start]
+        # Of a square s, an error e of its root is an error 2 e sqrt(s) + e^2 of s.
         close = CLOSE
         if degree == 8:
             close = CLOSE * (2.0 * math.sqrt(min(abs(best), size)) + CLOSE)
@@ -61,6 +64,7 @@ def lowest(work, degree, floor):
         if not bound < best - close or piece[width] <= _SHORTEST:
             top -= 1
             continue
+        # De Casteljau: the first numbers of all levels are the left half, what is left of the last one the right.
         left = work[top + 1]
         half = 0.5 * piece[width]
         left[start], left[width] = piece[start], half
@@ -128,10 +132,16 @@ def span_of(curve):
 
 
 @compiled
+def basis_at(x):
+    """The five Bernstein polynomials of fourth degree at x."""
+    y = 1.0 - x
+    return y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
+
+
+@compiled
 def point_at(curve, x):
     """Point of a curve with control points (5, 3) at x."""
-    y = 1.0 - x
-    a, b, c, d, e = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
+    a, b, c, d, e = basis_at(x)
     return (
         a * curve[0, 0] + b * curve[1, 0] + c * curve[2, 0] + d * curve[3, 0] + e * curve[4, 0],
         a * curve[0, 1] + b * curve[1, 1] + c * curve[2, 1] + d * curve[3, 1] + e * curve[4, 1],
@@ -163,17 +173,18 @@ def shortest(curve, floor, work, pieces):
                 far += piece[3 * k + q] * piece[3 * k + q]
             along, size = min(along, dot), max(size, far)
         top -= 1
+        # All control points lie beyond a plane across the middle one that is farther than the best length.
         if middle > 0.0 and not along < best * math.sqrt(middle):
             continue
         start = length_at(piece, 0.0)
         if start < best:
             best, at = start, piece[15]
         square(piece, 1.0, work[0])
-        _, found = lowest(work, 8, best * best)
-        if found >= 0.0:
-            length = length_at(piece, found)
+        _, place = lowest(work, 8, best * best)
+        if place >= 0.0:
+            length = length_at(piece, place)
             if length < best:
-                best, at = length, piece[15] + found * piece[16]
+                best, at = length, piece[15] + place * piece[16]
         close = max(CLOSE, _ROUNDING * math.sqrt(size))  # the accuracy that rounding allows
         known = _ROUNDING * size <= close * max(2.0 * best, 1e-5)
         if count > _MOST and not known and along < best * math.sqrt(middle):
@@ -185,43 +196,26 @@ def shortest(curve, floor, work, pieces):
 
 
 @compiled
-def from_box(x, y, z, box, normal):
-    """Signed distance of a point from a box (6,), negative inside; writes the normal of a supporting plane."""
-    inside, face = -math.inf, 0
-    outside = 0.0
-    for q in range(3):
-        r = x if q == 0 else y if q == 1 else z
-        below, above = box[q] - r, r - box[3 + q]
-        beyond = max(below, above)
-        if beyond > inside:
-            inside, face = beyond, q
-        out = max(beyond, 0.0)
-        outside += out * out
-        normal[q] = -out if below > above else out
-    if outside > 0.0:
-        outside = math.sqrt(outside)
-        for q in range(3):
-            normal[q] /= outside
-        return outside
-    r = x if face == 0 else y if face == 1 else z
-    for q in range(3):
-        normal[q] = 0.0
-    normal[face] = -1.0 if box[face] - r > r - box[3 + face] else 1.0
-    return inside
+def beyond_plane(piece, distance, x, y, z):
+    """Lower bound of the distance between a curve with control points (15,) and something convex.
+
+    The tangent plane at the nearest point to any point bounds it; the middle control point is near the curve. The plane
+    is given by that point's ``distance`` and its unit normal; where the normal is not known, three zeros, the extent of
+    the curve takes its place.
+    """
+    least, known = 0.0, x != 0.0 or y != 0.0 or z != 0.0
+    for k in range(0, 15, 3):
+        dx, dy, dz = piece[k] - piece[6], piece[k + 1] - piece[7], piece[k + 2] - piece[8]
+        along = x * dx + y * dy + z * dz
+        least = min(least, along if known else -math.sqrt(dx * dx + dy * dy + dz * dz))
+    return distance + least
 
 
 @compiled
-def beyond_plane(piece, box, normal):
-    """Lower bound of the distance between a box and a curve with control points (15,).
-
-    The tangent plane at any point gives a bound; the middle control point is near the curve.
-    """
-    x, y, z = piece[6], piece[7], piece[8]
-    distance, least = from_box(x, y, z, box, normal), 0.0
-    a, b, c = normal[0], normal[1], normal[2]
-    for k in range(0, 15, 3):
-        least = min(least, a * (piece[k] - x) + b * (piece[k + 1] - y) + c * (piece[k + 2] - z))
-    return distance + least
+def touch_box(x, y, z, b, _, boxes):
+    """Signed distance of a point from box b, negative inside, and the normal of its tangent plane."""
+    nx, ny, nz = box_normal(x, y, z, boxes[b])
+    return from_box(x, y, z, boxes[b]), nx, ny, nz
 
 
 @compiled
@@ -253,18 +247,21 @@ def put_whole(curve, pieces):
 
 
 @compiled
-def nearest_box(curve, box, floor, pieces, normal):
-    """Least distance of a curve with control points (5, 3) from a box, if below ``floor``, and its place; else -1."""
+def nearest_box(curve, b, part, floor, pieces, boxes):
+    """Least distance of a curve with control points (5, 3) from box b, if below ``floor``, and its place; else -1.
+
+    `obstacles` makes of this source the same for any solid, or a ``part`` of one, by a function beside `touch_box`.
+    """
     best, at, top, count, close = floor, -1.0, 0, 0, put_whole(curve, pieces)
-    if not beyond_plane(pieces[0], box, normal) < floor:
-        return best, at
     while top >= 0:
         piece, count = pieces[top], count + 1
-        for k in (0, 4):
-            distance = from_box(piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], box, normal)
-            if distance < best:
-                best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
-        bound = beyond_plane(piece, box, normal)
+        distance, x, y, z = touch_box(piece[6], piece[7], piece[8], b, part, boxes)
+        bound = beyond_plane(piece, distance, x, y, z)
+        if bound < best - close:
+            for k in (0, 12):
+                distance, _, _, _ = touch_box(piece[k], piece[k + 1], piece[k + 2], b, part, boxes)
+                if distance < best:
+                    best, at = distance, piece[15] + (piece[16] if k == 12 else 0.0)
         best, at, top = refine(bound, best, at, close, count, top, pieces)
     return best, at
 
@@ -326,7 +323,5 @@ def shortest_above(curve, own, other, altitude, floor, pieces):
 
 @compiled
 def weights(x, out):
-    """Bernstein polynomials (5,) of fourth degree at x."""
-    y = 1.0 - x
-    out[0], out[1], out[2] = y**4, 4.0 * x * y**3, 6.0 * x * x * y * y
-    out[3], out[4] = 4.0 * x**3 * y, x**4
+    """Write the Bernstein polynomials (5,) of fourth degree at x."""
+    out[0], out[1], out[2], out[3], out[4] = basis_at(x)

@@ -25,7 +25,7 @@ def _series(xx, s):
 
 
 @compiled
-def _closed(xx, s):
+def _closed_form(xx, s):
     x = math.sqrt(xx)
     sin, cos = math.sin(x), math.cos(x)
     a, b = (1.0 - cos) / xx, (x - sin) / (xx * x)
@@ -37,7 +37,7 @@ def _closed(xx, s):
 @compiled
 def rate_factors(xx, s):
     """a, b and their derivatives over time, of `body_rates`, for xx = |phi|^2 and s = phi . dphi/dt."""
-    return _series(xx, s) if xx < 0.04 else _closed(xx, s)
+    return _series(xx, s) if xx < 0.04 else _closed_form(xx, s)
 
 
 @compiled

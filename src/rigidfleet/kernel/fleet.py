@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import Solids, join
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
@@ -95,7 +95,7 @@ class Vehicle:
         """Speed [rad/s] of a rotor with a thrust [N]."""
         return speed_of(np.asarray(thrust, dtype=float), *_three(self.thrust))
 
-    def unmixed(self, g: float) -> Floats:
+    def allocation(self, g: float) -> Floats:
         """Matrix (4, 4) from thrust [N] and torque [N m] to the rotors' forces.
 
         The ratio of a rotor's torque to its thrust is that at hover; without gravity, that at half the greatest thrust.
@@ -360,7 +360,7 @@ def quadrotors(vehicles: Sequence[Vehicle], g: float = 9.81) -> Quadrotors:
     return Quadrotors(
         **{name: rows(name) for name in names},
         force=np.array([v.thrust_at(v.speed) for v in vehicles]),
-        unmix=np.array([v.unmixed(g) for v in vehicles]),
+        unmix=np.array([v.allocation(g) for v in vehicles]),
         span=np.array([[gap.min(), gap.max()] for gap in gaps]),
         point=np.array([v.point for v in vehicles]),
         lost=np.zeros(len(vehicles), dtype=np.bool_),
@@ -370,7 +370,7 @@ def quadrotors(vehicles: Sequence[Vehicle], g: float = 9.81) -> Quadrotors:
 
 def still_air(n: int) -> Air:
     """Air at rest, without downwash and ground effect."""
-    nothing = np.full(n, -np.inf), np.zeros(n), joined([])
+    nothing = np.full(n, -np.inf), np.zeros(n), join([])
     return Air(np.zeros(3), 1.0, np.zeros((0, n, 3)), False, False, 1.225, 0.0, *nothing)
 
 
@@ -422,26 +422,26 @@ def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 
 
 
 def begin(
-    given: Flight, S: Floats, workspace: Workspace, *, frame: Floats | None = None, rows: int = 0
+    flight: Flight, S: Floats, workspace: Workspace, *, frame: Floats | None = None, rows: int = 0
 ) -> SampledState:
     """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail."""
     n, m = len(S), len(workspace.c)
-    sensing = given.sensing
+    sensing = flight.sensing
     depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
     attitude = _frame(frame)
-    curves = given.vehicles.thrust.T[:, :, None]
-    peak = np.where(given.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
+    curves = flight.vehicles.thrust.T[:, :, None]
+    peak = np.where(flight.vehicles.point[:, None], 0.0, thrust_of(S[:, 13:], *curves))
     worst = np.zeros((n, VERTICAL + 1))
     worst[:, UPRIGHT] = 1.0 - 2.0 * (S[:, 7:9] ** 2).sum(axis=1)
-    times = np.full(worst.shape, given.start)
+    times = np.full(worst.shape, flight.start)
     trail = NO_TRAIL
     if rows:
         none = np.zeros(0)
         trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
-        S=S.copy(), clock=np.array([given.start, given.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
+        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
         integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
@@ -452,7 +452,7 @@ def begin(
     )  # fmt: skip
 
 
-def renewed(
+def under_problem(
     state: SampledState, workspace: Workspace, integral: Floats, *, frame: Floats | None = None
 ) -> SampledState:
     """The same flight under another problem, such as that of the next phase, whose edges may be others.

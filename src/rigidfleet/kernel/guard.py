@@ -37,10 +37,10 @@ from rigidfleet.kernel.moving import (
     brake_beside,
     braking_beside,
     follow_flow,
+    is_known,
     look,
     miss,
     need_beside,
-    present,
     room_beside,
     stop_beside,
     way_to_rest,
@@ -125,18 +125,20 @@ def keeps(i, v, j, s, floor, a):
     the nearest point of the chord.
     """
     mine, other, rise = a.trial, a.ways[j], a.rise[j]
-    if a.soft[i] + a.soft[j] > 0.0:
+    if a.soft[i] + a.soft[j] > 0.0:  # quadrotors, by their hulls
         return between_hulls(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
+    # After the tick: from then on both may brake, and their stop segments only shrink.
     if between_segments(mine[1], mine[2], other[1], other[2]) < floor:
         return False
+    # During the tick: the chord of the relative path, and how far the path may be from it.
     x, y, z = mine[0, 0] - other[0, 0], mine[0, 1] - other[0, 1], mine[0, 2] - other[0, 2]
-    u = mine[1, 0] - other[1, 0] - x
-    w = mine[1, 1] - other[1, 1] - y
-    k = mine[1, 2] - other[1, 2] - z
-    length, share = u * u + w * w + k * k, 0.0
+    chord_x = mine[1, 0] - other[1, 0] - x
+    chord_y = mine[1, 1] - other[1, 1] - y
+    chord_z = mine[1, 2] - other[1, 2] - z
+    length, share = chord_x * chord_x + chord_y * chord_y + chord_z * chord_z, 0.0
     if length > 0.0:
-        share = min(max(-(x * u + y * w + z * k) / length, 0.0), 1.0)
-    n0, n1, n2 = x + share * u, y + share * w, z + share * k
+        share = min(max(-(x * chord_x + y * chord_y + z * chord_z) / length, 0.0), 1.0)
+    n0, n1, n2 = x + share * chord_x, y + share * chord_y, z + share * chord_z
     size = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
     if size < floor or size == 0.0:
         return size >= floor
@@ -158,8 +160,10 @@ def clears(i, v, far, a):
         if a.sight.moves[o] != 0:
             continue
         floor = a.walls[i, o]
+        # Farther away than it can come: most obstacles take one distance.
         if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
+        # Its stop segment after the tick, then its path over the tick as in `keeps`: a parabola beyond the chord.
         after = a.ways[i, 4] if a.soft[i] > 0.0 else way[1]
         bound, _, _ = from_obstacle(after, way[2], o, a.solids, floor, normal)
         if bound < floor:
@@ -207,6 +211,7 @@ def interaction_range(u, c, a):
 @compiled
 def list_neighbours(r, lost, way, a):
     """List for each vehicle those within a distance ``way`` [m]; returns False if the list is too short."""
+    # By sweep and prune: along the axis in which the fleet is widest, only those within ``way`` are compared.
     n, order = a.b.shape[0], a.order
     axis, widest = 0, -1.0
     for q in range(3):
@@ -223,6 +228,7 @@ def list_neighbours(r, lost, way, a):
         order[at] = i
     for i in range(n + 1):
         a.start[i] = 0
+    # First to count, so that each list begins where the one before ends; then to write.
     for fill in range(2):
         for k in range(n):
             i = order[k]
@@ -255,39 +261,40 @@ def list_neighbours(r, lost, way, a):
 @compiled
 def greatest(x):
     """Greatest length of the rows of x (N, 3)."""
-    found = 0.0
+    longest = 0.0
     for i in range(x.shape[0]):
-        found = max(found, x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1] + x[i, 2] * x[i, 2])
-    return math.sqrt(found)
+        longest = max(longest, x[i, 0] * x[i, 0] + x[i, 1] * x[i, 1] + x[i, 2] * x[i, 2])
+    return math.sqrt(longest)
 
 
 @compiled
 def moved_apart(r, a):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
-    n, found = a.b.shape[0], 0.0
-    x, y, z = 0.0, 0.0, 0.0
+    # What all have gone together changes no distance: a fleet that travels keeps its lists.
+    n, farthest = a.b.shape[0], 0.0
+    mean_x, mean_y, mean_z = 0.0, 0.0, 0.0
     for i in range(n):
-        x += (r[i, 0] - a.listed[i, 0]) / n
-        y += (r[i, 1] - a.listed[i, 1]) / n
-        z += (r[i, 2] - a.listed[i, 2]) / n
+        mean_x += (r[i, 0] - a.listed[i, 0]) / n
+        mean_y += (r[i, 1] - a.listed[i, 1]) / n
+        mean_z += (r[i, 2] - a.listed[i, 2]) / n
     for i in range(n):
-        u = r[i, 0] - a.listed[i, 0] - x
-        v = r[i, 1] - a.listed[i, 1] - y
-        w = r[i, 2] - a.listed[i, 2] - z
-        found = max(found, u * u + v * v + w * w)
-    return math.sqrt(found)
+        x = r[i, 0] - a.listed[i, 0] - mean_x
+        y = r[i, 1] - a.listed[i, 1] - mean_y
+        z = r[i, 2] - a.listed[i, 2] - mean_z
+        farthest = max(farthest, x * x + y * y + z * z)
+    return math.sqrt(farthest)
 
 
 @compiled
 def update_neighbours(r, v, lost, a):
     """Renew the list of neighbours if others could have come near; returns False if it is too short."""
-    fastest, asked = greatest(v), greatest(a.wanted)
-    due = a.count[LISTED] == 0 or fastest > a.span[1] or asked > a.span[2]
+    fastest, hardest = greatest(v), greatest(a.wanted)
+    due = a.count[LISTED] == 0 or fastest > a.span[1] or hardest > a.span[2]
     # Nor for speeds far below those for which it was made
     due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * a.span[1]
     if not (due or 2.0 * moved_apart(r, a) > a.span[0]):
         return True
-    speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * asked + 1.0
+    speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * hardest + 1.0
     way = interaction_range(speed, hard, a)
     a.span[0], a.span[1], a.span[2] = max(_NEARER * way, _LEAST_WAY), speed, hard
     for i in range(a.b.shape[0]):
@@ -323,7 +330,7 @@ def set_floor_beside(t, i, o, r, v, closest, a):
 
     Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
     """
-    if not present(o, a):
+    if not is_known(o, a):
         return closest
     stop, speed = stop_beside(i, o, r, v, a)
     need, way = need_beside(i, o, speed, braking_beside(i, o, a), a), a.shifted
@@ -334,11 +341,11 @@ def set_floor_beside(t, i, o, r, v, closest, a):
     if apart < need or apart - need < a.margin[OBSTACLE, 0]:
         # Rounding alone must not make the bound a loose one: the vehicle could lose a little at each tick
         enough = need - 10.0 * _ROUNDING
-        found, _, _ = from_obstacle(way[0], way[2], o, a.solids, enough, a.normal)
-        a.walls[i, o] = min(need, found)
-        note(OBSTACLE, found - a.reach[i], t, i, o, a)
-        if found - need < closest or (apart < need and closest == 0.0):
-            a.threat[i], closest = o, min(found - need, 0.0)
+        kept, _, _ = from_obstacle(way[0], way[2], o, a.solids, enough, a.normal)
+        a.walls[i, o] = min(need, kept)
+        note(OBSTACLE, kept - a.reach[i], t, i, o, a)
+        if kept - need < closest or (apart < need and closest == 0.0):
+            a.threat[i], closest = o, min(kept - need, 0.0)
     return closest
 
 
@@ -356,6 +363,7 @@ def set_floors(t, r, v, lost, a):
             a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
         take(i, max(predict(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+    # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
             continue
@@ -368,14 +376,12 @@ def set_floors(t, r, v, lost, a):
             if apart < need or apart - need < a.margin[PAIR, 0]:
                 if a.soft[i] + a.soft[j] > 0.0:
                     mine, other = a.ways[i], a.ways[j]
-                    found = between_hulls(
-                        mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal
-                    )
+                    kept = between_hulls(mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal)
                 else:
-                    found = between_segments(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
-                a.floor[e] = min(need, found)
+                    kept = between_segments(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
+                a.floor[e] = min(need, kept)
                 if i < j:
-                    note(PAIR, found - a.room[i] - a.room[j], t, i, j, a)
+                    note(PAIR, kept - a.room[i] - a.room[j], t, i, j, a)
         a.threat[i], a.late[i], closest = -1, 0.0, 0.0
         for o in range(a.solids.kind.shape[0]):
             if a.sight.moves[o] != 0:
@@ -387,9 +393,9 @@ def set_floors(t, r, v, lost, a):
             a.walls[i, o] = need
             if apart < need or apart - need < a.margin[OBSTACLE, 0]:
                 way = a.ways[i]
-                found, _, _ = from_obstacle(way[4], way[3], o, a.solids, need, a.normal)
-                a.walls[i, o] = min(need, found)
-                note(OBSTACLE, found - a.reach[i], t, i, o, a)
+                kept, _, _ = from_obstacle(way[4], way[3], o, a.solids, need, a.normal)
+                a.walls[i, o] = min(need, kept)
+                note(OBSTACLE, kept - a.reach[i], t, i, o, a)
 
 
 @compiled
@@ -405,7 +411,7 @@ def safe(i, r, v, far, a):
 
 
 @compiled
-def pushed(i, a):
+def is_pushed(i, a):
     """Whether barriers push vehicle i."""
     push = a.known[2, i]
     return push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0
@@ -417,7 +423,7 @@ def propose(i, k, v, a, c):
     last = a.candidates.shape[0] + 1
     if k == 0:
         c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
-        if a.soft[i] > 0.0 and a.led[i] == 0 and not pushed(i, a):
+        if a.soft[i] > 0.0 and a.overruled[i] == 0 and not is_pushed(i, a):
             for q in range(3):
                 c[q] = at_once(i, q, a)
     elif k < last:
@@ -446,7 +452,7 @@ def choose(i, r, v, a):
     unsafe, too: then the one counts that keeps all else and has the most room beside them. Where a vehicle could
     not brake in time any more, the one counts that misses them most, held.
     """
-    wanted, c, best, found = a.wanted[i], a.trial[3], math.inf, -1
+    wanted, c, best, nearest = a.wanted[i], a.trial[3], math.inf, -1
     most, second = -math.inf, -1
     late = a.threat[i] >= 0 and a.late[i] < -_LATE
     for k in range(a.candidates.shape[0] + (2 if a.threat[i] >= 0 else 1)):
@@ -454,7 +460,7 @@ def choose(i, r, v, a):
         away = 0.0
         for q in range(3):
             away += (c[q] - wanted[q]) ** 2
-        if away >= best:
+        if away >= best:  # before it is tried: distances cost far more
             continue
         far = predict(i, r[i], v[i], c, a, a.trial)
         if not safe(i, r, v, far, a):
@@ -464,15 +470,15 @@ def choose(i, r, v, a):
             if room > most:
                 most, second = room, k
             continue
-        best, found = away, k
+        best, nearest = away, k
         if k == 0:
             take(i, far, a)
             return 0
-    if found < 0:
+    if nearest < 0:
         if second < 0 or room_if_braking(i, r, v, late, a) >= most:
             return 2
-        found = second
-    propose(i, found, v[i], a, c)
+        nearest = second
+    propose(i, nearest, v[i], a, c)
     take(i, predict(i, r[i], v[i], c, a, a.trial), a)
     return 1
 
@@ -487,7 +493,7 @@ def tally(kind, i, t, a):
 @compiled
 def command(i, state, a):
     """Give vehicle i the force of the acceleration chosen for it; a quadrotor's follows it with a lag."""
-    c, u = a.chosen[i], a.given[i]
+    c, u = a.chosen[i], a.commanded[i]
     for q in range(3):
         u[q] = c[q] - a.ahead[i, q, 2] / (a.period + a.ahead[i, q, 2]) * (c[q] - u[q])
         state.force[i, q] = a.weight[i] * (u[q] + (a.g if q == 2 else 0.0))
@@ -505,21 +511,23 @@ def want(i, state, a):
         limit(i, a)
         off = 0.0
         for q in range(3):
-            a.asked[i, q] = a.wanted[i, q]
-            if not a.given[i, q] < math.inf:
-                a.given[i, q] = a.asked[i, q]
+            a.requested[i, q] = a.wanted[i, q]
+            if not a.commanded[i, q] < math.inf:
+                a.commanded[i, q] = a.requested[i, q]
             a.wanted[i, q] = at_once(i, q, a)
         limit(i, a)
         for q in range(3):
             off = max(off, abs(a.wanted[i, q] - at_once(i, q, a)))
         if off < _ROUNDING:
-            a.led[i] = 0
+            a.overruled[i] = 0
 
 
 @compiled
 def at_once(i, q, a):
     """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
-    return a.given[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (a.asked[i, q] - a.given[i, q])
+    return a.commanded[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (
+        a.requested[i, q] - a.commanded[i, q]
+    )
 
 
 @compiled
@@ -536,7 +544,7 @@ def foresee(i, vehicles, state, r, v, a):
     for j in range(4):
         lift += _curve(S[13 + j], k[0], k[1], k[2]) / a.weight[i]
     for q in range(3):
-        a1, a2, late, u = a.ahead[i, q, 0], a.ahead[i, q, 1], a.ahead[i, q, 2], a.given[i, q]
+        a1, a2, late, u = a.ahead[i, q, 0], a.ahead[i, q, 1], a.ahead[i, q, 2], a.commanded[i, q]
         rise = lift * T[2, q] - (a.g if q == 2 else 0.0)
         a.ways[i, 4, q] = r[q]
         a.ways[i, 5, q] = r[q] + a1 * v[q] + a2 * rise
@@ -566,12 +574,12 @@ def avoid(p, w, flight, state, a):
                 a.ways[i, 4, q] = a.ways[i, 5, q] = r[i, q]
         state.layers[i] = 0
     look(t, a.ways[:, 4], lost, a)
-    led = False
+    flows = False
     if a.flow:
         for i in range(n):
             if follow_flow(i, r[i], v[i], a):
                 limit(i, a)
-                led = True
+                flows = True
     if not update_neighbours(r, v, lost, a):
         a.count[FULL] = 1
         return 0
@@ -580,11 +588,12 @@ def avoid(p, w, flight, state, a):
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
-        if changed and pushed(i, a):
+        if changed and is_pushed(i, a):
             state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue
         free = alone(i, a) or not a.guarded
+        # Its choice counts for those that come after it, who keep their distances from it: the order makes the proof.
         how = 0 if free else choose(i, r, v, a)
         if free:
             for q in range(3):
@@ -596,14 +605,14 @@ def avoid(p, w, flight, state, a):
             tally(BRAKE, i, t, a)
             state.layers[i] |= ACTS[BRAKE]
         if a.soft[i] > 0.0:
-            if how + state.layers[i] + a.led[i] == 0:
+            if how + state.layers[i] + a.overruled[i] == 0:
                 for q in range(3):
-                    a.given[i, q] = a.asked[i, q]
+                    a.commanded[i, q] = a.requested[i, q]
                 continue
-            a.led[i] = 1
+            a.overruled[i] = 1
             if state.layers[i] == 0:
                 state.layers[i] = ACTS[GUARD]
             command(i, state, a)
-        elif how > 0 or changed or led:
+        elif how > 0 or changed or flows:
             command(i, state, a)
     return 1

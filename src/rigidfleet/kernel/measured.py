@@ -61,7 +61,7 @@ class Spectrum(NamedTuple):
     least: Floats  # (1, 8) the smallest non-zero eigenvalue
     one: Floats  # (s, s) A of one sample
     work: Floats  # (3, s)
-    found: Floats  # (K,) the smallest non-zero singular value
+    values: Floats  # (K,) the smallest non-zero singular value
 
 
 class Nearest(NamedTuple):
@@ -75,7 +75,7 @@ class Nearest(NamedTuple):
     places: Annotated[Floats, Extents((3, BLOCK))]  # of one agent
 
 
-def measured(n: int, m: int, K: int, **given: Any) -> Measured:
+def measurement_of(n: int, m: int, K: int, **samples: Any) -> Measured:
     """Arrays for the measurement of K samples of ``n`` agents and ``m`` edges."""
     work = np.zeros((9, 4, 4))
     work[5] = np.eye(4)
@@ -85,7 +85,7 @@ def measured(n: int, m: int, K: int, **given: Any) -> Measured:
         "wrench": np.empty((K, 6)), "thrust": np.empty((K, n)), "distance": np.empty((K, m)),
         "line": np.zeros(K, dtype=np.bool_), "work": work, "left": np.empty(n), "x": np.empty((2, n, 3)),
     }  # fmt: skip
-    return Measured(**(fields | given))
+    return Measured(**(fields | samples))
 
 
 def spectrum_of(r: Floats, edges: Ints) -> Spectrum:

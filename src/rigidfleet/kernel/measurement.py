@@ -153,7 +153,7 @@ def quaternion_of(T, q):
 
 
 @compiled
-def continued(q, last):
+def keep_sign(q, last):
     """Choose the sign of a quaternion q (4,): no jump from the one before, ``last``, or else q0 >= 0."""
     if math.isnan(q[0] + q[1] + q[2] + q[3]):
         return
@@ -395,14 +395,14 @@ def measure(m):
             else:
                 for a in range(4):
                     m.attitude[k, a] = math.nan
-            continued(m.attitude[k], last[0])
+            keep_sign(m.attitude[k], last[0])
             if not math.isnan(m.T_ref[k, 0, 0]):
                 quaternion_of(m.T_ref[k], m.attitude_reference[k])
-                continued(m.attitude_reference[k], last[1])
+                keep_sign(m.attitude_reference[k], last[1])
             if k == 0 or math.isnan(last[2, 0]):
                 for a in range(4):
                     last[2, a] = m.frame[k, a]
-            continued(m.frame[k], last[2])
+            keep_sign(m.frame[k], last[2])
             angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
             if line:
@@ -532,7 +532,7 @@ def spectrum(s):
                         s.one[a, b] = s.A[a, b * _AT_ONCE + l]
                 s.least[0, l] = least_eigenvalue(s.one, s.work[0], s.work[1], s.work[2], _ZERO)
         for l in range(min(_AT_ONCE, K - first)):
-            s.found[first + l] = math.sqrt(s.least[0, l])
+            s.values[first + l] = math.sqrt(s.least[0, l])
 
 
 @compiled
@@ -544,9 +544,9 @@ def least_eigenvalue_of_three(A):
     a, b, c, d, e, f = A[0, 0], A[1, 1], A[2, 2], A[1, 0], A[2, 0], A[2, 1]
     none = filled(0.0)
     for _ in range(_SWEEPS):
-        a, b, e, f = rotated(d, a, b, e, f)
-        a, c, d, f = rotated(e, a, c, none, f)
-        b, c, d, e = rotated(f, b, c, d, none)
+        a, b, e, f = rotate(d, a, b, e, f)
+        a, c, d, f = rotate(e, a, c, none, f)
+        b, c, d, e = rotate(f, b, c, d, none)
         f = none
     largest = max(a, b)
     largest = max(largest, c)
@@ -557,7 +557,7 @@ def least_eigenvalue_of_three(A):
 
 
 @compiled
-def rotated(off, p, q, x, y):
+def rotate(off, p, q, x, y):
     """Rotate so that an element ``off`` the diagonal of a matrix becomes zero.
 
     p and q are the elements of the diagonal in its row and column, x and y what else is in these.

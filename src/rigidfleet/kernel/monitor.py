@@ -20,7 +20,6 @@ import math
 
 from rigidfleet.kernel.bernstein import (
     CLOSE,
-    from_box,
     length_at,
     lowest,
     lowest_overlap,
@@ -30,6 +29,7 @@ from rigidfleet.kernel.bernstein import (
     shortest_above,
     span_of,
     square,
+    touch_box,
     weights,
 )
 from rigidfleet.kernel.compiler.jit import compiled
@@ -66,8 +66,8 @@ from rigidfleet.kernel.records import (
     VERTICAL_ACCELERATION,
     VERTICAL_SPEED,
 )
-from rigidfleet.kernel.rigid_body import inertia_inverse
-from rigidfleet.solids.distance import STEEP
+from rigidfleet.kernel.rigid_body import attitude_matrix, inertia_inverse
+from rigidfleet.solids.distance import STEEP, box_normal
 
 #: Relative accuracy of a greatest force, direct and iterated.
 _CLOSE_FORCE, _CLOSE_ITERATED = 1e-7, 1e-6
@@ -90,58 +90,56 @@ def take(kind, key, t, first, second, monitor):
 
 
 @compiled
-def angle_of(points, p):
-    """Upper bound of the rotation [rad] of the body frame over a step."""
-    n = p.vehicles.m.shape[0]
-    q = 6 * n + p.graph.edges.shape[0]
-    fastest, size = 0.0, math.inf
+def quaternion_of(points, p):
+    """Greatest rate, over a step, and least length of the quaternion of the body axes, by its control points."""
+    first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
+    fastest, least = 0.0, math.inf
     for k in range(5):
-        here, rate = 0.0, 0.0
-        for s in range(4):
-            here += points[k, q + s] * points[k, q + s]
-            if k < 4:
-                d = 4.0 * (points[k + 1, q + s] - points[k, q + s])
-                rate += d * d
-        fastest, size = max(fastest, rate), min(size, here)
-    return 2.0 * math.sqrt(fastest) / max(math.sqrt(size), 1e-3)
+        squared_length = squared_rate = 0.0
+        for s in range(first, first + 4):
+            squared_length += points[k, s] ** 2
+            squared_rate += (4.0 * (points[min(k + 1, 4), s] - points[k, s])) ** 2
+        fastest, least = max(fastest, squared_rate), min(least, squared_length)
+    return math.sqrt(fastest), math.sqrt(least)
 
 
 @compiled
-def attitudes(points, part, parts, p, monitor):
+def angle_of(points, p):
+    """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
+    if not p.body_formulation:
+        return 0.0
+    rate, length = quaternion_of(points, p)
+    return 2.0 * rate / max(length, 1e-3)
+
+
+@compiled
+def pieces_over(angle):
+    """Number of pieces into which a step is cut whose axes turn by an angle [rad]."""
+    return int(min(max(1.0, math.ceil(angle / _TURN)), 1e4))
+
+
+@compiled
+def find_attitudes(points, part, parts, p, monitor):
     """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
-    n = p.vehicles.m.shape[0]
-    first = 6 * n + p.graph.edges.shape[0]
-    state = monitor.scratch[0]
+    first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
+    quaternion = monitor.scratch[0]
     for k in range(5):
-        basis, pose = monitor.basis[k], monitor.poses[k]
+        basis = monitor.basis[k]
         weights((part + KNOTS[k]) / parts, basis)
-        size = 0.0
-        for s in range(10):
-            state[s] = 0.0
-            for j in range(5):
-                state[s] += basis[j] * points[j, first + s]
         for s in range(4):
-            size += state[s] * state[s]
-        size = 1.0 / math.sqrt(size)
-        a, b, c, d = state[0] * size, state[1] * size, state[2] * size, state[3] * size
-        # Columns of T^T, body -> world (the quaternion of Eq. (21), scalar first).
-        pose[0], pose[1], pose[2] = (
-            1 - 2 * (c * c + d * d),
-            2 * (b * c - a * d),
-            2 * (b * d + a * c),
-        )
-        pose[3], pose[4], pose[5] = (
-            2 * (b * c + a * d),
-            1 - 2 * (b * b + d * d),
-            2 * (c * d - a * b),
-        )
-        pose[6], pose[7], pose[8] = (
-            2 * (b * d - a * c),
-            2 * (c * d + a * b),
-            1 - 2 * (b * b + c * c),
-        )
+            quaternion[s] = along(basis, points, first + s)
         for s in range(6):
-            pose[9 + s] = state[4 + s]
+            monitor.centres[k, s] = along(basis, points, first + 4 + s)
+        attitude_matrix(quaternion, monitor.attitudes[k])
+
+
+@compiled
+def along(basis, points, q):
+    """Column q of control points (5, n) where a curve has the Bernstein polynomials ``basis`` (5,)."""
+    value = 0.0
+    for k in range(5):
+        value += basis[k] * points[k, q]
+    return value
 
 
 @compiled
@@ -154,101 +152,118 @@ def in_world(points, i, moving, p, monitor, out):
             for q in range(3):
                 out[k, q] = points[k, first + q]
         return
-    at, x = monitor.knots, monitor.scratch[1]
+    at_knots, in_body = monitor.knots, monitor.scratch[1]
     for k in range(5):
-        basis, pose = monitor.basis[k], monitor.poses[k]
+        T = monitor.attitudes[k]
         for q in range(3):
-            x[q] = 0.0
-            for j in range(5):
-                x[q] += basis[j] * points[j, first + q]
+            in_body[q] = along(monitor.basis[k], points, first + q)
         for q in range(3):
-            at[k, q] = pose[9 + 3 * moving + q]
+            at_knots[k, q] = monitor.centres[k, 3 * moving + q]
             for s in range(3):
-                at[k, q] += pose[3 * q + s] * x[s]
+                at_knots[k, q] += T[s, q] * in_body[s]
     for k in range(5):
         for q in range(3):
             out[k, q] = 0.0
             for j in range(5):
-                out[k, q] += FROM_KNOTS[k, j] * at[j, q]
+                out[k, q] += FROM_KNOTS[k, j] * at_knots[j, q]
 
 
 # -- distances ---------------------------------------------------------------------------------------
 
 
 @compiled
+def from_mean(points, k, i, mean):
+    """Control point k of agent i, from the mean of those of the agents that are monitored."""
+    return (
+        points[k, 3 * i] - mean[k, 0],
+        points[k, 3 * i + 1] - mean[k, 1],
+        points[k, 3 * i + 2] - mean[k, 2],
+    )
+
+
+@compiled
+def find_mean(points, monitor, mean):
+    """Mean (5, 3) of the control points of the agents that are monitored."""
+    count = 0
+    for i in range(monitor.left.shape[0]):
+        count += 1 if monitor.left[i] else 0
+    for k in range(5):
+        for q in range(3):
+            total = 0.0
+            for i in range(monitor.left.shape[0]):
+                if monitor.left[i]:
+                    total += points[k, 3 * i + q]
+            mean[k, q] = total / count
+
+
+@compiled
+def rotation_over(points, mean, monitor):
+    """Rotation [rad] about each axis by which agents turn about their mean over a step.
+
+    It is that of a rigid body with their moment of momentum, for equal masses at the places halfway: no other leaves
+    less of their motion, in the sum of squares.
+    """
+    xx = xy = xz = yy = yz = zz = moment_x = moment_y = moment_z = 0.0
+    for i in range(monitor.left.shape[0]):
+        if monitor.left[i]:
+            x0, y0, z0 = from_mean(points, 0, i, mean)
+            x1, y1, z1 = from_mean(points, 4, i, mean)
+            x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
+            dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+            xx, yy, zz = xx + y * y + z * z, yy + x * x + z * z, zz + x * x + y * y
+            xy, xz, yz = xy - x * y, xz - x * z, yz - y * z
+            moment_x += y * dz - z * dy
+            moment_y += z * dx - x * dz
+            moment_z += x * dy - y * dx
+    I, inverse = monitor.attitudes[0], monitor.attitudes[1]
+    I[0, 0], I[0, 1], I[0, 2] = xx, xy, xz
+    I[1, 0], I[1, 1], I[1, 2] = xy, yy, yz
+    I[2, 0], I[2, 1], I[2, 2] = xz, yz, zz
+    inertia_inverse(I, inverse)
+    return (
+        inverse[0, 0] * moment_x + inverse[0, 1] * moment_y + inverse[0, 2] * moment_z,
+        inverse[1, 0] * moment_x + inverse[1, 1] * moment_y + inverse[1, 2] * moment_z,
+        inverse[2, 0] * moment_x + inverse[2, 1] * moment_y + inverse[2, 2] * moment_z,
+    )
+
+
+@compiled
 def bound_moves(p, state, monitor):
     """Bounds [m] of the change of any distance over the trail's first step, in space and as seen from above.
 
-    They are written into ``monitor.moves``.
-
-    With r_i' = any rigid motion + u_i, the rate of a distance is at most |u_i| + |u_j|, and |u_i| is at most its
-    greatest Bernstein coefficient. The rotation is the one that leaves the smallest u_i. As seen from above, tilting
-    rotations change distances, too.
+    They are written into ``monitor.moves``. With r_i' = any rigid motion + u_i, the rate of a distance is at most
+    |u_i| + |u_j|, and |u_i| is at most its greatest Bernstein coefficient. The rotation is the one that leaves the
+    smallest u_i. As seen from above, tilting rotations change distances, too.
     """
-    points = state.trail.points[row_of(0, state)]
-    n, left, mean = monitor.left.shape[0], monitor.left, monitor.knots
-    count = 0
-    for i in range(n):
-        count += 1 if left[i] else 0
-    for k in range(5):
-        x = y = z = 0.0
-        for i in range(n):
-            if left[i]:
-                x, y, z = x + points[k, 3 * i], y + points[k, 3 * i + 1], z + points[k, 3 * i + 2]
-        mean[k, 0], mean[k, 1], mean[k, 2] = x / count, y / count, z / count
-    I, I_inv = monitor.basis[:3, :3], monitor.poses[:3, :3]
-    a = b = c = d = e = f = h0 = h1 = h2 = 0.0
-    for i in range(n):
-        if left[i]:
-            x0, y0, z0 = points[0, 3 * i], points[0, 3 * i + 1], points[0, 3 * i + 2]
-            x1, y1, z1 = points[4, 3 * i], points[4, 3 * i + 1], points[4, 3 * i + 2]
-            x0, y0, z0 = x0 - mean[0, 0], y0 - mean[0, 1], z0 - mean[0, 2]
-            x1, y1, z1 = x1 - mean[4, 0], y1 - mean[4, 1], z1 - mean[4, 2]
-            x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
-            x1, y1, z1 = x1 - x0, y1 - y0, z1 - z0
-            a, d, f = a + y * y + z * z, d + x * x + z * z, f + x * x + y * y
-            b, c, e = b - x * y, c - x * z, e - y * z
-            h0, h1, h2 = h0 + y * z1 - z * y1, h1 + z * x1 - x * z1, h2 + x * y1 - y * x1
-    I[0, 0], I[0, 1], I[0, 2] = a, b, c
-    I[1, 0], I[1, 1], I[1, 2] = b, d, e
-    I[2, 0], I[2, 1], I[2, 2] = c, e, f
-    inertia_inverse(I, I_inv)
-    s0 = I_inv[0, 0] * h0 + I_inv[0, 1] * h1 + I_inv[0, 2] * h2
-    s1 = I_inv[1, 0] * h0 + I_inv[1, 1] * h1 + I_inv[1, 2] * h2
-    s2 = I_inv[2, 0] * h0 + I_inv[2, 1] * h1 + I_inv[2, 2] * h2
+    points, mean = state.trail.points[row_of(0, state)], monitor.knots
+    find_mean(points, monitor, mean)
+    turn_x, turn_y, turn_z = rotation_over(points, mean, monitor)
     fastest = farthest = 0.0
-    for i in range(n):
-        if left[i]:
-            x0, y0, z0 = points[0, 3 * i], points[0, 3 * i + 1], points[0, 3 * i + 2]
-            x0, y0, z0 = x0 - mean[0, 0], y0 - mean[0, 1], z0 - mean[0, 2]
-            x1 = y1 = z1 = u0 = u1 = u2 = v0 = v1 = v2 = 0.0
-            for k in range(5):
-                if k < 4:
-                    x1, y1, z1 = (
-                        points[k + 1, 3 * i],
-                        points[k + 1, 3 * i + 1],
-                        points[k + 1, 3 * i + 2],
-                    )
-                    x1, y1, z1 = x1 - mean[k + 1, 0], y1 - mean[k + 1, 1], z1 - mean[k + 1, 2]
-                    v0, v1, v2 = x1 - x0, y1 - y0, z1 - z0
-                # The rate has the coefficients k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k).
-                rate0 = k * u0 + (4 - k) * v0 - (s1 * z0 - s2 * y0)
-                rate1 = k * u1 + (4 - k) * v1 - (s2 * x0 - s0 * z0)
-                rate2 = k * u2 + (4 - k) * v2 - (s0 * y0 - s1 * x0)
-                fastest = max(fastest, rate0 * rate0 + rate1 * rate1 + rate2 * rate2)
-                farthest = max(farthest, x0 * x0 + y0 * y0 + z0 * z0)
-                x0, y0, z0, u0, u1, u2 = x1, y1, z1, v0, v1, v2
-    tilt = math.hypot(s0, s1)
-    if p.body_formulation:
-        q = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
-        rate, size = 0.0, math.inf
+    for i in range(monitor.left.shape[0]):
+        if not monitor.left[i]:
+            continue
+        x, y, z = from_mean(points, 0, i, mean)
+        before_x = before_y = before_z = 0.0
         for k in range(5):
-            here = turn = 0.0
-            for s in range(4):
-                here += points[k, q + s] ** 2
-                turn += (points[min(k + 1, 4), q + s] - points[k, q + s]) ** 2
-            rate, size = max(rate, 4.0 * math.sqrt(turn)), min(size, math.sqrt(here))
-        tilt = 2.0 * rate / max(size - 0.1, 0.1) + math.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
+            next_x, next_y, next_z = from_mean(points, min(k + 1, 4), i, mean)
+            after_x, after_y, after_z = next_x - x, next_y - y, next_z - z
+            # The rate of a quartic has, in quartic form, k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k) as coefficients; the
+            # rotation takes its cross product with the place from it.
+            rate_x = k * before_x + (4 - k) * after_x - (turn_y * z - turn_z * y)
+            rate_y = k * before_y + (4 - k) * after_y - (turn_z * x - turn_x * z)
+            rate_z = k * before_z + (4 - k) * after_z - (turn_x * y - turn_y * x)
+            fastest = max(fastest, rate_x * rate_x + rate_y * rate_y + rate_z * rate_z)
+            farthest = max(farthest, x * x + y * y + z * z)
+            x, y, z = next_x, next_y, next_z
+            before_x, before_y, before_z = after_x, after_y, after_z
+    tilt = math.hypot(turn_x, turn_y)
+    if p.body_formulation:
+        # The axes turn as well, and where the vertical is in them is not asked: any rotation may tilt. A quaternion
+        # between its control points may be shorter than they are, hence the tenth.
+        rate, length = quaternion_of(points, p)
+        turn = math.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
+        tilt = 2.0 * rate / max(length - 0.1, 0.1) + turn
+    # Of two agents, each may move by its part, and tilting moves each by at most its distance from the mean.
     monitor.moves[0] = 2.0 * math.sqrt(fastest)
     monitor.moves[1] = monitor.moves[0] + tilt * 2.0 * math.sqrt(farthest)
 
@@ -263,12 +278,7 @@ def put(curve, ball):
 def place(points, monitor):
     """Balls that hold the agents' positions over a step, in the axes of the states."""
     for i in range(monitor.balls.shape[0]):
-        far, ball = 0.0, monitor.balls[i]
-        x, y, z = points[2, 3 * i], points[2, 3 * i + 1], points[2, 3 * i + 2]
-        for k in range(5):
-            a, b, c = points[k, 3 * i] - x, points[k, 3 * i + 1] - y, points[k, 3 * i + 2] - z
-            far = max(far, a * a + b * b + c * c)
-        ball[0], ball[1], ball[2], ball[3] = x, y, z, math.sqrt(far)
+        put(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
 
 
 @compiled
@@ -296,6 +306,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
     axes, curve = 2 if below else 3, monitor.curve
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
+        # Surfaces that overlap count by how deep, so that the floor may be below the sum of the radii.
         radii = monitor.radius[i] + monitor.radius[j]
         floor = monitor.worst[kind] + radii
         if apart(i, j, axes, radii if below else floor, monitor):
@@ -352,6 +363,7 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
 @compiled
 def clearance_of_interest(i, monitor):
     """Clearance of agent i from which on it is worse than what is stored."""
+    # A clearance is stored under three names, and is of no interest only if it is worse than none of them.
     own = monitor.worst[FLYING]
     if monitor.standing[i] != 0:
         own = max(own, monitor.worst[STANDING])
@@ -391,7 +403,6 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     where its outward normal points up by `STEEP` or more: nobody stands on the wall beside.
     """
     radius, standing = monitor.radius[i], monitor.standing[i] != 0
-    low, normal = monitor.low, monitor.scratch[2]
     x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], monitor.balls[i, 3]
     for b in range(monitor.boxes.shape[0]):
         box = monitor.boxes[b]
@@ -400,16 +411,16 @@ def watch_obstacles(i, curve, t, h, last, monitor):
         far += max(0.0, box[2] - z, z - box[5]) ** 2
         if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
             continue
-        value, at = nearest_box(curve, box, floor, monitor.pieces, normal)
+        value, at = nearest_box(curve, b, -1, floor, monitor.pieces, monitor.boxes)
         if at >= 0.0:
-            u, v, w = point_at(curve, at)
-            from_box(u, v, w, box, normal)
-            take_clearance(value - radius, t + at * h, i, b, normal[2] >= STEEP, monitor)
-    if not last or not (standing or low[i, 0] < math.inf):
+            x_near, y_near, z_near = point_at(curve, at)
+            _, _, up = box_normal(x_near, y_near, z_near, box)
+            take_clearance(value - radius, t + at * h, i, b, up >= STEEP, monitor)
+    if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
-        end = from_box(curve[4, 0], curve[4, 1], curve[4, 2], monitor.boxes[b], normal)
-        if end - radius <= monitor.pad and normal[2] >= STEEP:
+        end, _, _, up = touch_box(curve[4, 0], curve[4, 1], curve[4, 2], b, -1, monitor.boxes)
+        if end - radius <= monitor.pad and up >= STEEP:
             return
     leave(i, monitor)
 
@@ -421,26 +432,29 @@ def unremarkable(points, i, angle, p, monitor):
     By its control points in body axes, for a piece of the step over which these turn by ``angle`` [rad] at most. The
     curves in world axes, of which few agents are worth it, take ten times as long.
     """
-    n, worst, pose = p.vehicles.m.shape[0], monitor.worst, monitor.poses[2]
-    q = 6 * n + p.graph.edges.shape[0] + 4
-    far = fast = carried = 0.0
-    low = least = math.inf
-    high = most = -math.inf
+    n, worst, T = p.vehicles.m.shape[0], monitor.worst, monitor.attitudes[2]
+    centre = 6 * n + p.graph.edges.shape[0] + 4
+    far = fastest = carried = 0.0
+    low = centre_low = math.inf
+    high = centre_high = -math.inf
     for k in range(5):
         x, y, z = points[k, 3 * i], points[k, 3 * i + 1], points[k, 3 * i + 2]
-        up = pose[6] * x + pose[7] * y + pose[8] * z
+        up = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
         low, high, far = min(low, up), max(high, up), max(far, x * x + y * y + z * z)
         x, y, z = points[k, 3 * (n + i)], points[k, 3 * (n + i) + 1], points[k, 3 * (n + i) + 2]
-        fast = max(fast, x * x + y * y + z * z)
-        least, most = min(least, points[k, q + 2]), max(most, points[k, q + 2])
-        x, y, z = points[k, q + 3], points[k, q + 4], points[k, q + 5]
+        fastest = max(fastest, x * x + y * y + z * z)
+        centre_low = min(centre_low, points[k, centre + 2])
+        centre_high = max(centre_high, points[k, centre + 2])
+        x, y, z = points[k, centre + 3], points[k, centre + 4], points[k, centre + 5]
         carried = max(carried, x * x + y * y + z * z)
+    # An agent in the world is at most as fast as it is in the axes, and as their centre. It is at most as high as with
+    # the axes of the middle knot, and what they turn by moves it by that angle times its distance.
     slowest = max(worst[SPEED], worst[HORIZONTAL_SPEED], worst[VERTICAL_SPEED])
     room = -slowest - math.sqrt(carried) - CLOSE
     off = angle * math.sqrt(far) + CLOSE
     return (
-        room > 0.0 and fast <= room * room
-        and least + low - off >= worst[LOWEST] and -(most + high + off) >= worst[HIGHEST]
+        room > 0.0 and fastest <= room * room
+        and centre_low + low - off >= worst[LOWEST] and -(centre_high + high + off) >= worst[HIGHEST]
     )  # fmt: skip
 
 
@@ -464,26 +478,20 @@ def watch_step(step, p, state, monitor):
     place(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
     watch_pairs(LOST, monitor.struck, points, t, h, monitor)
-    parts, angle = 1, 0.0
-    if p.body_formulation:
-        angle = angle_of(points, p)
-        parts = int(min(max(1.0, math.ceil(angle / _TURN)), 1e4))
+    angle = angle_of(points, p)
+    parts = pieces_over(angle)
     h /= parts
     # Obstacles, pairs one below the other and fences need the curve of each agent.
-    heights = monitor.boxes.shape[0] + monitor.columns.shape[0] + monitor.fence.shape[0] == 0
-    heights = heights and monitor.altitude == math.inf
+    curves = monitor.boxes.shape[0] + monitor.columns.shape[0] + monitor.fence.shape[0] > 0
+    curves = curves or monitor.altitude < math.inf or not p.body_formulation
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
-            attitudes(points, part, parts, p, monitor)
+            find_attitudes(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
-            if (
-                p.body_formulation
-                and heights
-                and unremarkable(points, i, angle / parts, p, monitor)
-            ):
+            if not curves and unremarkable(points, i, angle / parts, p, monitor):
                 continue
             curve = monitor.curve
             in_world(points, i, 1, p, monitor, curve)
@@ -563,9 +571,7 @@ def evaluate(t, step, p, w, state, monitor, values):
     basis, y = monitor.basis[0], monitor.states[0]
     weights(min(max(x, 0.0), 1.0), basis)
     for q in range(y.shape[0]):
-        y[q] = 0.0
-        for k in range(5):
-            y[q] += basis[k] * trail.points[row, k, q]
+        y[q] = along(basis, trail.points[row], q)
     monitor.time[0] = t
     # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
@@ -580,6 +586,7 @@ def promise(c, a, b, v, ta, tb, tc, p, monitor):
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
     not positive if there is nothing to expect.
     """
+    # Newton's divided differences: slopes of the two chords, and half the second derivative.
     left, right = (b - a) / (tb - ta), (v - b) / (tc - tb)
     bend = (right - left) / (tc - ta)
     if not (left >= 0.0 and right <= 0.0 and bend < 0.0):
@@ -624,16 +631,11 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
         values[0, c], values[1, c], values[2, c] = before[c], middle[c], after[c]
     for k in range(3):
         at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
+    # Entries peak at different times: the most promising one is looked at first, and all are judged there.
     for count in range(3, at.shape[0]):
-        evaluate(
-            top,
-            step if top <= end_of(step, state) else step + 1,
-            p,
-            w,
-            state,
-            monitor,
-            values[count],
-        )
+        in_step = step if top <= end_of(step, state) else step + 1
+        evaluate(top, in_step, p, w, state, monitor, values[count])
+        # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
         while at[rank[k - 1]] > top:
             rank[k] = rank[k - 1]

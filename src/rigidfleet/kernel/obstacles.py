@@ -10,22 +10,19 @@ to `CLOSE` as well. Inside, its depth is that at five points of each step, and i
 """
 
 import math
-from typing import NamedTuple
 
-import numpy as np
-
-from rigidfleet.kernel.bernstein import point_at, put_whole, refine, span_of
+from rigidfleet.kernel.bernstein import nearest_box, point_at, span_of
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import compiled, compiled_copy
 from rigidfleet.kernel.monitor import (
     angle_of,
-    attitudes,
     clearance_of_interest,
+    find_attitudes,
     in_world,
     leave,
+    pieces_over,
     take_clearance,
 )
-from rigidfleet.kernel.records import Monitor
 from rigidfleet.solids.distance import (
     displacement,
     from_box,
@@ -37,98 +34,26 @@ from rigidfleet.solids.distance import (
     signed_distance,
 )
 from rigidfleet.solids.records import HEIGHTS
-from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 #: Length of the shortest piece of a step.
 _SHORTEST = 2.0**-32
-#: Greatest rotation of one piece of a step in the body formulation [rad].
-_TURN = 0.1
-
-
-class Watched(NamedTuple):
-    """What the monitor of obstacles reads and writes; the fields are those of `records.Monitor`."""
-
-    worst: Floats
-    when: Floats
-    who: Ints
-    radius: Floats
-    left: Bools
-    standing: Ints
-    low: Floats
-    pad: float
-    pieces: Floats
-    basis: Floats
-    poses: Floats
-    knots: Floats
-    scratch: Floats
-    curves: Floats  # (3, 5, 3) a path in the world, cut at waypoints, and in the obstacle's axes
-
-
-class _Vehicles(NamedTuple):
-    m: Floats
-
-
-class _Graph(NamedTuple):
-    edges: Edges
-
-
-class Layout(NamedTuple):
-    """The part of a `Problem` that says where positions are in its states."""
-
-    vehicles: _Vehicles
-    graph: _Graph
-    body_formulation: bool
-
-
-def layout(m: Floats, edges: Edges, body_formulation: bool) -> Layout:
-    """The layout of a problem with these masses, edges and formulation."""
-    return Layout(_Vehicles(m), _Graph(edges), body_formulation)
 
 
 @compiled
-def beside(x, y, z, b, triangle, s):
-    """Distance from solid b, or from one of its triangles if that is not -1, and the normal of a supporting plane."""
+def touch_solid(x, y, z, b, triangle, s):
+    """As `bernstein.touch_box`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
-        u, v, w = outward_normal(x, y, z, b, s)
-        return signed_distance(x, y, z, b, s), u, v, w
-    u, v, w, squared = off_triangle(x, y, z, s.triangles[triangle])
+        nx, ny, nz = outward_normal(x, y, z, b, s)
+        return signed_distance(x, y, z, b, s), nx, ny, nz
+    nx, ny, nz, squared = off_triangle(x, y, z, s.triangles[triangle])
     away = math.sqrt(squared)
     if away == 0.0:
         return 0.0, 0.0, 0.0, 0.0
-    return away, u / away, v / away, w / away
+    return away, nx / away, ny / away, nz / away
 
 
-@compiled
-def bound_of(piece, b, triangle, s):
-    """Lower bound of the distance of a curve (15,) from something convex: its tangent plane, or the curve's extent."""
-    x, y, z = piece[6], piece[7], piece[8]
-    distance, u, v, w = beside(x, y, z, b, triangle, s)
-    least, known = 0.0, u != 0.0 or v != 0.0 or w != 0.0
-    for k in range(0, 15, 3):
-        p, q, r = piece[k] - x, piece[k + 1] - y, piece[k + 2] - z
-        along = u * p + v * q + w * r if known else -math.sqrt(p * p + q * q + r * r)
-        least = min(least, along)
-    return distance + least
-
-
-@compiled
-def nearest_along(curve, b, triangle, floor, pieces, s):
-    """Least distance of a curve with control points (5, 3) if below ``floor``, and its place; otherwise -1."""
-    best, at, top, count, close = floor, -1.0, 0, 0, put_whole(curve, pieces)
-    while top >= 0:
-        piece, count = pieces[top], count + 1
-        bound = bound_of(piece, b, triangle, s)
-        if not bound < best - close:
-            top -= 1
-            continue
-        for k in (0, 4):
-            distance, _, _, _ = beside(
-                piece[3 * k], piece[3 * k + 1], piece[3 * k + 2], b, triangle, s
-            )
-            if distance < best:
-                best, at = distance, piece[15] + (piece[16] if k == 4 else 0.0)
-        best, at, top = refine(bound, best, at, close, count, top, pieces)
-    return best, at
+#: As `nearest_box`, of solid b or of one of its triangles.
+nearest_along = compiled_copy(nearest_box, "nearest_along", touch_box=touch_solid)
 
 
 @compiled
@@ -251,27 +176,19 @@ def watch_landing(i, curve, t, s, monitor):
 
 
 @compiled
-def watch(points, t, h, p, s, monitor):
-    """Take the clearances of a step from t [s] of length h [s]: control points (5, n) of the states."""
-    curve, parts = monitor.curves[0], 1
-    if p.body_formulation:
-        parts = int(min(max(1.0, math.ceil(angle_of(points, p) / _TURN)), 1e4))
-    h /= parts
+def watch_step(points, start, length, p, s, monitor):
+    """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
+    curve, parts = monitor.curves[0], pieces_over(angle_of(points, p))
+    h = length / parts
     for part in range(parts):
-        start = t + part * h
+        t = start + part * h
         if p.body_formulation:
-            attitudes(points, part, parts, p, monitor)
+            find_attitudes(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
             in_world(points, i, 0, p, monitor, curve)
             for b in range(s.kind.shape[0]):
-                watch_solid(i, b, curve, start, h, s, monitor)
+                watch_solid(i, b, curve, t, h, s, monitor)
             if part == parts - 1:
-                watch_landing(i, curve, start + h, s, monitor)
-
-
-def monitor_of(monitor: Monitor) -> Watched:
-    """The monitor of obstacles that writes into another one's arrays."""
-    known = {name: getattr(monitor, name) for name in Watched._fields if name != "curves"}
-    return Watched(**known, curves=np.zeros((3, 5, 3)))
+                watch_landing(i, curve, t + h, s, monitor)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet._common.kept import kept
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import Solids, join
 from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 
@@ -309,7 +309,7 @@ def no_disturbance(masses: Floats) -> Disturbance:
     none = zeros(0, n, 3)
     return Disturbance(
         False, masses, 1.0 / masses, np.zeros(n), np.zeros(3), 1.0, none, 1.0, none, none, np.zeros(n, dtype=np.bool_),
-        np.full(n, -np.inf), np.zeros(n), joined([]),
+        np.full(n, -np.inf), np.zeros(n), join([]),
     )  # fmt: skip
 
 
@@ -338,11 +338,11 @@ def _meeting(edges: NDArray[np.integer]) -> tuple[Edges, Ints, Ints, Floats]:
         sign = 1.0 - 2.0 * end
         p, q = np.tril_indices(len(k), -1)
         parts.append(np.stack([k[p], k[q], np.full(len(p), float(agent)), sign[p] * sign[q]]))
-    found = np.concatenate(parts, axis=1)
-    pairs, where = np.unique(found[:2].T.astype(np.uint32), axis=0, return_inverse=True)
+    meetings = np.concatenate(parts, axis=1)
+    pairs, where = np.unique(meetings[:2].T.astype(np.uint32), axis=0, return_inverse=True)
     return (
         np.ascontiguousarray(pairs).reshape(-1, 2),
         where.ravel(),
-        found[2].astype(np.int64),
-        found[3],
+        meetings[2].astype(np.int64),
+        meetings[3],
     )

@@ -18,7 +18,7 @@ def copy(a, out):
 
 
 @compiled
-def unknown(out):
+def fill_with_nan(out):
     """Write NaN into a two-dimensional array."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -55,20 +55,20 @@ def record_sample(t, p, w, k, out):
         if p.disturbance.active:
             copy(w.f_D, out.f_D[k])
         else:
-            unknown(out.f_D[k])
+            fill_with_nan(out.f_D[k])
         if p.disturbance.noise_r.shape[0] > 0:
             copy(w.r_seen, out.r_seen[k])
             copy(w.v_seen, out.v_seen[k])
         else:
-            unknown(out.r_seen[k])
-            unknown(out.v_seen[k])
+            fill_with_nan(out.r_seen[k])
+            fill_with_nan(out.v_seen[k])
     for q in range(6):
         out.wrench[k, q] = w.wrench[q]
     # Even if only distances are blended, the slots give the formation's attitude.
     blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
     copy(w.p, out.p[k])
     if kind == OPEN:
-        unknown(out.T_ref[k])
+        fill_with_nan(out.T_ref[k])
     else:
         copy(w.T_ref, out.T_ref[k])
     if kind == TRACKING:
@@ -77,7 +77,7 @@ def record_sample(t, p, w, k, out):
             out.motion[k, q], out.motion[k, 3 + q] = w.body[0, q], w.body[1, q]
             out.rates[k, q] = w.body[3, q]
         return
-    unknown(out.r_ref[k])
+    fill_with_nan(out.r_ref[k])
     for q in range(3):
         out.motion[k, q] = out.motion[k, 3 + q] = out.rates[k, q] = math.nan
     if kind == BODY:

@@ -126,18 +126,22 @@ class Monitor(NamedTuple):
     # of the ball about the third control point that holds all five: its centre and its radius [m]
     balls: Annotated[Floats, Extents(("N", 4))]
     curve: Annotated[Floats, Extents((5, 3))]  # of one pair
+    # a path in the world, cut at waypoints, and in the axes of an obstacle
+    curves: Annotated[Floats, Extents((3, 5, 3))]
     work: Annotated[Floats, Extents((40, 11))]  # polynomials
     pieces: Annotated[Floats, Extents((40, 17))]  # curves
     basis: Annotated[Floats, Extents((5, 5))]
-    poses: Annotated[Floats, Extents((5, 15))]  # attitude, centre and its velocity at knots
+    # of the body axes at knots, world to body; their centre [m] and its velocity [m/s]
+    attitudes: Annotated[Floats, Extents((5, 3, 3))]
+    centres: Annotated[Floats, Extents((5, 6))]
     knots: Annotated[Floats, Extents((5, 3))]
     scratch: Annotated[Floats, Extents((3, 10))]
 
 
 def monitor(
-    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **given: Any
+    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **changes: Any
 ) -> Monitor:
-    """A new monitor without values; pairs are listed only if ``given`` among the fields."""
+    """A new monitor without values; pairs are listed only if they are among the ``changes`` of fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
     fields: dict[str, Any] = {
         "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
@@ -150,11 +154,12 @@ def monitor(
         "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
         "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
         "rank": np.zeros(_NODES, dtype=np.int64),
-        "places": np.zeros((n, 5, 3)), "balls": np.zeros((n, 4)), "curve": np.zeros((5, 3)), "work": np.zeros((40, 11)),
-        "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "poses": np.zeros((5, 15)),
-        "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
+        "places": np.zeros((n, 5, 3)), "balls": np.zeros((n, 4)), "curve": np.zeros((5, 3)),
+        "curves": np.zeros((3, 5, 3)), "work": np.zeros((40, 11)),
+        "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "attitudes": np.zeros((5, 3, 3)),
+        "centres": np.zeros((5, 6)), "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
     }  # fmt: skip
-    return Monitor(**(fields | given))
+    return Monitor(**(fields | changes))
 
 
 class IntegratorState(NamedTuple):
@@ -185,10 +190,10 @@ def integrator(
     n = len(y)
     count = np.empty(FIRST_ROW + 1, dtype=np.int64)
     state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
-    return restarted(state, y, t, rtol=rtol, atol=atol, step=step)
+    return integrator_in(state, y, t, rtol=rtol, atol=atol, step=step)
 
 
-def restarted(
+def integrator_in(
     state: IntegratorState, y: Floats, t: float, *, rtol: float, atol: Floats, step: float = 1e-3
 ) -> IntegratorState:
     """An `integrator` of as many states as another, in its memory and with its trail."""
@@ -243,8 +248,8 @@ def recorder(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
 
     Unless ``disturbed``, there are no rows of what disturbances alone give.
     """
-    agent, edge, given = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
-    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(given,) * 3
+    agent, edge, seen = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
+    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(seen,) * 3
     return Record._make([np.empty(shape) for shape in shapes])
 
 

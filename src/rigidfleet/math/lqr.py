@@ -53,7 +53,7 @@ def infinite_horizon(
     does so at least cost.
     """
     A, B, Q, R, N = _system(A, B, Q, R, N)
-    F, G, W = _reduced(A, B, Q, R, N)
+    F, G, W = _without_cross_weight(A, B, Q, R, N)
     for s in np.linalg.eigvals(A):
         mode = A - s * np.eye(len(A))
         if s.real >= 0.0 and np.linalg.matrix_rank(np.hstack([mode, B])) < len(A):
@@ -103,7 +103,9 @@ def finite_horizon(
     """
     A, B, Q, R, N = _system(A, B, Q, R, N)
     S = _weight("S", S, len(A))
-    P = riccati.cost_to_go(*_reduced(A, B, Q, R, N), S, _times("time_to_go", time_to_go))
+    P = riccati.cost_to_go(
+        *_without_cross_weight(A, B, Q, R, N), S, _times("time_to_go", time_to_go)
+    )
     return P, riccati.solve(R, B.T @ P + N.T)
 
 
@@ -200,9 +202,9 @@ def led(
 ) -> tuple[Floats, Floats, Floats]:
     """The trajectory of `finite_horizon_trajectory`, from the response at its times (K,) [s]."""
     states, inputs = response
-    given = [np.asarray(z, dtype=float) for z in (*start, *target)]
-    alike = all(z.shape == given[0].shape for z in given)
-    x0, v0, x1, v1 = given if alike else np.broadcast_arrays(*given)
+    ends = [np.asarray(z, dtype=float) for z in (*start, *target)]
+    alike = all(z.shape == ends[0].shape for z in ends)
+    x0, v0, x1, v1 = ends if alike else np.broadcast_arrays(*ends)
     e0 = np.array([x0 - (x1 - T * v1), v0 - v1])
     rows, shape = e0.reshape(2, -1), x0.shape
     e = (states.reshape(-1, 2) @ rows).reshape(-1, 2, *shape)
@@ -321,7 +323,7 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
     t, T = _times("times", times), float(_times("T", T))
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
         raise ValueError(f"times must be a list of times between 0 and T = {T} s")
-    P, x = riccati.costs_and_states(*_reduced(A, B, Q, R, N), S, t, T)
+    P, x = riccati.costs_and_states(*_without_cross_weight(A, B, Q, R, N), S, t, T)
     return x, -riccati.solve(R, (B.T @ P + N.T) @ x)
 
 
@@ -349,7 +351,7 @@ def _array(key: Key) -> Floats:
     return np.frombuffer(data).reshape(shape)
 
 
-def _reduced(
+def _without_cross_weight(
     A: Floats, B: Floats, Q: Floats, R: Floats, N: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """The same problem without N, for the input u + R^-1 N^T x: its A, B R^-1 B^T and Q."""

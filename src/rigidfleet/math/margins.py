@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -181,7 +181,7 @@ class Loop(NamedTuple):
     channels: tuple[tuple[Lag, bool], ...]
 
     @property
-    def constrained(self) -> bool:
+    def is_constrained(self) -> bool:
         """Whether the constraint law has a share in it."""
         return bool(np.abs(self.S[0]).max() > _NO_SHARE)
 
@@ -222,6 +222,11 @@ class Margins:
     gain: tuple[float, float] = (math.nan, math.nan)
     phase: float = math.nan
     delay: float = math.nan
+
+    def data(self) -> dict[str, Any]:
+        """Plain data: the phase in degrees."""
+        phase = math.degrees(self.phase)
+        return {"stable": self.stable, "gain": self.gain, "phase_deg": phase, "delay_s": self.delay}
 
 
 def formation_loops(
@@ -316,7 +321,7 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     random = np.random.default_rng(0).uniform(1.0, 2.0, len(matrices))
     X = sum(c * A for c, A in zip(random, matrices, strict=True))
     n = len(X)
-    done, found = np.zeros((n, 0)), {}
+    done, bases = np.zeros((n, 0)), {}
     for v in np.linalg.eigh(X)[1].T:
         rest = v - done @ (done.T @ v)
         size = np.linalg.norm(rest)
@@ -333,8 +338,8 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
                     V = np.column_stack([V, y / size])
             at += 1
         done = np.column_stack([done, V])
-        found.setdefault(tuple(np.round(np.linalg.eigvalsh(V.T @ X @ V), 6)), V)
-    return list(found.values())
+        bases.setdefault(tuple(np.round(np.linalg.eigvalsh(V.T @ X @ V), 6)), V)
+    return list(bases.values())
 
 
 def is_stable(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> bool:
@@ -353,19 +358,19 @@ def _unstable(loop: Loop, law: Feedback, growth: float) -> int:
     if end == 0.0:
         return 0
 
-    def returned(omega: Floats) -> Complexes:
+    def return_difference(omega: Floats) -> Complexes:
         return np.eye(n) + loop.gain(growth + 1j * omega, law)
 
     # The poles of L at 0 are left of this line. To its right L is analytic and vanishes at infinity.
     omega = np.append(0.0, np.geomspace(0.1 * growth, end, _SAMPLES))
-    F = returned(omega)
+    F = return_difference(omega)
     turn = np.linalg.solve(F[:-1], F[1:])
     for _ in range(30):
         far = np.flatnonzero(np.linalg.norm(turn - np.eye(n), axis=(1, 2)) > near)
         if not len(far):
             break
         middle = 0.5 * (omega[far] + omega[far + 1])
-        between = returned(middle)
+        between = return_difference(middle)
         # Only the halves of an interval that is divided are new.
         halves = np.linalg.solve(F[far], between), np.linalg.solve(between, F[far + 1])
         turn[far] = halves[0]
@@ -423,7 +428,7 @@ def _loci_at(loop: Loop, law: Feedback, *, on_axis: bool) -> list[tuple[float, c
         """A number that is whole at a crossing, of log(locus)."""
         return (z.imag - math.pi) / (2 * math.pi) if on_axis else z.real * 1e-3
 
-    found = []
+    crossings = []
     number = place(loci)
     for k, c in np.argwhere(np.floor(number[:-1]) != np.floor(number[1:])):
         target = max(np.floor(number[k, c]), np.floor(number[k + 1, c]))
@@ -439,8 +444,8 @@ def _loci_at(loop: Loop, law: Feedback, *, on_axis: bool) -> list[tuple[float, c
             return complex(z[np.abs(z).argmin()] + guess)
 
         x = _root(lambda x, at=at, target=target: float(place(np.array(at(x)))) - target, *ends)
-        found.append((math.exp(x), complex(np.exp(at(x)))))
-    return found
+        crossings.append((math.exp(x), complex(np.exp(at(x)))))
+    return crossings
 
 
 def _root(f: Callable[[float], float], a: float, b: float) -> float:
@@ -459,7 +464,7 @@ def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
     omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
     values = _eigenvalues(loop.gain(1j * omega, law))
     for _ in range(12):
-        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+        loci = _follow(np.log(np.where(values == 0, 1e-300, values)))
         step = np.abs(np.diff(loci, axis=0))
         # Where loci are fainter than the threshold, they turn as they please.
         step[np.maximum(loci[1:].real, loci[:-1].real) < math.log(_FAINT)] = 0.0
@@ -470,11 +475,11 @@ def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
         omega = np.insert(omega, coarse + 1, middle)
         values = np.insert(values, coarse + 1, _eigenvalues(loop.gain(1j * middle, law)), axis=0)
     else:
-        loci = _followed(np.log(np.where(values == 0, 1e-300, values)))
+        loci = _follow(np.log(np.where(values == 0, 1e-300, values)))
     return omega, loci
 
 
-def _followed(loci: Complexes) -> Complexes:
+def _follow(loci: Complexes) -> Complexes:
     """Logarithms (K, n), reordered and unwrapped so that each column is continuous."""
     from scipy.optimize import linear_sum_assignment
 

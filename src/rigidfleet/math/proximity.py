@@ -93,14 +93,14 @@ def all_pairs(n: int) -> Ints:
 
 def lengths(r: Floats, pairs: Ints) -> Floats:
     """Distances (m, K) [m] of pairs (m, 2) of agents r (K, N, 3): a row for each pair, which is faster."""
-    x, found = np.ascontiguousarray(r.T), np.empty((len(pairs), len(r)))
+    x, apart = np.ascontiguousarray(r.T), np.empty((len(pairs), len(r)))
     some = max(1, CACHED // (3 * len(r)))
     for first in range(0, len(pairs), some):
         i, j = pairs[first : first + some].T
         d = x.take(i, axis=1)
         d -= x.take(j, axis=1)
-        found[first : first + some] = root_of_squares(d)
-    return found
+        apart[first : first + some] = root_of_squares(d)
+    return apart
 
 
 def root_of_squares(d: Floats) -> Floats:
@@ -127,7 +127,7 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
         if near is not None:
             apart = near.separations(p)
             at = int(apart.argmin())
-        if near is None or apart[at] > near.beyond - 2.0 * _moved(rest, p):
+        if near is None or apart[at] > near.beyond - 2.0 * _greatest_move(rest, p):
             near, rest = _near(p, radius), p
             apart = near.separations(p)
             at = int(apart.argmin())
@@ -161,14 +161,14 @@ def _near(p: Floats, radius: Floats) -> _Near:
     widest, rounding = 2.0 * float(radius.max()), 1e-9 * float(np.abs(p).max())
     estimate = float((d[:, 1] - radius[some] - radius[j[:, 1]]).min())
     pairs = tree.query_pairs(_SPARE * (estimate + widest) + rounding, output_type="ndarray").T
-    found = _Near(pairs, radius[pairs].sum(axis=0), 0.0)
-    separations = found.separations(p)
+    candidates = _Near(pairs, radius[pairs].sum(axis=0), 0.0)
+    separations = candidates.separations(p)
     beyond = _SPARE * (float(separations.min()) + widest) + rounding - widest
     near = separations <= beyond
-    return _Near(np.ascontiguousarray(pairs[:, near]), found.radii[near], beyond)
+    return _Near(np.ascontiguousarray(pairs[:, near]), candidates.radii[near], beyond)
 
 
-def _moved(before: Floats, after: Floats) -> float:
+def _greatest_move(before: Floats, after: Floats) -> float:
     """Greatest displacement [m] of an agent, from (3, N) to (3, N), after removing the rigid motion of all."""
     U, _, Vt = np.linalg.svd(after @ before.T)
     moved = after - (U @ Vt) @ before  # a reflection also preserves distances
@@ -285,21 +285,21 @@ def closeness(
     Its arrays are read-only.
     """
     radius = np.asarray(radius, dtype=float)
-    given = [r, radius, time, left]
-    for things, before, found in _last[-1:]:
-        if things is obstacles and all(map(_same, given, before)):
-            return found
+    arguments = [r, radius, time, left]
+    for things, before, answer in _last[-1:]:
+        if things is obstacles and all(map(_same, arguments, before)):
+            return answer
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
-    found = Closeness(
+    answer = Closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
-    for values in found:
+    for values in answer:
         values.flags.writeable = False
     if r.nbytes <= _KEPT:
-        _last[:] = [(obstacles, [x.copy() for x in given], found)]
-    return found
+        _last[:] = [(obstacles, [x.copy() for x in arguments], answer)]
+    return answer
 
 
 def _same(a: Floats | Bools, b: Floats | Bools) -> bool:
@@ -346,13 +346,13 @@ def below(
 
     At times (M,) [s]. On these a vehicle may stand: on ground, roof or terrain, not on a wall beside or on what moves.
     """
-    found = np.zeros((len(obstacles), len(r)), dtype=np.bool_)
+    under = np.zeros((len(obstacles), len(r)), dtype=np.bool_)
     for b, thing in enumerate(obstacles):
         near = np.flatnonzero(distances(*r.T, thing.solid, time) <= radius + reach)
         for first in range(0, len(near), _TOGETHER):
             some = near[first : first + _TOGETHER]
-            found[b, some] = distance.is_below(*r[some].T, 0, thing.solid)
-    return found
+            under[b, some] = distance.is_below(*r[some].T, 0, thing.solid)
+    return under
 
 
 def _approach(
@@ -392,18 +392,18 @@ def distances(
         x, y, z = x - shift[0], y - shift[1], z - shift[2]
     x, y, z = distance.own_axes(x, y, z, 0, solid)
     if solid.kind[0] in _SURFACES:
-        found = np.full(x.shape, np.inf)
+        away = np.full(x.shape, np.inf)
         near = np.flatnonzero((distance.from_box(x, y, z, solid.size[0]) < most).reshape(-1))
-        points, flat = np.stack([x, y, z]).reshape(3, -1), found.reshape(-1)
+        points, flat = np.stack([x, y, z]).reshape(3, -1), away.reshape(-1)
         for first in range(0, len(near), _TOGETHER):
             some = near[first : first + _TOGETHER]
             flat[some] = distance.signed_distance(*points[:, some], 0, solid)
     else:
-        found = distance.signed_distance(x, y, z, 0, solid)
+        away = distance.signed_distance(x, y, z, 0, solid)
     if not any(map(math.isfinite, solid.there[0].tolist())):
-        return found
+        return away
     there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
-    return np.where(there, found, np.inf)
+    return np.where(there, away, np.inf)
 
 
 #: Number of points up to which all distances are compared: importing what finds neighbours faster takes longer.

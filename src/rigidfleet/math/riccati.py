@@ -32,7 +32,7 @@ def cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Float
     Raises ValueError if P does not exist at all times to go until the greatest, or cannot be computed.
     """
     grows = _grows(A, G, Q, S, tau.max(initial=0.0))
-    return _marched(A, G, Q, S, tau)[0] if grows else _doubled(A, G, Q, S, tau)
+    return _by_marching(A, G, Q, S, tau)[0] if grows else _by_doubling(A, G, Q, S, tau)
 
 
 def costs_and_states(
@@ -44,19 +44,19 @@ def costs_and_states(
     """
     tau = np.maximum(T - t, 0.0)
     if _grows(A, G, Q, S, T):
-        P, x = (found[:-1] for found in _marched(A, G, Q, S, np.append(tau, T)))
+        P, x = (part[:-1] for part in _by_marching(A, G, Q, S, np.append(tau, T)))
         return P, x
-    P = _doubled(A, G, Q, S, tau)
+    P = _by_doubling(A, G, Q, S, tau)
     X, Phi, W, _ = _flow(A, G, Q, S, t, T)
     return P, solve(np.eye(len(A)) + W @ (P - X), Phi)
 
 
-def _doubled(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
+def _by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Floats:
     """P (..., n, n) at times to go tau (...), from the flow of `_propagate`."""
     X, Phi, W, V = _flow(A, G, Q, S, tau, tau.max(initial=0.0))
     D = S - X
-    P = X + V + _transposed(Phi) @ solve(np.eye(len(A)) + D @ W, D @ Phi)
-    return 0.5 * (P + _transposed(P))
+    P = X + V + _transpose(Phi) @ solve(np.eye(len(A)) + D @ W, D @ Phi)
+    return 0.5 * (P + _transpose(P))
 
 
 def _grows(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
@@ -78,7 +78,7 @@ def _grows(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
     return not float(np.abs(Phi).max()) <= _GROWTH  # true for NaN
 
 
-def _marched(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
+def _by_marching(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tuple[Floats, Floats]:
     """P and x (..., n, n) at times to go tau (...), in steps that each keep P positive.
 
     Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
@@ -130,14 +130,14 @@ def _flow(
     A, Q = A - GS, A.T @ S + S @ A - S @ GS + Q
     rate = float(np.linalg.norm(A, 2) + np.sqrt(np.linalg.norm(G, 2) * np.linalg.norm(Q, 2)))
 
-    def escaped(t: float) -> bool:
+    def escapes(t: float) -> bool:
         return bool(_propagate(A, G, Q, np.array(t), rate)[3])
 
-    if escaped(T):
+    if escapes(T):
         low, high = 0.0, T
         while high - low > 1e-12 * high:
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if escaped(middle) else (middle, high)
+            low, high = (low, middle) if escapes(middle) else (middle, high)
         raise ValueError(
             f"the cost has no minimum over {high:.10g} s or longer: its Riccati equation grows"
             f" beyond all bounds at a time to go of {high:.10g} s. Shorten the horizon, or make Q or S"
@@ -217,11 +217,11 @@ def _propagate(
             more &= ~escaped
         d, w, v = D[more], W[more], V[more]
         phi, wv = identity + d, w @ v
-        turn = solve(identity + wv, np.concatenate([wv, w @ _transposed(phi)], axis=-1))
+        turn = solve(identity + wv, np.concatenate([wv, w @ _transpose(phi)], axis=-1))
         loss, reach = turn[..., :n], turn[..., n:]
         D[more] = 2.0 * d + d @ d - phi @ loss @ phi
         W[more] = w + phi @ reach
-        V[more] = v + _transposed(phi) @ v @ (phi - loss @ phi)
+        V[more] = v + _transpose(phi) @ v @ (phi - loss @ phi)
     return identity + D, W, V, escaped
 
 
@@ -235,5 +235,5 @@ def solve(M: Floats, b: Floats) -> Floats:
     return np.linalg.solve(M, b).astype(float, copy=False)
 
 
-def _transposed(M: Floats) -> Floats:
+def _transpose(M: Floats) -> Floats:
     return np.swapaxes(M, -1, -2)

@@ -50,8 +50,8 @@ def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
         for k in range(powers - 2, order - 1, -1):
             c[k] = c[k] + x * c[k + 1]
     full = np.zeros((orders, *np.broadcast_shapes(x.shape, c[0].shape)))
-    for order, found in enumerate(c[:orders]):
-        full[order] = found
+    for order, values in enumerate(c[:orders]):
+        full[order] = values
     return full
 
 
@@ -60,10 +60,10 @@ def product(
 ) -> Floats:
     """Series of the product of two series of the same order, by any bilinear ``multiply``, such as `numpy.matmul`."""
     n = min(len(a), len(b))
-    found = multiply(a[0], b[:n])
+    total = multiply(a[0], b[:n])
     for i in range(1, n):
-        found[i:] += multiply(a[i], b[: n - i])
-    return found
+        total[i:] += multiply(a[i], b[: n - i])
+    return total
 
 
 def rotation(phi: Floats) -> Floats:
@@ -102,10 +102,10 @@ def rotation_vector(R: Floats) -> Floats:
 
 def from_rates(R: Floats, omega: Floats) -> Floats:
     """Series (n + 1, ..., 3, 3) of a rotation that is R (..., 3, 3), body to world, at body rates omega (n, ..., 3)."""
-    W, found = cross_matrix(omega), [R]
+    W, terms = cross_matrix(omega), [R]
     for k in range(len(omega)):  # R' = R [omega x]
-        found.append(np.sum([found[i] @ W[k - i] for i in range(k + 1)], axis=0) / (k + 1))
-    return np.stack(found)
+        terms.append(np.sum([terms[i] @ W[k - i] for i in range(k + 1)], axis=0) / (k + 1))
+    return np.stack(terms)
 
 
 def body_rates(R: Floats) -> Floats:
@@ -115,8 +115,8 @@ def body_rates(R: Floats) -> Floats:
 
 def angle(y: Floats, x: Floats) -> Floats:
     """Series of atan2(y, x) [rad]; derivatives where y and x vanish are zero."""
-    found = np.zeros_like(x)
-    found[0] = np.arctan2(y[0], x[0])
+    angles = np.zeros_like(x)
+    angles[0] = np.arctan2(y[0], x[0])
     size = x[0] ** 2 + y[0] ** 2
     safe = np.where(size > 0.0, size, np.inf)
     turned, square = (
@@ -126,8 +126,8 @@ def angle(y: Floats, x: Floats) -> Floats:
     rates = np.zeros_like(turned)  # angle' (x^2 + y^2) = x y' - y x'
     for k in range(len(turned)):
         rates[k] = (turned[k] - sum(rates[i] * square[k - i] for i in range(k))) / safe
-        found[k + 1] = rates[k] / (k + 1)
-    return found
+        angles[k + 1] = rates[k] / (k + 1)
+    return angles
 
 
 def cross_matrix(a: Floats) -> Floats:
@@ -147,24 +147,24 @@ def _axial(W: Floats) -> Floats:
 
 def _stumpff(u: Floats, count: int) -> Floats:
     """Stumpff functions c_0 to c_(count - 1) (count, ...) of u >= 0: c_k = sum_i (-u)^i / (2 i + k)!."""
-    found = np.zeros((count, *u.shape))
+    values = np.zeros((count, *u.shape))
     near = u < _SERIES
     small = np.where(near, u, 0.0)
     for k in (count - 1, count - 2):
-        total = found[k, ...]  # a view, of single numbers as well
+        total = values[k, ...]  # a view, of single numbers as well
         for i in range(_TERMS, -1, -1):  # Horner
             np.multiply(total, small, out=total)
             np.subtract(_RECIPROCALS[2 * i + k], total, out=total)
     for k in range(count - 3, -1, -1):  # c_k = 1/k! - u c_(k + 2), downwards for small u
-        found[k] = _RECIPROCALS[k] - small * found[k + 2]
+        values[k] = _RECIPROCALS[k] - small * values[k + 2]
     if near.all():
-        return found
+        return values
     large = np.where(near, _SERIES, u)
     root = np.sqrt(large)
     closed = [np.cos(root), np.sin(root) / root]
     for k in range(2, count):  # upwards for large u
         closed.append((_RECIPROCALS[k - 2] - closed[k - 2]) / large)
-    return np.where(near, found, np.stack(closed))
+    return np.where(near, values, np.stack(closed))
 
 
 def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
@@ -174,15 +174,15 @@ def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
     """
     n, slope = len(u), rate(u)
     count = 2 * n + 1  # of the functions; two fewer with each order
-    found = [_stumpff(u[0], count)]
+    orders = [_stumpff(u[0], count)]
     chain: list[Floats] = []  # derivatives by u
     for order in range(1, n):
-        c = found[-1]
+        c = orders[-1]
         k = np.arange(len(c) - 2.0).reshape(-1, *(1,) * (c.ndim - 1))
         chain.append(0.5 * (k * c[2:] - c[1:-1]))
         total = slope[0] * chain[-1]
         for i in range(1, order):
             total += slope[i] * chain[order - 1 - i][: len(total)]
-        found.append(total / order)
-    c0, c1, c2 = (np.stack([c[k] for c in found]) for k in range(3))
+        orders.append(total / order)
+    c0, c1, c2 = (np.stack([c[k] for c in orders]) for k in range(3))
     return c0, c1, c2

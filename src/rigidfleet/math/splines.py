@@ -62,8 +62,8 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Float
             if not np.isnan(velocity).any():
                 A[k, 2], b[k, 2] = 0.0, unit * velocity
                 A[k, 2, 0, k] = 1.0
-        found = np.linalg.solve(A.reshape(3 * inner, 3 * inner), b.reshape(3 * inner, -1))
-        full[1:, 1:-1] = found.reshape(3, inner, *shape)
+        inside = np.linalg.solve(A.reshape(3 * inner, 3 * inner), b.reshape(3 * inner, -1))
+        full[1:, 1:-1] = inside.reshape(3, inner, *shape)
     return Piecewise.hermite(t, full).pieces / unit ** np.arange(POWERS)
 
 
@@ -84,7 +84,7 @@ def snap_cost(pieces: Floats, times: Floats) -> float:
     )
 
 
-def allocated(total: float, x: Floats, *state: Floats) -> Floats:
+def best_times(total: float, x: Floats, *state: Floats) -> Floats:
     """Times (n + 1,) [s] from 0 to ``total`` at points x (n + 1, d) that make the snap of `minimum_snap` least.
 
     ``state`` are its arguments after the points. From times that grow with the square root of each distance, by a
@@ -110,6 +110,6 @@ def allocated(total: float, x: Floats, *state: Floats) -> Floats:
     start = 0.5 * np.log(np.maximum(way, 1e-3 * max(float(way.max()), 1e-9)))
     first = 1.0
     first = abs(cost(start)) + 1.0
-    found = minimize(cost, start, method="BFGS", options={"gtol": 1e-6})
-    best = found.x if cost(found.x) <= cost(start) else start
+    best_shares = minimize(cost, start, method="BFGS", options={"gtol": 1e-6})
+    best = best_shares.x if cost(best_shares.x) <= cost(start) else start
     return times(best)

@@ -6,7 +6,6 @@ the files.
 
 from __future__ import annotations
 
-import copy
 import csv
 import hashlib
 import io
@@ -22,11 +21,6 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
-from rigidfleet.foreign.columns import Doubt
-from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
-from rigidfleet.foreign.files import groups_of_files, read_trajectories
-from rigidfleet.foreign.samples import ASSUMED
-from rigidfleet.formation.point_files import parse_points, read_bytes
 from rigidfleet.mission import bounds
 from rigidfleet.mission.text import unread
 
@@ -34,8 +28,6 @@ from rigidfleet.mission.text import unread
 _DIGEST = "SHA-256 "
 #: What stands before the notes on a file.
 _DOUBTS = ". Note: "
-#: What a text has that may name a file.
-_MAY_NAME = re.compile(r"(file|slots|position)[\"']?\s*=\s*[\"']")
 #: What is said where a file cannot be found, because a mission is not from a file itself.
 NOT_A_FILE = "is read only with a mission file, as its path is relative to that"
 
@@ -62,29 +54,12 @@ class Content(NamedTuple):
     notes: Sequence[str] = ()
 
 
-def completed(text: str, path: Path) -> str:
-    """Text of a mission as `with_files` gives it; itself if it names no files.
-
-    Raises
-    ------
-    MissionError
-        As `with_files` does.
-    """
-    if _MAY_NAME.search(text) is None or bounds.excess(text):
-        return text  # which need not, or must not, be parsed
-    try:
-        data = tomllib.loads(text)
-    except (ValueError, RecursionError):
-        return text  # whose errors the check tells
-    return with_files(text, data, path)
-
-
-def with_files(text: str, data: dict[str, Any], path: Path) -> str:
-    """Text of a mission in which numbers stand instead of the names of files, with the SHA-256 digest of each.
+def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, Any], str]:
+    """A mission in which numbers stand instead of the names of files, with the SHA-256 digest of each in its text.
 
     Parameters
     ----------
-    text, data : the mission's text, and what it says
+    data, text : what the mission's text says, which is changed, and the text
     path : the mission file; names of files are relative to its folder, and do not leave it
 
     Raises
@@ -92,32 +67,39 @@ def with_files(text: str, data: dict[str, Any], path: Path) -> str:
     MissionError
         A file is outside the folder, cannot be read, or has not the numbers asked for.
     """
-    data, digests = copy.deepcopy(data), []
+    digests = []
     for named in list(_named(data)):
+        from rigidfleet.formation.point_files import read_bytes
+
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
         rows, colours, notes = named.read(content, str(path.parent / name))
-        told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
+        origin = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         if notes:
-            told += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
-        digests.append(f"# {named.where}: {told}\n")
+            origin += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
+        digests.append(f"# {named.where}: {origin}\n")
         del named.table[named.key]
         if named.becomes == "trajectories":
             named.table.pop("units", None), named.table.pop("axes", None)
         named.table[named.becomes] = rows
         written = "".join(f"  {row!r},\n" for row in rows)
         line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
-        put = f"# {told}\n{named.becomes} = [\n{written}]"
+        put = f"# {origin}\n{named.becomes} = [\n{written}]"
         if colours is not None and named.becomes == "slots" and "colour" not in named.table:
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"
         text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
+    if digests and not _says(text, data):  # where a file is named within a line
+        text = "".join(digests) + to_toml(data)
+    return data, text
+
+
+def _says(text: str, data: dict[str, Any]) -> bool:
+    """Whether TOML text says what data say."""
     try:
-        if tomllib.loads(text) == data:
-            return text
+        return tomllib.loads(text) == data
     except tomllib.TOMLDecodeError:
-        pass
-    return "".join(digests) + to_toml(data)  # where a file is named within a line
+        return False
 
 
 def digests(text: str) -> str:
@@ -144,6 +126,8 @@ def _names(path: Path, named: _Named) -> list[str]:
     found = _inside(path, named.where, name)
     if not named.folder or not found.is_dir():
         return [name]
+    from rigidfleet.foreign.files import groups_of_files
+
     try:
         inside = [file for group in groups_of_files(found) for file in group]
     except TrajectoryError as error:
@@ -202,6 +186,8 @@ def _inside(path: Path, where: str, name: str) -> Path:
 
 
 def _points(data: bytes, name: str) -> Content:
+    from rigidfleet.formation.point_files import parse_points
+
     found = parse_points(data, name)
     return Content(found.slots.tolist(), found.colours)
 
@@ -211,6 +197,11 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
 
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
     """
+    from rigidfleet.foreign.columns import Doubt
+    from rigidfleet.foreign.curves import curve_to_rows, least_jerk_curve
+    from rigidfleet.foreign.files import read_trajectories
+    from rigidfleet.foreign.samples import ASSUMED
+
     try:
         read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
     except TrajectoryError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -32,46 +31,15 @@ _STAND_IN: dict[str, Any] = {
 }  # fmt: skip
 
 
-class Shared:
-    """The tables that several missions have in common, as the same objects, each validated once for all of them.
-
-    Attributes
-    ----------
-    models : of tables without errors, by their `key`
-    sound : what the phases of the last mission were checked by, if they had no findings
-    """
-
-    def __init__(self, data: Mapping[str, Any]) -> None:
-        # Alive, so that no other table gets the number of one of them.
-        self._tables = {id(table): table for table in _tables(data)}
-        self.models: dict[Any, Any] = {}
-        self.sound: tuple[Any, ...] | None = None
-
-    def key(self, kind: type[Part], data: object, defaults: Mapping[str, Any]) -> Any:
-        """What a model of a table is found by; None if the table is none of these."""
-        return (id(data), kind, *defaults.values()) if id(data) in self._tables else None
-
-
-def _tables(data: Any) -> Iterator[dict[str, Any]]:
-    """All tables in plain data."""
-    if isinstance(data, dict):
-        yield data
-        data = list(data.values())
-    if isinstance(data, list):
-        for part in data:
-            yield from _tables(part)
-
-
 class FindingCollector:
     """Findings about one mission, each at a path of keys in its data.
 
     A path counts from 0, a message from 1: ("phases", 1) is reported as `phases[2]`.
     """
 
-    def __init__(self, data: Mapping[str, Any], origin: str, shared: Shared | None = None) -> None:
+    def __init__(self, data: Mapping[str, Any], origin: str) -> None:
         self.data = data
         self.origin = origin
-        self.shared = shared or Shared({})
         self._findings: dict[tuple[str, str], Finding] = {}
         self._told: Counter[Keys] = Counter()
         self._wrong: set[Keys] = set()
@@ -143,21 +111,14 @@ class FindingCollector:
 
         Keys with errors are left out, so that later checks can use the others. None if that leaves no valid model.
         """
-        key = self.shared.key(kind, data, defaults)
-        if (found := self.shared.models.get(key)) is not None:
-            return found
         if not isinstance(data, dict):
             self.add(path, "must be a table", f"write [{_key(path)}] with its keys below it")
             return None
         data = {**defaults, **data} if defaults else data
         try:
-            model = kind.model_validate(data)
+            return kind.model_validate(data)
         except ValidationError as error:
             errors = error.errors(include_url=False)
-        else:
-            if key is not None:
-                self.shared.models[key] = model
-            return model
         for error in errors:
             self._structural(error, kind, path)
         wrong = {error["loc"][0] for error in errors}
@@ -207,6 +168,8 @@ def look_up(data: Any, path: Keys, default: Any = None) -> Any:
 
 def near(word: object, known: Iterable[str]) -> str:
     """Return 'did you mean ...?' if a known word is similar, else ''."""
+    import difflib
+
     words = {k.lower(): k for k in known}
     match = difflib.get_close_matches(str(word).lower(), words, n=1, cutoff=0.55)
     return f"did you mean '{words[match[0]]}'?" if match else ""

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from rigidfleet.errors import wrong_type
-from rigidfleet.mission.files import completed
+from rigidfleet.mission.files import with_files
 from rigidfleet.mission.model import Mission
 from rigidfleet.mission.schema import Start
-from rigidfleet.mission.text import mission_names, mission_text, read_text
+from rigidfleet.mission.text import mission_names, mission_text, parse_toml, read_text
 
 
 def load_mission(name_or_path: str | Path) -> Mission:
@@ -24,9 +24,19 @@ def load_mission(name_or_path: str | Path) -> Mission:
     """
     if isinstance(name_or_path, str) and name_or_path in mission_names():
         return Mission.from_toml(mission_text(name_or_path), name_or_path)
-    text, origin = read_text(name_or_path), str(name_or_path)
-    text = completed(text, Path(name_or_path))
-    return Mission.from_toml(text, origin)
+    return mission_of_file(read_text(name_or_path), str(name_or_path))
+
+
+def mission_of_file(text: str, origin: str) -> Mission:
+    """The mission of the text of a file, and of the files that it names relative to that.
+
+    Raises
+    ------
+    MissionError
+        The text is no mission, or a file cannot be read.
+    """
+    data, text = with_files(parse_toml(text, origin), text, Path(origin))
+    return Mission.from_plain(data, origin, text=text)
 
 
 def as_mission(given: Mission | str | Path) -> Mission:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
 from typing import Any, Literal, NamedTuple, Self, TypeVar
@@ -11,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
+from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
 from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
-from rigidfleet._common.toml import to_toml
+from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.assignment import assign_slots, downwash_metric
 from rigidfleet.formation.distance_geometry import distances
@@ -21,19 +21,18 @@ from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission.changes import scaled, told_apart
+from rigidfleet.mission.changes import with_own_names, with_scales
 from rigidfleet.mission.check import check, defaults
-from rigidfleet.mission.describe import counted
+from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.files import digests
-from rigidfleet.mission.findings import Shared
 from rigidfleet.mission.kinds import Establish, Phase
-from rigidfleet.mission.obstacles import Ground, is_ground
+from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.schema import DRAG, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.solids.distance import height_below
-from rigidfleet.solids.records import Solids, joined
+from rigidfleet.solids.records import Solids, join
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Smallest and largest damping that "auto" uses. Below, rounding errors show; docs/robustness.md has the measurements.
@@ -80,7 +79,7 @@ def _once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
     return wrapper
 
 
-class Mission(Contents):
+class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
     >>> import rigidfleet as rf
@@ -88,9 +87,10 @@ class Mission(Contents):
     <Mission narrow-passage: 3 agents, 2 formations, 12 phases, 90 s>
     """
 
+    #: As written: plain data, which `to_dict` copies, and the text, which is made of them when it is asked for.
+    _data: dict[str, Any] = PrivateAttr(default_factory=dict)
     _text: str = PrivateAttr("")
-    #: What the text is made of when it is asked for.
-    _plain: dict[str, Any] | None = PrivateAttr(None)
+    _about: str = PrivateAttr("")
     _origin: str = PrivateAttr("")
 
     def __init__(self, *_: object, **__: object) -> None:
@@ -116,34 +116,26 @@ class Mission(Contents):
         """
         if not isinstance(text, str):
             raise wrong_type("the text of a mission file", text)
-        return cls._checked(parse_toml(text, origin), text, origin)
+        return cls.from_plain(parse_toml(text, origin), origin, text=text)
 
     @classmethod
-    def from_plain(cls, data: dict[str, Any], origin: str, shared: Shared | None = None) -> Self:
-        """Check a mission given as the plain data of its TOML text, as `to_dict` returns it.
-
-        Tables that are ``shared`` with other missions are validated once for all of them.
+    def from_plain(cls, data: dict[str, Any], origin: str, *, text: str = "") -> Self:
+        """Check a mission given as the plain data of its TOML text, as `to_dict` returns it; the mission keeps them.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        mission = cls._checked(data, "", origin, shared)
-        mission._plain = data
-        return mission
-
-    @classmethod
-    def _checked(
-        cls, data: dict[str, Any], text: str, origin: str, shared: Shared | None = None
-    ) -> Self:
-        parts = check(data, origin, shared)
+        parts = check(data, origin)
         if parts["assignment"] == "each":
-            parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+            parts["formations"], parts["phases"] = with_own_names(
+                parts["formations"], parts["phases"]
+            )
         n = len(parts["agents"].position)
-        parts["formations"] = scaled(parts["formations"], parts["phases"], n)
+        parts["formations"] = with_scales(parts["formations"], parts["phases"], n)
         mission = cls.model_construct(set(parts), **defaults() | parts)
-        mission._text, mission._origin = text, origin
+        mission._data, mission._text, mission._origin = data, text, origin
         return mission
 
     @classmethod
@@ -158,15 +150,15 @@ class Mission(Contents):
         if not isinstance(data, Mapping):
             raise wrong_type("a dict with the keys of a mission", data)
         try:
-            text = to_toml(data)
+            copied = plain_data(data)
         except TypeError as error:
             raise unread(origin, str(error), "use numbers, strings, lists and dicts") from None
         except RecursionError:
             raise unread(origin, "is nested too deeply", "use the keys of a mission") from None
-        return cls.from_toml(text, origin)
+        return cls.from_plain(copied, origin)
 
     def rewritten(self, data: Mapping[str, Any], origin: str | None = None) -> Self:
-        """Return a mission from changed data of this one, checked; its text keeps the digests of files.
+        """Return a mission from changed data of this one, checked, with what is known of its files (`about`).
 
         Raises
         ------
@@ -174,19 +166,19 @@ class Mission(Contents):
             With a finding for each error.
         """
         mission = self.from_dict(data, self._origin if origin is None else origin)
-        mission._text = digests(self.text) + mission._text
+        mission._about = self.about
         return mission
 
     def with_phases(self, phases: list[dict[str, Any]]) -> Self:
-        """Return the mission with other tables of phases, checked. It keeps its own text.
+        """Return the mission with other tables of phases, checked. It is written as before.
 
         Raises
         ------
         MissionError
             With a finding for each error.
         """
-        mission = self.from_dict(self.to_dict() | {"phases": phases}, self._origin)
-        mission._text = self.text
+        mission = self.rewritten(self._data | {"phases": phases})
+        mission._data, mission._text = self._data, self._text
         return mission
 
     def with_assignment(self, assignment: str) -> Self:
@@ -207,28 +199,35 @@ class Mission(Contents):
 
     __str__ = __repr__
 
-    def _repr_html_(self) -> str:
-        """Show the mission in a notebook: its phases, in order."""
-        from rigidfleet._common import markup
-        from rigidfleet.mission.describe import ending, goal
+    def facts(self) -> Sheet:
+        """The phases, in order, and the size."""
+        return Sheet(self.name, self.title, [self.phase_table, Line(self.size_in_words)])
 
+    @property
+    def phase_table(self) -> Table:
+        """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
-            (n, phase.name, phase.kind, goal(phase), ending(phase), phase.control)
-            for n, phase in enumerate(self.phases, start=1)
+            Row((n, p.name, p.kind, goal(p), ending(p), p.control))
+            for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
-        return markup.shown(self.name, self.title, heads, rows, self.size_in_words)
+        return Table(heads, rows, heads[1:])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
-        return tomllib.loads(self.text)
+        return plain_data(self._data)
 
     @property
     def text(self) -> str:
         """The TOML text of the mission."""
-        if self._plain is not None:
-            self._text, self._plain = to_toml(self._plain), None
+        if not self._text:
+            self._text = self._about + to_toml(self._data)
         return self._text
+
+    @property
+    def about(self) -> str:
+        """What its text tells of the files that were read: lines with their digests."""
+        return self._about or digests(self._text)
 
     @property
     def origin(self) -> str:
@@ -465,11 +464,15 @@ class Mission(Contents):
         """Height of the highest `ground` [m]; minus infinity if there is none."""
         return max((o.height for o in self.obstacles if isinstance(o, Ground)), default=-np.inf)
 
+    @property
+    def solids(self) -> list[Obstacle]:
+        """Obstacles but for the ground, which is everywhere."""
+        return [o for o in self.obstacles if not isinstance(o, Ground)]
+
     @cached_property
     def roofs(self) -> Solids:
         """What counts as ground besides it: height maps, and boxes at rest that are no zones."""
-        things = (o for o in self.obstacles if is_ground(o) and not isinstance(o, Ground))
-        return joined([o.solid for o in things])
+        return join([o.solid for o in self.solids if is_ground(o)])
 
     def height_at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike = np.inf) -> Floats:
         """Height [m] of what is below points (x, y) [m], arrays of one shape or numbers; minus infinity: nothing.

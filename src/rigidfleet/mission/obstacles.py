@@ -1,7 +1,5 @@
 """Obstacles of a mission: their keys, their solids, and checks that no single key decides."""
 
-from __future__ import annotations
-
 import math
 from abc import abstractmethod
 from functools import cached_property

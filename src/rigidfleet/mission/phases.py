@@ -49,28 +49,13 @@ Lengths = list[float | None]
 
 
 def rules(m: Draft) -> Breaches:
-    """All phases, by themselves and together; they are parts of the mission, including those with findings.
-
-    They are not checked again if those of the last mission that shares tables had no findings, and nothing differs on
-    which that depends.
-    """
+    """All phases, by themselves and together; they are parts of the mission, including those with findings."""
     phases = yield from _phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
-    dependence = _dependence(m)
-    if m.findings or m.shared.sound != dependence:
-        _check(m, phases)
-        m.shared.sound = None if m.findings else dependence
+    _check(m, phases)
     end = latest_end(m.phases) if m.right((), "phases") else math.nan
     # With automatic durations it is not known; the mission is checked again when they are.
     m.end = None if math.isnan(end) else end
-
-
-def _dependence(m: Draft) -> tuple[Any, ...]:
-    """All that the findings of phases depend on."""
-    limits = None if m.agents is None else m.agents.thrust_limit
-    keys = ("phases", "formations", "architecture", "assignment")
-    read = (m.lqr, m.limits, m.smoothness, m.output_step)
-    return m.n, limits, *map(m.data.get, keys), *read
 
 
 def _check(m: Draft, phases: Written) -> None:
@@ -291,7 +276,7 @@ def _orbit(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
         yield Breach("rate_deg_s", problem, "use a lower rate or several phases")
 
 
-def _ended(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
+def _tracked_way(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
     """A phase with a way of its own has tracked slots and a time of arrival."""
     if p.control == "body":
         problem = f"kind '{p.kind}' cannot be flown by a wrench on the virtual body"
@@ -303,7 +288,7 @@ def _ended(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
 
 def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
     """A take-off or a landing has what its groups need, and agents that exist."""
-    yield from _ended(m, p, k, longest)
+    yield from _tracked_way(m, p, k, longest)
     if p.stagger is None:
         if "by" in p.model_fields_set:
             yield Breach("by", "has no effect without stagger", "remove it")
@@ -319,7 +304,7 @@ def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
 
 def _go(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
     """A way can be found and flown: tracked slots, an end, and formations that exist."""
-    yield from _ended(m, p, k, longest)
+    yield from _tracked_way(m, p, k, longest)
     for name in p.formations or ():
         yield from _exists(m, name, "formations")
 
@@ -330,7 +315,7 @@ _JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 def _follow(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
     """There are trajectories, without jumps, one for the virtual body or one for each vehicle, and an end."""
-    yield from _ended(m, p, k, longest)
+    yield from _tracked_way(m, p, k, longest)
     if p.trajectories is None:
         problem, remedy = "is missing", "give the name of a file with trajectories"
         if p.file is not None:
@@ -404,7 +389,7 @@ def _reshape(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
 
 
 _OWN: dict[str, Callable[[Draft, Any, int, float | None], Breaches]] = {
-    "brake": _ended,
+    "brake": _tracked_way,
     "establish": _establish,
     "follow": _follow,
     "land": _vertical,

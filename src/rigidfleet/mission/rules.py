@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from rigidfleet.mission.findings import FindingCollector, Keys, Shared, look_up
+from rigidfleet.mission.findings import FindingCollector, Keys, look_up
 
 #: Stands for the value that the user wrote.
 _WRITTEN: Any = object()
@@ -44,14 +44,8 @@ class Draft(FindingCollector):
     end : mission time [s] at which the last phase ends at the latest; None if it is not known
     """
 
-    def __init__(
-        self,
-        data: Mapping[str, Any],
-        origin: str,
-        shared: Shared | None,
-        defaults: Mapping[str, Any],
-    ) -> None:
-        super().__init__(data, origin, shared)
+    def __init__(self, data: Mapping[str, Any], origin: str, defaults: Mapping[str, Any]) -> None:
+        super().__init__(data, origin)
         self.parts: dict[str, Any] = {}
         self.n: int | None = None
         self.end: float | None = None

@@ -3,8 +3,6 @@
 The descriptions document the format: `rigidfleet missions --schema` exports them, and docs/missions.md has them.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, Literal
 
@@ -370,7 +368,7 @@ class Lqr(Regulator):
     """Regulator of the virtual body: its centre of mass and, in `lqr.attitude`, its attitude."""
 
     attitude: Regulator = Field(
-        default_factory=Regulator,
+        default_factory=Regulator.model_construct,
         description="regulator of the attitude; missing keys are those of lqr",
     )
 
@@ -826,23 +824,28 @@ class Contents(MissionHeader):
         default_factory=dict, description="models of vehicles by name: [vehicles.NAME]"
     )
     autopilot: Autopilot = Field(
-        default_factory=Autopilot, description="sampled control on board: [autopilot]"
+        default_factory=Autopilot.model_construct,
+        description="sampled control on board: [autopilot]",
     )
     avoidance: Avoidance | None = Field(
         None, description="barriers and guard in flight: [avoidance]"
     )
     constraint: Constraint = Field(
-        default_factory=Constraint, description="the constraint force: [constraint]"
+        default_factory=Constraint.model_construct, description="the constraint force: [constraint]"
     )
-    lqr: Lqr = Field(default_factory=Lqr, description="regulator of the virtual body: [lqr]")
+    lqr: Lqr = Field(
+        default_factory=Lqr.model_construct, description="regulator of the virtual body: [lqr]"
+    )
     tracking: Tracking = Field(
-        default_factory=Tracking, description="regulator of each agent: [tracking]"
+        default_factory=Tracking.model_construct, description="regulator of each agent: [tracking]"
     )
     allocation: Allocation = Field(
-        default_factory=Allocation, description="from wrench to forces on agents: [allocation]"
+        default_factory=Allocation.model_construct,
+        description="from wrench to forces on agents: [allocation]",
     )
     integrator: IntegratorOptions = Field(
-        default_factory=IntegratorOptions, description="tolerances of the integrator: [integrator]"
+        default_factory=IntegratorOptions.model_construct,
+        description="tolerances of the integrator: [integrator]",
     )
     body_frame: BodyFrame | None = Field(
         None, description="attitude of the body frame at t = 0: [body_frame]"
@@ -852,9 +855,12 @@ class Contents(MissionHeader):
     )
     obstacles: tuple[Obstacle, ...] = Field((), description="obstacles: [[obstacles]]")
     limits: Limits = Field(
-        default_factory=Limits, description="limits that the verdict checks: [limits]"
+        default_factory=Limits.model_construct,
+        description="limits that the verdict checks: [limits]",
     )
-    yaw: VehicleYaw = Field(default_factory=VehicleYaw, description="yaw of each vehicle: [yaw]")
+    yaw: VehicleYaw = Field(
+        default_factory=VehicleYaw.model_construct, description="yaw of each vehicle: [yaw]"
+    )
     geodetic_origin: GeodeticOrigin | None = Field(
         None, description="place of the origin on the Earth, for exports: [geodetic_origin]"
     )

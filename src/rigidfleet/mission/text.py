@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +11,31 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import bounds
 from rigidfleet.mission.findings import near
 
-_SHIPPED = resources.files("rigidfleet") / "missions"
+_SHIPPED = Path(__file__).parents[1] / "missions"
+
+#: What shipped missions are about, and their names.
+GROUPS = {
+    "The paper": (
+        "cube-passage", "cube-waypoint", "establish-cube", "establish-triangle", "narrow-passage", "single-waypoint",
+    ),
+    "Shapes and rigidity": (
+        "drift", "establish-cube-as-printed", "hexagon", "line-singular", "pyramid", "square", "two-agents",
+    ),
+    "Obstacles and avoidance": (
+        "bridge-inspection", "hill-search", "moving-obstacles", "narrow-passage-found", "statue",
+    ),
+    "Vehicles": (
+        "crazyflies", "cube-passage-quadrotors", "delayed", "downwash-cube", "passage-quadrotors", "windy-passage",
+    ),
+    "Shows": ("change-of-picture", "falling-light", "ferris-wheel", "show-1000"),
+}  # fmt: skip
+#: Shipped missions to look at first.
+FIRST = ("narrow-passage", "bridge-inspection", "change-of-picture")
 
 
 def mission_names() -> list[str]:
     """Names of the shipped missions, in alphabetical order."""
-    names = (entry.name for entry in _SHIPPED.iterdir())
-    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+    return sorted(path.stem for path in _SHIPPED.glob("*.toml"))
 
 
 def mission_text(name: str) -> str:

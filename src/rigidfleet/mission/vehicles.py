@@ -8,8 +8,7 @@ motors with a first-order lag, drag of the rotors and of the body.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from rigidfleet.mission.findings import look_up, near
 from rigidfleet.mission.rules import Breach, Breaches, Draft
@@ -20,8 +19,7 @@ _GRAVITY = 9.81
 _LEAST_GRAVITY = 1.0
 
 
-@dataclass(frozen=True)
-class VehicleModel:
+class VehicleModel(NamedTuple):
     """A vehicle with all its numbers. A point has mass, thrust limit and drag alone; its other numbers are zero.
 
     Attributes
@@ -173,17 +171,16 @@ _OF_POINTS = {"thrust_limit": "thrust_coefficient", "drag": "rotor_drag"}
 
 def resolve(vehicle: Vehicle) -> VehicleModel:
     """The model of a checked table, with what the table gives in place of the model's own numbers."""
-    given = {
+    own = {
         key: value
         for key in Vehicle.model_fields
         if key != "model" and (value := getattr(vehicle, key)) is not None
     }
     if vehicle.model == "point":
-        return VehicleModel(point=True, **given)
-    own = {key: value for key, (value, _) in MODELS[vehicle.model].items()}
-    found = VehicleModel(point=False, **(own | given))
-    limit = 4.0 * found.rotor_limit
-    return replace(found, thrust_limit=limit)
+        return VehicleModel(point=True, **own)
+    usual = {key: value for key, (value, _) in MODELS[vehicle.model].items()}
+    model = VehicleModel(point=False, **(usual | own))
+    return model._replace(thrust_limit=4.0 * model.rotor_limit)
 
 
 def check(m: Draft) -> None:
@@ -244,7 +241,7 @@ def _model(vehicle: Vehicle) -> Breaches:
         yield Breach("attitude_gains", problem, remedy, list(x.attitude_gains))
 
 
-def equipped(m: Draft, agents: Any) -> Any:
+def fleet_table(m: Draft, agents: Any) -> Any:
     """The table [agents], with masses and thrust limits of its vehicles; None if they cannot be known."""
     if not isinstance(agents, dict) or "vehicle" not in agents:
         if m.vehicles and isinstance(agents, dict):

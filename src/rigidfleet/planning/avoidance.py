@@ -7,7 +7,7 @@ import numpy as np
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
 from rigidfleet.mission.avoidance import braking, foresight, reaction_times, widening
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 
 
 def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avoidance | None:
@@ -20,7 +20,7 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
     if separation is None:
         separation = mission.limits.separation or 0.0
     limit = np.array([model.thrust_limit for model in models])
-    solids = joined([thing.solid for thing in mission.obstacles])
+    solids = join([thing.solid for thing in mission.obstacles])
     reach = np.inf if given.sensing_range is None else given.sensing_range
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance(

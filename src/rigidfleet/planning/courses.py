@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet._common.kept import kept
 from rigidfleet.errors import Finding, MissionError
-from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS
+from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Fly, Mission, Phase
@@ -30,14 +31,12 @@ from rigidfleet.mission.kinds import (
 )
 from rigidfleet.mission.schema import Lqr
 from rigidfleet.planning.body_trajectories import (
-    BodyTrajectory,
-    GivenTrajectory,
-    RegulatedTrajectory,
-    SmoothTrajectory,
-    StoppingTrajectory,
     as_motion,
-    orbit,
+    orbit_motion,
+    regulated_motion,
     rotation_of,
+    smooth_motion,
+    stopping_motion,
 )
 from rigidfleet.planning.reference import PhaseState, Pose, changed, pose_at
 from rigidfleet.typing import Floats
@@ -71,7 +70,7 @@ class Course(NamedTuple):
 
     goal: Pose | None  # pose to reach; None if no frame is attached yet
     arrival: float  # time to reach it [s]
-    trajectory: BodyTrajectory | None  # trajectory to it; None if there is none
+    motion: Callable[[], Motion] | None  # to it; None if there is none
     lift: Lift | None = (
         None  # what is added to the slots; None if they keep the shape, or blend to another
     )
@@ -95,7 +94,7 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
 def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
     """Stay, or go to the phase's own place; slots may go on bent ways."""
     rest = _stay(mission, phase, now, t_end)
-    if phase.control_points is None:
+    if not phase.bent:
         return rest
     control, blend = np.array(phase.control_points), seconds(phase.blend)
     knots, ways = Piecewise.b_spline(control, blend)
@@ -137,11 +136,9 @@ def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Cou
     """Fly a circle, and continue with its velocity. An attitude that turns along is not an explicitly specified one."""
     assert now.pose is not None  # slots are tracked
     assert now.goal is not None
-    trajectory = orbit(phase, now.pose, now.goal.T, now.t, t_end, smooth=mission.smooth)
-    x, rate, *_ = (y[0] for y in trajectory.at(np.array([t_end - now.t])))
-    T = att.dcm_from_rotation_vector(x[3:]) @ trajectory.T1
-    goal = Pose(x[:3], rate[:3], T, rate[3:], named=now.goal.named and not phase.turns_away)
-    return Course(goal, t_end, trajectory)
+    motion = orbit_motion(phase, now.pose, now.goal.T, now.t, t_end, smooth=mission.smooth)
+    named = now.goal.named and not phase.turns_away
+    return Course(changed(pose_at(motion, t_end), named=named), t_end, lambda: motion)
 
 
 def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
@@ -149,13 +146,13 @@ def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Cou
     assert now.pose is not None  # slots are tracked
     assert now.goal is not None
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
-    trajectory = StoppingTrajectory(now.pose, now.t, arrival)
-    end = pose_at(trajectory.motion(), arrival)
+    motion = stopping_motion(now.pose, now.t, arrival)
+    end = pose_at(motion, arrival)
     turned = now.pose.omega.any() or not np.allclose(now.pose.T, now.goal.T, rtol=0, atol=1e-9)
     goal = Pose(
         end.r, np.zeros(3), end.T if turned else now.goal.T, np.zeros(3), now.goal.named and not turned
     )  # fmt: skip
-    return Course(goal, arrival, trajectory)
+    return Course(goal, arrival, lambda: motion)
 
 
 def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) -> Course:
@@ -178,7 +175,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
         up[2] = -max(0.0, height(mission, now))
         v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
     goal = changed(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
-    return Course(goal, arrival, SmoothTrajectory(now.pose, goal, now.t, arrival, ()), lift)
+    return Course(goal, arrival, partial(smooth_motion, now.pose, goal, now.t, arrival), lift)
 
 
 def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> Course:
@@ -218,7 +215,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     motion = as_motion(now.t + cm.time, cm.pieces, T1)
     arrival = float(min(t_end, motion.knots[-1]))
     goal = changed(pose_at(motion, arrival), named=now.goal.named and not phase.turns_away)
-    return Course(goal, arrival, GivenTrajectory(motion), lift)
+    return Course(goal, arrival, lambda: motion, lift)
 
 
 def _whole_turns(yaw: float, near: float) -> float:
@@ -228,14 +225,14 @@ def _whole_turns(yaw: float, near: float) -> float:
 
 def misled(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    return _MISLED[phase.kind](phase, now) if phase.kind in _MISLED else ""
+    return _MISLED.get(phase.kind, lambda *_: "")(phase, now)
 
 
 def _misled_slots(phase: Reshape, now: PhaseState) -> str:
     """What keeps a change of shape from following its bent ways, if it has any."""
-    if phase.control_points is None:
+    if not phase.bent:
         return ""
-    first = np.array(phase.control_points[0])
+    first = np.array(phase.control_points)[0]
     far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
     return "" if far < _LED[0] else "begins in other slots than the phase before has led to"
 
@@ -329,14 +326,14 @@ def _led(
     if phase.control == "open" or now.pose is None:
         return Course(goal, arrival, None)
     if not mission.smooth:
-        laws = regulators(mission, phase)
-        leg = RegulatedTrajectory(laws, mission.tracking, now.pose, goal, now.t, arrival, t_end)
-        return Course(goal, arrival, leg)
+        laws, tracking = regulators(mission, phase), mission.tracking
+        way = partial(regulated_motion, laws, tracking, now.pose, goal, now.t, arrival, t_end)
+        return Course(goal, arrival, way)
     end = changed(goal, v=np.full(3, np.nan)) if phase.free else goal
-    way = SmoothTrajectory(now.pose, end, now.t, arrival, phase.points)
+    motion = smooth_motion(now.pose, end, now.t, arrival, phase.points)
     if phase.free:
-        goal = changed(goal, v=pose_at(way.motion(), arrival).v)
-    return Course(goal, arrival, way)
+        goal = changed(goal, v=pose_at(motion, arrival).v)
+    return Course(goal, arrival, lambda: motion)
 
 
 def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:

@@ -6,6 +6,7 @@ follows from a loss read it; the plan of a flight (`rigidfleet.planning.plan`) i
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ from rigidfleet.math import rigid_body
 from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase, Settle
 from rigidfleet.mission.kinds import seconds
-from rigidfleet.planning.body_trajectories import BodyTrajectory
+from rigidfleet.mission.schema import Constraint
 from rigidfleet.planning.certificate import Certificate, certified
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.derivatives import body_series, slot_derivatives
@@ -68,10 +69,10 @@ class Leg:
     knows_slots : whether that has slots, not only distances
     slots : (N, 3) at the end, about the CM, body axes [m]
     goal, arrival : the pose that the body is to reach, and when [s]
-    trajectory : of the body, if there is a course for it
+    way : motion of the body, if there is a course for it
     reference : of the slots; the distances of edges are those of a flight, which knows them
     masses, radius : (N,) of all vehicles, lost ones included [kg, m]
-    settling : time in which errors of distances settle [s]
+    constraint : options of the law that holds distances
     smooth : whether the next phase begins with the acceleration and jerk of the reference
     """
 
@@ -86,11 +87,11 @@ class Leg:
     slots: Floats | None
     goal: Pose | None
     arrival: float
-    trajectory: BodyTrajectory | None
+    way: Callable[[], Motion] | None
     reference: Reference
     masses: Floats
     radius: Floats
-    settling: float
+    constraint: Constraint
     smooth: bool
 
     @property
@@ -108,8 +109,8 @@ class Leg:
     @cached_property
     def motion(self) -> Motion:
         """Motion of the body; under the input forces alone, if it has no course."""
-        if self.trajectory is not None:
-            return self.trajectory.motion()
+        if self.way is not None:
+            return self.way()
         now, total = self.before, self.masses.sum()
         pieces = np.zeros((1, 6, 3))
         pieces[0, :3, 0] = self.masses @ now.r / total
@@ -143,12 +144,12 @@ class Leg:
         """Time [s] at which the phase is expected to end: one that ends by settling, soon after it reaches its goal."""
         if self.phase.settle is None:
             return self.t_end
-        return self.start + settling_length(self.phase, self.settling, self._reached())
+        return self.start + settling_length(self.phase, self.constraint, self._reached())
 
     def _reached(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
         goal, settle = self.goal, self.phase.settle
-        if goal is None or settle is None or self.trajectory is None:
+        if goal is None or settle is None or self.way is None:
             return 0.0
         time = np.linspace(self.start, self.t_end, _LOOKS)
         cm, axes = (x[0] for x in body_series(self.motion, time))
@@ -290,7 +291,7 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
     """The leg of a phase from a departure: its own, or one of a phase that differs in nothing but its times."""
     before, now, frame, target, kind, p0, dp, turn = departure
     shaping, t_end = phase.shaping, latest_end(phase, now.t)
-    goal, arrival, trajectory, lift = course(mission, phase, now, t_end)
+    goal, arrival, way, lift = course(mission, phase, now, t_end)
     name, slots, T_b = now.formation, p0, 0.0
     if shaping is not None:
         name = shaping.formation
@@ -313,8 +314,8 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
     if shaping is None and now.blend is not None:
         reference = now.blend
     return Leg(
-        phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, trajectory,
-        reference, mission.fleet.mass, mission.fleet.radius, mission.constraint.settling_time or 0.0,
+        phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, way,
+        reference, mission.fleet.mass, mission.fleet.radius, mission.constraint,
         mission.smooth or mission.on_loss != "continue",
     )  # fmt: skip
 
@@ -326,12 +327,13 @@ def latest_end(phase: Phase, start: float) -> float:
     return start + seconds(phase.duration or (phase.settle or Settle()).timeout)
 
 
-def settling_length(phase: Phase, settling: float, reached: float = 0.0) -> float:
+def settling_length(phase: Phase, constraint: Constraint, reached: float = 0.0) -> float:
     """Expected duration [s] of a phase that ends by settling: soon after its motion.
 
-    Errors of distances settle in ``settling`` [s]; the goal is ``reached`` so long after the start [s].
+    Errors of distances have to settle; the goal is ``reached`` so long after the start [s].
     """
     assert phase.settle is not None
+    settling = constraint.settling_time or 0.0
     least = max(phase.least_time, reached) + settling + phase.settle.dwell
     return min(phase.settle.timeout, least)
 
@@ -342,7 +344,6 @@ def phase_spans(mission: Mission) -> list[tuple[float, float]]:
     for phase in mission.phases:
         begin, end = end, latest_end(phase, end)
         if phase.settle is not None:
-            settling = mission.constraint.settling_time or 0.0
-            end = begin + settling_length(phase, settling)
+            end = begin + settling_length(phase, mission.constraint)
         spans.append((begin, end))
     return spans

@@ -43,7 +43,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase, Regulator, bounds
-from rigidfleet.mission.schema import Constraint, IntegratorOptions
+from rigidfleet.mission.schema import IntegratorOptions
 from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import passed
 from rigidfleet.planning.certificate import Certificate
@@ -82,7 +82,6 @@ class PhasePlan(Leg):
     attached: bool  # whether the slots carry the body frame
     lies: bool  # whether the mission prescribes the attitude of the established formation
     method: solvers.Method  # method that solves for the multipliers
-    constraint: Constraint  # options of the law
     integrator: IntegratorOptions  # options of the integration
     damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
@@ -273,9 +272,9 @@ def plan_phase(
         PhasePlan, leg, reference=reference, masses=masses, problem=problem, edges=edges, distances=d1,
         attached=leg.before.slots is not None or phase.control != "open",
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
-        constraint=mission.constraint, integrator=mission.integrator,
+        integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
-        loses=mission.first_loss < math.inf, through=passed(leg.trajectory),
+        loses=mission.first_loss < math.inf, through=passed(phase.points, motion),
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost

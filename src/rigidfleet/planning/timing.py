@@ -227,7 +227,7 @@ def _shared_out(mission: Mission, phase: Phase, departure: Departure) -> Phase:
     if not phase.points:
         return phase
     arriving = phase.model_copy(update={phase.time_key: _arrival(phase)})
-    points = passed(leg_from(mission, arriving, departure).trajectory)
+    points = passed(phase.points, leg_from(mission, arriving, departure).motion)
     start = departure.now.t
     through = tuple(
         at.model_copy(update={"time": round(point["time"] - start, 6)})

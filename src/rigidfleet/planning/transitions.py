@@ -9,6 +9,7 @@ colours of the graph of these conflicts (greedy colouring, the agents with most 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -59,31 +60,41 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
-        if isinstance(phase, Reshape) and phase.transition == "ways":
+        if not phase.spelled:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
-            report(f"looking for ways of the agents in '{phase.name}'")
-            room = _room(mission.rewritten(so_far) if tables else mission, len(tables), timed)
-            parts = [_bent(mission, k, table, phase, before, room)]
-        elif isinstance(phase, Reshape) and phase.transition != "straight":
-            stops = _stops(mission, k, phase, before)
-            if stops is not None:
-                names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
-                forms |= {
-                    name: {"slots": x, "edges": []}
-                    for name, x in zip(names, stops[1:3], strict=True)
-                }
-                parts = _phases(table, phase, names, stops)
-        elif isinstance(phase, Vertical) and phase.stagger is not None:
-            parts = _staggered(mission, k, table, phase, before)
+            room = partial(_room, mission, so_far, timed)
+            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, room)
+            forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
     return mission.rewritten(data)
 
 
+#: Phases as tables, and the formations that they take on the way.
+_Parts = tuple[list[dict[str, Any]], dict[str, Any]]
+#: Corners (2, 3) [m] of the room for bent ways (`_room`).
+_Room = Callable[[], Floats]
+
+
+def _transition(
+    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, room: _Room
+) -> _Parts:  # fmt: skip
+    """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do."""
+    if phase.transition == "ways":
+        report(f"looking for ways of the agents in '{phase.name}'")
+        return [_bent(mission, number, table, phase, before, room())], {}
+    stops = _stops(mission, number, phase, before)
+    if stops is None:
+        return [table], {}
+    names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
+    levels = {name: {"slots": x, "edges": []} for name, x in zip(names, stops[1:3], strict=True)}
+    return _phases(table, phase, names, stops), levels
+
+
 def _staggered(
-    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None
-) -> list[dict[str, Any]]:
+    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, _: _Room
+) -> _Parts:  # fmt: skip
     """The phases of a staggered take-off or landing, one for each group.
 
     Raises
@@ -112,24 +123,35 @@ def _staggered(
             f" {phase.stagger:g} s less"
         )
         raise refused(mission, number, "duration", phase.duration, problem, remedy)
-    kept = {key: x for key, x in table.items() if key not in ("stagger", "by")}
-    return [
-        kept
+    common = {key: x for key, x in table.items() if key not in ("stagger", "by")}
+    parts = [
+        common
         | {"name": f"{phase.name}: {k} of {len(groups)}", "agents": group, "travel": travel}
         | {"duration": phase.stagger if k < len(groups) else travel}
         for k, group in enumerate(groups, start=1)
     ]
+    return parts, {}
 
 
-def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
-    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly after some phases.
+#: What takes the place of each kind of phase that may not be flown as it is written.
+_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None, _Room], _Parts]] = {
+    "land": _staggered,
+    "reshape": _transition,
+    "takeoff": _staggered,
+}
+
+
+def _room(mission: Mission, so_far: dict[str, Any], timed: Timed) -> Floats:
+    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly after phases ``so_far``.
 
     These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides
     if its axes are along the world's. Infinite where that, or the place of the formation, is not known.
     """
     box = np.array([[-np.inf] * 3, [np.inf] * 3])
-    now = at_start(mission)
-    for number, phase in enumerate(mission.phases[:phases]):
+    now, tables = at_start(mission), so_far["phases"]
+    if tables:
+        mission = mission.rewritten(so_far)
+    for number, phase in enumerate(mission.phases[: len(tables)]):
         if phase.replaced:
             return box
         leg = timed(mission, phase, now, number)

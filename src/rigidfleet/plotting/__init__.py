@@ -27,6 +27,8 @@ from rigidfleet.plotting.curves import (
     distances,
     disturbance,
     inputs,
+    limited_motions,
+    motion,
 )
 from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
@@ -54,6 +56,7 @@ __all__ = [
     "figure_names",
     "formations",
     "inputs",
+    "motion",
     "operation",
     "plot",
     "rotors",
@@ -66,7 +69,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     draw.__name__: draw
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
-        clearance, formations, disturbance, rotors, vehicles, operation,
+        clearance, formations, disturbance, rotors, vehicles, operation, motion,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -100,6 +103,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "rotors": not has_rotors(result),
         "vehicles": not has_rotors(result),
         "operation": not leaves_ground(result),
+        "motion": not limited_motions(result),
     }
     # Of trajectories that others made, most panels of the summary would be empty.
     empty["summary"] = empty["distances"] and empty["inputs"] and empty["attitude"]

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, shown
 from rigidfleet.math import attitude as att
-from rigidfleet.math import proximity
 from rigidfleet.plotting import peaks, quadrotors
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
-from rigidfleet.result import Result
+from rigidfleet.result import Extremum, Result
+from rigidfleet.result.quantities import owner_name, samples
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -444,109 +444,95 @@ def constraint_error(result: Result) -> Figure:
 # -- clearance ---------------------------------------------------------------------------------------
 
 
-def room_below(result: Result) -> Floats:
-    """Least height (K,) [m] between agents whose spheres overlap as seen from above; NaN if there are none."""
-    radius = result.mission.agents.radius
-    least = proximity.headroom(result.position, radius, result.left)[0]
-    return np.where(np.isfinite(least), least, np.nan)
+#: Names of the axes of least distances, and what stands where there is none.
+_PANELS = {
+    "separation": ("between agents [m]", "only one agent"),
+    "separation_below": ("straight below [m]", "no agent is ever straight below another"),
+    "clearance": ("to obstacles [m]", "no obstacles"),
+}
 
 
-def _mark_least(ax: Axes, result: Result, values: Floats, name: str) -> None:
-    """Mark the least value, at samples or between them, with its size, time and agents."""
-    known = np.where(np.isfinite(values), values, np.inf)
-    k = int(known.argmin())
-    if not np.isfinite(known[k]):
-        return
-    t, value, pair = float(result.time[k]), float(values[k]), None
-    between = result.extreme(name)
-    if between is not None and between.value <= value:
-        t, value, pair = between.time, between.value, (between.who, between.other)
-    elif name == "separation":
-        pair = tuple(result.separation_pair[k])
-    elif name == "clearance":
-        pair = result.clearance_agent[k], result.clearance_obstacle[k]
-    ax.plot(
-        t, value, "o", markersize=5, markerfacecolor="none", markeredgecolor=st.INK, clip_on=False
-    )
-    who = "" if pair is None else _who(result, name, *map(int, pair))
-    st.annotate(ax, f"{value:.3g} m at {t:.2f} s{who}", st.around(t, value))
-
-
-def _who(result: Result, name: str, first: int, second: int) -> str:
-    if name != "clearance":
-        return f", agents {min(first, second) + 1} and {max(first, second) + 1}"
-    if first < 0 or not 0 <= second < len(result.mission.obstacles):
-        return ""
-    return f", agent {first + 1} to {st.clean(result.mission.obstacles[second].name)}"
-
-
-def draw_separation(ax: Axes, result: Result) -> None:
-    """Least distance between the surfaces of two agents, with its limit."""
-    ax.set_ylabel("between agents [m]")
-    least = result.mission.limits.separation_always
-    words = "contact" if least is None else f"limit {least:g} m"
-    none = "only one agent" if result.n_agents == 1 else "unknown"
-    _draw_least(ax, result, "separation", none, least or 0.0, words)
-
-
-def draw_clearance(ax: Axes, result: Result) -> None:
-    """Least distance to an obstacle."""
-    ax.set_ylabel("to obstacles [m]")
-    none = "no obstacles" if not result.mission.obstacles else "unknown"
-    _draw_least(ax, result, "clearance", none, 0.0, "contact")
-
-
-def _draw_least(ax: Axes, result: Result, name: str, none: str, limit: float, words: str) -> None:
-    """Least distances of a result by name, with a limit and what it is called; ``none`` if nothing is known."""
-    values = getattr(result, name)
+def draw_least(ax: Axes, result: Result, name: str) -> None:
+    """Least distance to others, to one straight below or to obstacles, with its limit and its least value."""
+    label, nothing = _PANELS[name]
+    ax.set_ylabel(label)
+    q, sampled = QUANTITIES[name], samples(result, name)
+    values, limit = getattr(result, name, sampled.worst), q.limit_of(result.mission) or 0.0
     values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
-        st.note(ax, none)
+        known = {"separation": result.n_agents == 1, "clearance": not result.mission.obstacles}
+        st.note(ax, nothing if known.get(name, True) else "unknown")
+        if limit:
+            ax.set_ylim(0.0, 1.4 * limit)
+            st.limit(ax, limit, f"limit {limit:g} m")
         return
     st.line(ax, result.time, values, color=st.TONES[0])
-    st.limit(ax, limit, words)
-    _mark_least(ax, result, values, name)
-    _from_zero(ax, values)
-
-
-def _from_zero(ax: Axes, values: Floats) -> None:
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    st.limit(ax, limit, f"limit {limit:g} m" if limit else "contact")
+    if name == "separation":
+        _draw_planned(ax, result)
+        if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
+            altitude = result.mission.limits.separation_altitude
+            st.limit(ax, flying, f"limit {flying:g} m from z = {altitude:g} m on")
+    k = int(np.nanargmin(values))
+    x = result.extreme(name)
+    if x is None or x.value > values[k]:
+        who = *sampled.owner(k), -1
+        x = Extremum(float(values[k]), float(result.time[k]), *who[:2])
+    look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
+    ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
+    words = f"{x.value:.3g} m at {x.time:.2f} s, {st.clean(owner_name(result, q, x.who, x.other))}"
+    st.annotate(ax, words, st.around(x.time, x.value))
+    low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
 
 
-def draw_below(ax: Axes, result: Result, least: float) -> None:
-    """Least height of an agent above another one, with its limit."""
-    ax.set_ylabel("straight below [m]")
-    values = room_below(result)
-    if np.isfinite(values).any():
-        st.line(ax, result.time, values, color=st.TONES[0])
-        _mark_least(ax, result, values, "separation_below")
-        _from_zero(ax, np.append(values, least))
-    else:
-        ax.text(
-            0.5, 0.3, "no agent is ever straight below another", transform=ax.transAxes,
-            ha="center", va="center", color=st.GREY,
-        )  # fmt: skip
-        ax.set_ylim(0, 1.4 * least or 1.0)
-    st.limit(ax, least, f"limit {least:g} m")
+def _draw_planned(ax: Axes, result: Result) -> None:
+    """The separation that the plan of each phase proves, less what is allowed for tracking."""
+    allowed = result.mission.limits.separation_allowance
+    proved = [(p.planned["separation"] - allowed, p) for p in result.phases if p.planned]
+    for least, p in proved:
+        ax.hlines(least, p.t_start, p.t_end, st.ALERT, linewidth=0.8, linestyle=":", gid="planned")
+    if proved:
+        least, p = min(proved, key=lambda each: each[0])
+        words = f"as planned, less {allowed:g} m"
+        st.annotate(ax, words, st.around(p.t_start, least), color=st.ALERT)
 
 
 @styled
 def clearance(result: Result) -> Figure:
     """Least distances between agents, straight below an agent and to obstacles, with their limits."""
-    mission = result.mission
-    panels: list[Callable[[Axes], None]] = []
-    if result.n_agents > 1 or not mission.obstacles:
-        panels.append(lambda ax: draw_separation(ax, result))
-    below = mission.limits.separation_below
-    if below is not None and result.n_agents > 1:
-        panels.append(lambda ax: draw_below(ax, result, below))
-    if mission.obstacles:
-        panels.append(lambda ax: draw_clearance(ax, result))
-    height = 3.2 if len(panels) == 1 else 1.8
-    fig, axes = st.time_figure(result, "Clearance between surfaces", len(panels), height=height)
-    for draw, ax in zip(panels, axes[:, 0], strict=True):
-        draw(ax)
+    mission, several = result.mission, result.n_agents > 1
+    wanted = {
+        "separation": several or not mission.obstacles,
+        "separation_below": several and mission.limits.separation_below is not None,
+        "clearance": bool(mission.obstacles),
+    }
+    names = [name for name, there in wanted.items() if there]
+    height = 3.2 if len(names) == 1 else 1.8
+    fig, axes = st.time_figure(result, "Clearance between surfaces", len(names), height=height)
+    for name, ax in zip(names, axes[:, 0], strict=True):
+        draw_least(ax, result, name)
+    st.name_phases(axes[0], result)
+    return fig
+
+
+# -- motion ------------------------------------------------------------------------------------------
+
+
+def limited_motions(result: Result) -> list[Quantity]:
+    """Speeds, accelerations and jerks that the mission limits."""
+    return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
+
+
+@styled
+def motion(result: Result) -> Figure:
+    """Speed, acceleration and jerk of each agent, in all directions or one, with their limits."""
+    drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
+    fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
+    for q, ax in zip(drawn, axes[:, 0], strict=True):
+        ax.set_ylabel(f"{q.called.replace(' ', chr(10))} [{shown(q.unit)}]")
+        quadrotors.draw_limited(ax, result, q.name)
+    st.agents_legend(axes[0, 0], result.n_agents)
     st.name_phases(axes[0], result)
     return fig

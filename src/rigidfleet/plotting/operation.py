@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.curves import draw_clearance, draw_separation
+from rigidfleet.plotting.curves import draw_least
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
@@ -50,8 +50,7 @@ def _drawn(result: Result, agents: Sequence[int]) -> Figure:
     fig, axes = st.time_figure(result, "Operation", 5, height=1.6)
     above, fast, climb, apart, clear = axes[:, 0]
     v = result.velocity
-    top = result.mission.limits.speed
-    fence = result.mission.limits.geofence
+    limits = result.mission.limits
     for ax, words, values in (
         (above, "altitude [m]", result.position[..., 2]),
         (fast, "speed [m/s]", np.linalg.norm(v, axis=2)),
@@ -61,12 +60,13 @@ def _drawn(result: Result, agents: Sequence[int]) -> Figure:
         handles = _lines(ax, result, np.where(result.left, values, np.nan), agents)
     # One legend for three panels; beside one of them it would push the others apart.
     fig.legend(handles=handles, loc="outside right center", labelspacing=0.3)
-    if fence is not None:
+    if (fence := limits.geofence) is not None:
         st.limit(above, fence.max[2], f"geofence {fence.max[2]:g} m")
-    if top is not None:
-        st.limit(fast, top, f"limit {top:g} m/s")
-    draw_separation(apart, result)
-    draw_clearance(clear, result)
+    for ax, top in ((fast, limits.speed), (climb, limits.vertical_speed)):
+        if top is not None:
+            st.limit(ax, top, f"limit {top:g} m/s")
+    draw_least(apart, result, "separation")
+    draw_least(clear, result, "clearance")
     st.name_phases([above], result)
     return fig
 

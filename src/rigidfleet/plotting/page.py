@@ -50,7 +50,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
 
 @styled
 def summary(result: Result) -> Figure:
-    """Trajectory, top view, distances, attitude, thrust and clearance on one page."""
+    """Trajectory, top view, distances (without edges: separation), attitude, thrust and clearance on one page."""
     fig = st.blank(11.4, 7.0)
     st.head(fig, result, st.clean(result.mission.title, 80) or "Flight")
     view = space.scene(result)
@@ -62,12 +62,17 @@ def summary(result: Result) -> Figure:
     for ax in over_time:
         st.over_time(ax, result)
         ax.set_xlabel("time [s]")
-    curves.draw_distances(lengths, result)
+    if len(result.edges):
+        curves.draw_distances(lengths, result)
+    elif result.mission.obstacles and result.n_agents > 1:
+        curves.draw_least(lengths, result, "separation")
+    else:
+        curves.draw_error(lengths, result)
     if 0 < len(result.edges) <= curves.SINGLE:
         _legend_above(lengths, curves.edge_handles(result))
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
-    (curves.draw_clearance if result.mission.obstacles else curves.draw_separation)(apart, result)
+    curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
     key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
     entries = space.handles(result, view)
     fig.legend(

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet.math import attitude as att
+from rigidfleet._common.quantities import QUANTITIES, shown
 from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import styled
 from rigidfleet.result import LABELS, Extremum, Result
+from rigidfleet.result.quantities import samples
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -47,16 +48,8 @@ def rotor_forces(result: Result) -> Floats:
 
 def tilt(result: Result) -> Floats:
     """Tilt (K, N) of each vehicle [deg]; NaN for points and for vehicles that are lost."""
-    assert result.vehicle_attitude is not None
-    up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
-    known = result.left & np.isfinite(rotor_limits(result.mission))
-    return np.where(known, np.degrees(np.arccos(np.clip(up, -1.0, 1.0))), np.nan)
-
-
-def tracking_error(result: Result) -> Floats:
-    """Distance (K, N) of each vehicle from its slot [m]; NaN where no slot is tracked, or the vehicle is lost."""
-    off = np.linalg.norm(result.position - result.slot_position, axis=2)
-    return np.where(result.left, off, np.nan)
+    known = np.isfinite(rotor_limits(result.mission))
+    return np.where(known, samples(result, "tilt").values, np.nan)
 
 
 def _nearest(result: Result, limits: Floats) -> Extremum | None:
@@ -137,7 +130,7 @@ def vehicles(result: Result) -> Figure:
     if not has_rotors(result):
         st.note(above, "points do not tilt")
     else:
-        _draw_limited(above, result, tilt(result), "deg", "tilt", result.mission.limits.tilt_deg)
+        draw_limited(above, result, "tilt", tilt(result))
         st.agents_legend(above, result.n_agents)
     draw_off_slot(middle, result)
     _draw_saturation(below, result, saturated)
@@ -148,20 +141,19 @@ def vehicles(result: Result) -> Figure:
 def draw_off_slot(ax: Axes, result: Result) -> None:
     """Distance of each vehicle from its slot, with the mission's limit."""
     ax.set_ylabel("from the slot [m]")
-    off, limit = tracking_error(result), result.mission.limits.tracking_error
-    if np.isfinite(off).any():
-        _draw_limited(ax, result, off, "m", "tracking_error", limit)
-    else:
-        st.note(ax, "no slots are tracked")
+    draw_limited(ax, result, "tracking_error")
 
 
-def _draw_limited(
-    ax: Axes, result: Result, values: Floats, unit: str, name: str, limit: float | None
-) -> None:
-    """Each agent's values (K, N) from zero, with their greatest and the mission's limit."""
-    between = result.extreme(name)
-    if between is not None and unit == "deg":
-        between = Extremum(math.degrees(between.value), between.time, between.who, -1)
+def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = None) -> None:
+    """Each agent's values (K, N) of a quantity from zero, with their greatest and the mission's limit."""
+    q, between = QUANTITIES[name], result.extreme(name)
+    values = samples(result, name).values if values is None else values
+    if not np.isfinite(values).any():
+        st.note(ax, q.nothing)
+        return
+    if between is not None:
+        between = between._replace(value=q.scale * between.value, other=-1)
+    limit, unit = q.limit_of(result.mission), shown(q.unit)
     if peaks.from_none(ax, result, values, unit, between=between) and limit is not None:
         top = max(ax.get_ylim()[1], 1.2 * limit)
         ax.set_ylim(-0.04 * top, top)
@@ -194,3 +186,5 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     ax.set_ylim(n + 0.6, 0.4)
     ax.set_yticks(range(1, n + 1))
     ax.set_ylabel("saturated\nagent")
+    limit = QUANTITIES["saturation"].limit_of(result.mission)
+    st.annotate(ax, f"limit {limit:.3g} % of a phase", st.corners(), color=st.ALERT)

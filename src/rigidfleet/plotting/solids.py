@@ -50,8 +50,8 @@ class Shape:
 def shapes(mission: Mission, begin: float, end: float, low: Floats, high: Floats) -> list[Shape]:
     """Obstacles that are no plain boxes, over a time [s], as far as they come near the space from low to high (3,)."""
     found = []
-    for thing in mission.obstacles:
-        if thing.kind == "ground" or (thing.corners is not None and not thing.zone):
+    for thing in mission.solids:
+        if thing.corners is not None and not thing.zone:
             continue
         solid = thing.solid
         at = way = np.zeros((1, 3))

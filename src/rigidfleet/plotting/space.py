@@ -63,12 +63,9 @@ def scene(result: Result) -> Scene:
     if not len(seen):
         seen = np.zeros((1, 3))
     low, high = seen.min(axis=0), seen.max(axis=0)
-    heights = [o.height for o in mission.obstacles if o.kind == "ground"]
     near = float((high - low).max()) + 5.0
-    if heights and max(heights) > low[2] - near:
-        low[2] = min(low[2], max(heights))
-    else:
-        heights = []
+    if stands := mission.ground > low[2] - near:  # on a ground that is near
+        low[2] = min(low[2], mission.ground)
     boxes = []
     for o in mission.obstacles:
         if o.kind == "box" and o.corners is not None and not o.zone:
@@ -85,7 +82,7 @@ def scene(result: Result) -> Scene:
     # A margin around it; no direction too thin to see.
     size = float((high - low).max()) or 2.0
     lack = np.maximum(0.3 * size - (high - low), 0.08 * size) / 2
-    floor = max(heights) if heights else low[2] - lack[2]
+    floor = mission.ground if stands else low[2] - lack[2]
     high = high + lack
     low = np.array([low[0] - lack[0], low[1] - lack[1], min(floor, low[2])])
     return Scene(
@@ -95,7 +92,7 @@ def scene(result: Result) -> Scene:
         low,
         high,
         floor,
-        bool(heights),
+        stands,
         boxes,
         shapes,
         waypoints,
@@ -255,7 +252,8 @@ def draw_space(
     if 0 < len(edges) <= _LINES:
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
-    for name, (x, y, z) in view.waypoints:
+    labels = {(name, x, y): z for name, (x, y, z) in view.waypoints}  # once above each other
+    for (name, x, y), z in labels.items():
         ax.text(
             x, y, z, f"  {name}", fontsize=7.5, zorder=8, va="bottom", parse_math=False,
             path_effects=st.halo(),

@@ -10,6 +10,14 @@ from rigidfleet.mission import Mission
 from rigidfleet.preflight.findings import Remark
 
 
+def evades(mission: Mission, topic: str, limit: float = 0.0) -> bool:
+    """Whether [avoidance] has to keep vehicles off obstacles, or a separation [m], where the plan does not."""
+    a = mission.avoidance
+    if a is None or topic not in ("collision", "obstacle"):
+        return False
+    return topic == "obstacle" or (a.guard and (a.separation is None or a.separation >= limit))
+
+
 def braking_remarks(mission: Mission) -> Iterator[Remark]:
     """Remark on the two vehicles, or the vehicle and the obstacle at rest, that braking at the start leaves nearest."""
     if mission.avoidance is None or not mission.avoidance.guard:

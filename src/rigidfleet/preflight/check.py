@@ -28,6 +28,7 @@ from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
     downwash_remarks,
+    greatest_speed,
     limit_remarks,
     separation_remarks,
     thrust_remarks,
@@ -63,7 +64,9 @@ def check(
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
     planned, known = preview(mission)
-    found = Preflight(formations, check_gains(mission, formations), planned)
+    found = Preflight(mission, formations, check_gains(mission, formations), planned)
+    found.speed = greatest_speed(planned, slice(3))
+    found.vertical_speed = greatest_speed(planned, slice(2, 3))
     if not known:
         found.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):
@@ -73,7 +76,7 @@ def check(
         found.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
     found.remarks = [
-        *(Remark("note", "files", text) for text in doubts(mission.text)),
+        *(Remark("note", "files", text) for text in doubts(mission.about)),
         *formation_remarks(mission, formations),
         *gain_remarks(mission, found),
         *margin_remarks(found),

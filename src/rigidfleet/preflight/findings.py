@@ -7,9 +7,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rigidfleet._common import markup
+from rigidfleet._common.facts import Fact, Line, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.plain import plain
 from rigidfleet._common.text import agent_names
+from rigidfleet.math import proximity
 from rigidfleet.math.margins import Margins
+from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.preview import PlannedPhase
@@ -27,8 +30,20 @@ _TOLD = 6
 
 #: Maximum number of equations for which rigidity, and forces at a step, are computed by a dense decomposition.
 DENSE = 600
+#: Number of agents beyond which tracked slots are those of a show, whose edges are not explained.
+MANY = 12
 #: A limit is exceeded only by more than this rounding error.
 SLACK = 1e-9
+
+#: Worst values of the planned paths: the key of each in JSON, and its unit.
+_WORST = {
+    "separation": ("separation_m", "m"), "speed": ("speed_m_s", "m/s"), "vertical_speed": ("speed_m_s", "m/s"),
+    "thrust": ("thrust_n", "N"),
+}  # fmt: skip
+#: Forces of disturbances in words.
+_FORCES = {
+    "air": "steady wind", "gusts": "gusts (3 sigma)", "weight": "weight error", "noise": "noise (3 sigma)",
+}  # fmt: skip
 
 Level = Literal["fails", "note"]
 
@@ -64,6 +79,8 @@ class FormationCheck:
     realisations : other shapes with the same distances; None if they were not searched
     method : how the constraint force is solved
     spectrum : of a large formation, instead of its rigidity
+    spacing : least distance between two slots, centre to centre [m]; infinite if there are no slots
+    colours : number of colours of its lights; 0 if it keeps the lights before
     skipped : whether the formation was not checked because there are too many
     """
 
@@ -74,6 +91,8 @@ class FormationCheck:
     method: solvers.Method = "dense"
     spectrum: Spectrum | None = None
     skipped: bool = False
+    spacing: float = math.inf
+    colours: int = 0
 
 
 @dataclass(frozen=True)
@@ -126,22 +145,23 @@ class MarginsCheck:
     formations: dict[str, FormationMargins]
     skipped: bool = False
 
-    def describe(self) -> Iterator[str]:
+    @property
+    def rows(self) -> Iterator[tuple[str, str]]:
         """In words, the tracking first."""
         if self.tracking is not None:
-            yield f"tracking: {_margin_words(self.tracking)}"
+            yield "margins", f"tracking: {_margin_words(self.tracking)}"
         alike: dict[str, list[str]] = {}
         for where, f in self.formations.items():
             pole = f"p up to {f.largest_pole:.3g} /s" if f.largest_pole < math.inf else "any p"
             alike.setdefault(f"{_margin_words(f.margins)}; {pole}", []).append(where)
-        yield from (f"{', '.join(places)}: {words}" for words, places in alike.items())
+        yield from (("margins", f"{', '.join(places)}: {words}") for words, places in alike.items())
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "tracking": None if self.tracking is None else _margin_data(self.tracking),
+            "tracking": None if self.tracking is None else self.tracking.data(),
             "formations": {
-                where: _margin_data(f.margins) | {"largest_p": _finite(f.largest_pole)}
+                where: f.margins.data() | {"largest_p": f.largest_pole}
                 for where, f in self.formations.items()
             },
         }
@@ -206,14 +226,6 @@ class VehicleCheck:
     jump: tuple[float, float, float, str] | None
     beyond: tuple[float, str, str, str] | None = None
 
-    def describe(self) -> Iterator[tuple[str, str]]:
-        """Facts with their headings."""
-        force, t, who, limit, _ = self.rotor_force
-        share = 100 * (1 - force / limit)
-        text = f"maximum {force:.3g} N of a rotor (limit {limit:.3g} N, {share:.0f} % left), {who} at {t:.2f} s"
-        yield "rotors", text
-        yield "tilt", f"maximum {self.tilt[0]:.1f} deg, {self.tilt[2]} at {self.tilt[1]:.2f} s"
-
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
@@ -227,14 +239,16 @@ class VehicleCheck:
 
 
 @dataclass
-class Preflight:
+class Preflight(Shown):
     """Result of `check`; `remarks` has the problems and notes.
 
     Attributes
     ----------
+    mission : with its times known
     formations, gains : checks of the formations and of the constraint law
     planned_phases : planned paths of each phase
     separation : minimum separation [m], its time [s] and the agents
+    speed, vertical_speed : greatest planned ones [m/s], their times [s] and agents
     thrust : maximum planned thrust [N], its time [s], the agent and its limit [N]
     clearance : of each obstacle: its name, minimum clearance [m], time [s], agent
     gaps : of each gap: its obstacles, its width [m], the width that the formation needs [m], time [s]
@@ -254,10 +268,13 @@ class Preflight:
     ...     print(heading, fact)
     """
 
+    mission: Mission
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
     separation: tuple[float, float, str] | None = None
+    speed: tuple[float, float, str] | None = None
+    vertical_speed: tuple[float, float, str] | None = None
     thrust: tuple[float, float, str, float] | None = None
     clearance: list[tuple[str, float, float, str]] = field(default_factory=list)
     gaps: list[tuple[str, float, float, float]] = field(default_factory=list)
@@ -274,63 +291,91 @@ class Preflight:
         """Whether no problem was found that will make the flight fail."""
         return all(remark.level != "fails" for remark in self.remarks)
 
+    @property
+    def is_show(self) -> bool:
+        """Whether slots alone concern the user: all phases track them, of many agents, or without edges."""
+        many = self.mission.n_agents > MANY or not len(self.mission.edges)
+        tracked = all(phase.control == "tracking" for phase in self.mission.phases)
+        return self.mission.n_agents > 1 and many and tracked
+
     def __repr__(self) -> str:
         fails = sum(remark.level == "fails" for remark in self.remarks)
         notes = len(self.remarks) - fails
         verdict = f"{fails} problem{'s' * (fails != 1)}" if fails else "no problems found"
         return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
 
-    def _repr_html_(self) -> str:
-        """Show the check in a notebook: facts, then remarks."""
-        rows = [*self.describe(), *((remark.level, remark.text) for remark in self.remarks)]
+    def facts(self) -> Sheet:
+        """The phases, the facts, and the remarks; of a show, nothing that concerns edges."""
+        name, heads = self.mission.name, ("about", "result")
+        remarks = [Row((r.level, r.text), r.level) for r in self.remarks]
         verdict = "no problems found" if self.passed else "the flight will fail"
-        return markup.shown("Check", verdict, ("about", "result"), rows)
+        parts = [
+            self.mission.phase_table,
+            Table(heads, [*map(Row, self._rows())], heads, bare=True),
+            worst_values("planned", self._worst()),
+            Table(heads, remarks, heads, bare=True),
+            Line(f"{name}: {verdict}", "ok" if self.passed else "fails"),
+        ]
+        return Sheet(name, f"valid: {self.mission.size_in_words}", parts)
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
-        for f in self.formations:
-            yield f.name, _formation_words(f)
-        if self.formations:
-            yield "gains", _gain_words(self.gains)
-        if self.margins is not None:
-            yield from (("margins", text) for text in self.margins.describe())
-        if self.separation is not None:
-            apart, t, who = self.separation
-            yield "separation", f"minimum {apart:.2f} m, {who} at {t:.2f} s"
-        yield from self._proved()
-        if self.thrust is not None:
-            force, t, who, limit = self.thrust
-            of = f" (limit {limit:g} N)" if math.isfinite(limit) else " (no limit)"
-            yield "thrust", f"maximum {force:.1f} N{of}, {who} at {t:.2f} s"
+        yield from self._rows()
+        for name, *words in worst_values("planned", self._worst()).texts:
+            yield name, ", ".join(filter(None, words))
+
+    def _worst(self) -> Iterator[Fact]:
+        """Worst values of the planned paths, with their limits."""
+        if self.is_show:
+            places = {"start": float(proximity.nearest(self.mission.fleet.position).min())}
+            places |= {f"'{f.name}'": f.spacing for f in self.formations}
+            for where, apart in places.items():
+                yield Fact("spacing, centre to centre", apart, "m", who=where)
+        for name, (_, unit) in _WORST.items():
+            if (worst := getattr(self, name)) is not None:
+                value, t, who, *own = worst
+                limit = own[0] if own else getattr(self.mission.limits, name)
+                limit = None if limit is None or not math.isfinite(limit) else limit
+                yield Fact(name.replace("_", " "), value, unit, limit, name == "separation", t, who)
         if self.vehicles is not None:
-            yield from self.vehicles.describe()
+            force, t, who, limit, _ = self.vehicles.rotor_force
+            yield Fact("rotor force", force, "N", limit, when=t, who=who)
+            tilt, t, who, _ = self.vehicles.tilt
+            yield Fact("tilt", tilt, "deg", when=t, who=who)
+        for name, least, t, who in self.clearance:
+            yield Fact("clearance", least, "m", when=t, who=f"{who}, '{name}'")
+
+    def _rows(self) -> Iterator[tuple[str, str]]:
+        """Facts in words, each with its heading."""
+        if self.is_show:
+            yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
+        else:
+            yield from ((f.name, _formation_words(f)) for f in self.formations)
+            if self.formations:
+                yield "gains", _gain_words(self.gains)
+        if self.margins is not None:
+            yield from self.margins.rows
+        yield from self._proved()
         if self.reserve:
             text = f"automatic times leave {self.reserve:.2g} s times the greatest jerk of limits of acceleration, tilt"
             text += " and thrust, and times the greatest acceleration of those of speed, for lag and drag of vehicles"
             yield "reserve", text
         if self.disturbed is not None:
             yield "disturbances", _disturbed_words(self.disturbed)
-        for name, least, t, who in self.clearance:
-            yield "clearance", f"{least:.2f} m to '{name}', {who} at {t:.2f} s"
         for between, wide, takes, t in self.gaps:
             text = f"{between}: {wide:.2f} m wide, the formation needs {takes:.2f} m at {t:.2f} s"
             yield "gap", text
         if len(self.assignments) > 1:
-            told = [
-                f"{name} {a.path_length:.1f} m, {a.min_clearance:.2f} m"
-                for name, a in self.assignments.items()
-            ]
-            yield (
-                "assignment",
-                f"total path length, minimum clearance: {'; '.join(told)}",
+            ways = (
+                f"{x} {a.path_length:.1f} m, {a.min_clearance:.2f} m"
+                for x, a in self.assignments.items()
             )
+            yield "assignment", f"total path length, minimum clearance: {'; '.join(ways)}"
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)
-            yield (
-                "guessed",
-                f"straight paths are assumed in {names}, where only distances guide the agents",
-            )
+            text = f"straight paths are assumed in {names}, where only distances guide the agents"
+            yield "guessed", text
 
     def _proved(self) -> Iterator[tuple[str, str]]:
         """The least of the certificates, and the phases that have none."""
@@ -359,7 +404,7 @@ class Preflight:
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""
         g = self.gains
-        return {
+        data = {
             "passed": self.passed,
             "remarks": [vars(remark) for remark in self.remarks],
             "formations": {
@@ -368,13 +413,15 @@ class Preflight:
                     "rigidity": None if f.rigidity is None else f.rigidity.data(),
                     "realisations": None if f.realisations is None else f.realisations.data(),
                     "solve": f.method,
-                    "spectrum": None if f.spectrum is None else _spectral_data(f.spectrum),
+                    "spectrum": None if f.spectrum is None else f.spectrum.data(),
+                    "spacing_m": f.spacing,
+                    "colours": f.colours,
                 }
                 for f in self.formations
             },
             "gains": {
                 "stabilised": g.stabilised,
-                "margin": g.margin if math.isfinite(g.margin) else None,
+                "margin": g.margin,
                 "settling_time_s": g.settling_time,
                 "overshoot": g.overshoot,
                 "force_per_error_n_m": g.force,
@@ -385,20 +432,20 @@ class Preflight:
             "disturbances": None
             if (d := self.disturbed) is None
             else {
-                "air_n": d.air,
-                "gusts_n": d.gusts,
-                "weight_n": d.weight,
-                "noise_n": d.noise,
+                **{f"{name}_n": getattr(d, name) for name in _FORCES},
                 "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), d.thrust),
                 "offset": _named(("offset_m", "who"), d.offset),
                 "lost": [_named(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
             },
             "paths": {
-                "judged_to_s": self.judged_to if math.isfinite(self.judged_to) else None,
+                "judged_to_s": self.judged_to,
                 "guessed_phases": [
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
-                "separation": _named(("separation_m", "time_s", "who"), self.separation),
+                **{
+                    name: _named((key, "time_s", "who", "limit_n"), getattr(self, name))
+                    for name, (key, _) in _WORST.items()
+                },
                 "certificates": [
                     {
                         "phase": phase,
@@ -409,7 +456,6 @@ class Preflight:
                     }
                     for phase, c in self.certificates.items()
                 ],
-                "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
                 "clearance": [
                     _named(("obstacle", "clearance_m", "time_s", "who"), c) for c in self.clearance
                 ],
@@ -424,17 +470,12 @@ class Preflight:
                 },
             },
         }
+        return plain(data)
 
 
 def _disturbed_words(d: Disturbed) -> str:
-    parts = [
-        f"{what} up to {force:.2g} N"
-        for what, force in (
-            ("steady wind", d.air), ("gusts (3 sigma)", d.gusts), ("weight error", d.weight),
-            ("noise (3 sigma)", d.noise),
-        )
-        if force > 0
-    ]  # fmt: skip
+    forces = {what: getattr(d, name) for name, what in _FORCES.items()}
+    parts = [f"{what} up to {force:.2g} N" for what, force in forces.items() if force > 0]
     force, t, who, limit = d.thrust
     of = f" (limit {limit:g} N)" if math.isfinite(limit) else ""
     parts.append(f"maximum thrust with them {force:.1f} N{of}, {who} at {t:.2f} s")
@@ -444,26 +485,31 @@ def _disturbed_words(d: Disturbed) -> str:
     return "; ".join(parts)
 
 
+def _scene_words(f: FormationCheck) -> str:
+    """What concerns a formation of a show, besides its spacing."""
+    parts = ["not used in any phase"] if f.held_by == "nothing" else []
+    parts += [f"{f.colours} colour{'s' * (f.colours > 1)} of lights"] if f.colours else []
+    parts += [f"edges solved by {solvers.WORDS[f.method]}"] if f.method != "dense" else []
+    return "; ".join(parts)
+
+
 def _formation_words(f: FormationCheck) -> str:
     r = f.rigidity
-    held = {
-        "tracking": "held by tracking",
-        "distances": "held by distances",
-        "nothing": "not used in any phase",
-    }[f.held_by]
+    held = "not used in any phase" if f.held_by == "nothing" else f"held by {f.held_by}"
+    solved = f"{held}; solved by {solvers.WORDS[f.method]}"
+    if f.spectrum is not None and f.spectrum.free:
+        return f"{solved}; flexible to first order, at least {f.spectrum.free} free motions"
     if f.spectrum is not None:
-        text = f"{held}; solved by {solvers.WORDS[f.method]}"
-        if f.spectrum.free:
-            return f"{text}; flexible to first order, at least {f.spectrum.free} free motions"
-        return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
+        return (
+            f"{solved}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
+        )
     if f.skipped:
-        return f"{held}; solved by {solvers.WORDS[f.method]}; skipped, rigidity not checked"
+        return f"{solved}; skipped, rigidity not checked"
     if r is None and f.method != "dense":
-        return f"{held}; solved by {solvers.WORDS[f.method]}; too large to check its rigidity"
+        return f"{solved}; too large to check its rigidity"
     if r is None:
         return f"{held}; its distances do not determine positions, so its rigidity is not checked"
-    if f.method != "dense":
-        held += f", solved by {solvers.WORDS[f.method]}"
+    held = held if f.method == "dense" else solved.replace("; ", ", ")
     parts = [f"{r.rigidity_class}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
     if r.reachable < r.needed:
         parts[0] += f" ({r.reachable} reachable on a {WHERE[r.dimension]})"
@@ -505,11 +551,6 @@ def _realisation_words(r: Realisations) -> str:
     return text + (f", and there are {len(others) - 3} more shapes" if len(others) > 3 else "")
 
 
-def _spectral_data(s: Spectrum) -> dict[str, Any]:
-    condition = s.condition if math.isfinite(s.condition) else None
-    return {"w": s.w, "index": s.index, "condition": condition, "free": s.free}
-
-
 def _gain_words(g: GainsCheck) -> str:
     if not g.stabilised:
         return "no feedback: stabilisation = 'none'"
@@ -532,19 +573,6 @@ def _margin_words(m: Margins) -> str:
     return f"stable; bears {delay}, {math.degrees(m.phase):.0f} deg of phase, {gain}"
 
 
-def _margin_data(m: Margins) -> dict[str, Any]:
-    return {
-        "stable": m.stable,
-        "gain": [_finite(g) for g in m.gain],
-        "phase_deg": _finite(math.degrees(m.phase)),
-        "delay_s": _finite(m.delay),
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def some(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
     text = ", ".join(f"'{name}'" for name in names[:_TOLD])
@@ -553,7 +581,4 @@ def some(names: Sequence[str]) -> str:
 
 
 def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
-    if values is None:
-        return None
-    plain = [None if isinstance(v, float) and not math.isfinite(v) else v for v in values]
-    return dict(zip(names, plain, strict=True))
+    return None if values is None else dict(zip(names, values, strict=False))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -11,6 +13,7 @@ import numpy as np
 from rigidfleet._common.text import agent_names
 from rigidfleet.formation import distance_geometry
 from rigidfleet.formation.graphs import complete_graph
+from rigidfleet.math.proximity import nearest
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
@@ -63,7 +66,15 @@ def check_formations(
         else:
             left -= work
             found[name] = _formation(mission, name, held[name], search=search)
-    return [found[name] for name in mission.formations]
+    return [_spaced(mission, found[name]) for name in mission.formations]
+
+
+def _spaced(mission: Mission, found: FormationCheck) -> FormationCheck:
+    """The check with what concerns a show: the spacing of the slots, and the lights."""
+    slots = mission.formation_slots(found.name)
+    spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
+    colours = len({*(mission.formation_colours(found.name) or ())})
+    return replace(found, spacing=spacing, colours=colours)
 
 
 def _work(mission: Mission, name: str, *, search: bool) -> float:

@@ -171,7 +171,7 @@ def _worse(
 ) -> FormationMargins:
     """The smaller margins of those ``known`` and those of a further shape."""
     now = margins(loops, law, growth)
-    constrained = [loop for loop in loops if loop.constrained]
+    constrained = [loop for loop in loops if loop.is_constrained]
     most = math.inf if known is None else known.largest_pole
     pole = largest_pole(constrained, law, most, growth) if constrained else most
     if known is None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from rigidfleet.mission import Box, Ground, Mission, Obstacle
 from rigidfleet.planning.clearance import CLOSE, closest, pace
+from rigidfleet.preflight.avoidance import evades
 from rigidfleet.preflight.findings import Preflight, Remark, some
 from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats
@@ -68,7 +69,7 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
                 if isinstance(thing, Ground):
                     text += _too_low(mission, found, phase, thing.height)
-                evaded = mission.avoidance is not None and thing.solid.moves
+                evaded = thing.solid.moves and evades(mission, "obstacle")
                 if evaded:
                     text += " as planned; [avoidance] has to evade it"
                 remark = Remark("fails" if exact and not evaded else "note", "obstacle", text)

@@ -20,6 +20,7 @@ from rigidfleet.math.margins import shares
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import air_force, jets
+from rigidfleet.preflight.avoidance import evades
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import feedback
 from rigidfleet.preflight.obstacles import obstacle_remarks
@@ -120,7 +121,7 @@ def offset_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             continue
         own, surely = broken(0.0 * off), broken(max(0.0, _SURE - gusts / far) * off)
         for topic in (topic for topic in now if topic not in own):
-            evaded = mission.avoidance is not None and topic in ("collision", "obstacle")
+            evaded = evades(mission, topic, mission.limits.separation or 0.0)
             fails = planned.exact and topic in surely and not evaded
             text = f"steady disturbances push vehicles up to {far:.2g} m off their slots in '{planned.phase}'"
             remark = Remark("fails" if fails else "note", topic, f"{text}: {now[topic]}")
@@ -134,7 +135,8 @@ def _broken(
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
     masses, r, far = mission.fleet.mass, planned.position + off, np.linalg.norm(off, axis=2)
-    there = Preflight(found.formations, found.gains, [replace(planned, position=r, path_ends=None)])
+    moved = [replace(planned, position=r, path_ends=None)]
+    there = Preflight(mission, found.formations, found.gains, moved)
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
     remarks += geofence_remarks(mission, there.planned_phases[0])
     if not phase.lands:  # that ends where vehicles stand

@@ -23,10 +23,9 @@ from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
 from rigidfleet.planning.vehicles import air_force
+from rigidfleet.preflight.avoidance import evades
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
-from rigidfleet.rigidity import (
-    jacobian,
-)
+from rigidfleet.rigidity import jacobian
 from rigidfleet.typing import Floats
 
 #: Share by which a goal is planned to be missed by more than its tolerance, before it is said to be missed.
@@ -72,16 +71,14 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     for exact, (separation, t, who, phase) in worst.items():
         if separation <= 0 or separation < limit - SLACK:
             text = _near(who, separation, t, phase, limit, exact=exact)
-            guess = (
-                "" if exact else "; straight paths are assumed, as only distances guide the agents"
-            )
-            yield _collision(mission, text + guess, limit, exact=exact)
+            yield _collision(mission, text, limit, exact=exact)
 
 
 def _collision(mission: Mission, text: str, limit: float, *, exact: bool) -> Remark:
     """Remark on planned paths that come too close, which is a note where the guard of [avoidance] keeps the limit."""
-    a = mission.avoidance
-    if exact and a is not None and a.guard and (a.separation is None or a.separation >= limit):
+    if not exact:
+        text += "; straight paths are assumed, as only distances guide the agents"
+    elif evades(mission, "collision", limit):
         text, exact = f"{text}. So it is planned; [avoidance] has to keep them apart", False
     return Remark("fails" if exact else "note", "collision", text)
 
@@ -119,10 +116,7 @@ def _crossing(
         text += 'Assign agents to near slots: assignment = "each"'
     if not promised and apart < math.sqrt(2) * needed:
         text += f"; and {spaced}"
-    guess = (
-        "" if planned.exact else ". Straight paths are assumed, as only distances guide the agents"
-    )
-    return _collision(mission, text + guess, limit, exact=planned.exact)
+    return _collision(mission, text, limit, exact=planned.exact)
 
 
 def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
@@ -176,6 +170,15 @@ def _nearest_to_limit(
     planned, need = max(zip(way, needs, strict=True), key=lambda pair: (pair[1] - room).max())
     k, i = np.unravel_index(int((need - room).argmax()), need.shape)
     return (float(need[k, i]), float(planned.time[k]), f"agent {i + 1}", float(limits[i])), planned
+
+
+def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, str] | None:
+    """Greatest planned speed [m/s] along some axes, its time [s] and agent, at samples; None without a plan."""
+    if not way:
+        return None
+    sizes = [np.linalg.norm(planned.velocity[..., axes], axis=2) for planned in way]
+    (speed, t, who, _), _ = _nearest_to_limit(way, sizes, np.full(sizes[0].shape[1], np.inf))
+    return speed, t, who
 
 
 def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:

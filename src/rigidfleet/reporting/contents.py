@@ -12,26 +12,25 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet import plotting
+from rigidfleet._common.facts import Cell, Level, Row, Table, value
 from rigidfleet._common.quantities import QUANTITIES, quantity, shown
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
-from rigidfleet.assessment.outcome import value
-from rigidfleet.assessment.table import check_row
-from rigidfleet.mission import ending, goal
 from rigidfleet.plotting.quadrotors import (
     has_rotors,
     rotor_forces,
     rotor_limits,
     tilt,
-    tracking_error,
 )
 from rigidfleet.plotting.style import clean
 from rigidfleet.reporting import gains, overlay
+from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
+    from rigidfleet.typing import Floats
 
 #: Greatest number of vehicles with a row each; of more vehicles, those with the greatest thrust are shown.
 _VEHICLES = 24
@@ -62,7 +61,7 @@ def contents(
     colours = plotting.agent_colours(len(flights))
     found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
-    controlled = any(flight.interpolation is None for flight in flights)
+    controlled = any(each["gains"] is not None and each["gains"].rows for each in found)
     response = overlay.response(missions, names) if controlled else None
     return {
         "title": " · ".join(names),
@@ -70,9 +69,9 @@ def contents(
         "flights": found,
         "figures": [] if several else _figures(flights[0]),
         "passed": all(verdict.passed for verdict in judged),
-        "safety": _safety_table(flights, judged),
-        "numbers": _numbers(flights, judged) if several else [],
-        "keys": _keys(missions) if several else [],
+        "safety": _safety_table(flights, judged, names),
+        "numbers": _numbers(flights, judged, names) if several else None,
+        "keys": _keys(missions, names) if several else None,
         "overlays": _overlays(flights, names) if several else [],
         "controlled": controlled,
         "response": None if response is None else _embedded(response),
@@ -102,7 +101,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
     failed = [finding for finding in judged if not finding.passed]
     return {
         "label": label,
-        "colour": colour,
+        "head_cell": Cell(label, colour=colour),
         "name": mission.name,
         "title": mission.title,
         "source": mission.source,
@@ -112,12 +111,12 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "facts": _facts(result),
-        "checks": [_check(check) for check in verdict.checks],
-        "phases": _phases(result, verdict),
+        "phases": mission.phase_table,
+        "checks": [part for part in verdict.facts().shown if isinstance(part, Table)],
         "vehicles": _vehicles(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
-        "gains": gains.explained(mission) if result.interpolation is None else [],
+        "gains": _gains(result),
         "versions": _versions(result),
         "text": result.mission_text,
     }
@@ -142,9 +141,8 @@ def _facts(result: Result) -> list[tuple[str, str]]:
     mission = result.mission
     mass = sorted(set(mission.agents.mass))
     masses = f"{mass[0]:.4g} kg" if len(mass) == 1 else f"{mass[0]:.4g} to {mass[-1]:.4g} kg"
-    forms = [
-        f"{name} ({len(mission.formation_edges(name))} edges)" for name in mission.formations
-    ]  # fmt: skip
+    counts = {name: len(mission.formation_edges(name)) for name in mission.formations}
+    forms = [f"{name} ({n} edges)" if n else name for name, n in counts.items()]
     made = result.created.replace("T", " ").replace("+00:00", " UTC")
     if result.interpolation is not None:
         return [
@@ -168,79 +166,54 @@ def _models(mission: Mission) -> str:
     return ": " * bool(count) + ", ".join(f"{n} × {name}" for name, n in count.items())
 
 
-def _check(finding: Any) -> dict[str, Any]:
-    row = [str(x).replace("<=", "≤").replace(">=", "≥") for x in check_row(finding)]
-    state = "failed" if not finding.passed else "ok" if finding.judged else ""
-    return dict(zip(("name", "worst", "limit", "when", "who"), row, strict=False), state=state)
+def _gains(result: Result) -> Table | None:
+    """The gains in words; None of trajectories that others made, which have none."""
+    if result.interpolation is not None:
+        return None
+    heads = ("gains", "value", "meaning")
+    return Table(heads, [*map(Row, gains.explained(result.mission))], heads, bare=True)
 
 
-def _phases(result: Result, verdict: Verdict) -> list[dict[str, str]]:
-    planned = {phase.name: phase for phase in result.mission.phases}
-    rows = []
-    for number, p in enumerate(verdict.phases, start=1):
-        phase, w = planned.get(p.name), p.waypoint
-        worst = {name: value(e.value) for name, e in p.worst.items()}
-        rows.append(
-            {
-                "number": str(number),
-                "name": p.name,
-                "kind": p.kind,
-                "to": "" if phase is None else goal(phase),
-                "ends": "" if phase is None else ending(phase),
-                "control": p.control,
-                "flown": f"{p.t_start:.2f} to {p.t_end:.2f}",
-                "miss": "" if w is None or w.position is None else value(w.position),
-                "shape": "" if p.shape is None else value(p.shape),
-                **{k: worst.get(k, "") for k in ("separation", "clearance", "thrust", "speed")},
-            }
-        )
-    return rows
-
-
-def _vehicles(result: Result) -> list[dict[str, Any]]:
+def _vehicles(result: Result) -> Table:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
-    with np.errstate(invalid="ignore"):
-        thrust = np.nan_to_num(result.thrust).max(axis=0)
-        speed = np.nan_to_num(np.linalg.norm(result.velocity, axis=2)).max(axis=0)
-        acceleration = np.nan_to_num(np.linalg.norm(result.acceleration, axis=2)).max(axis=0)
+
+    def greatest(values: Floats) -> list[float | None]:
+        most = np.fmax.reduce(values.reshape(*values.shape[:2], -1), axis=(0, 2), initial=np.nan)
+        return [x if math.isfinite(x) else None for x in most.tolist()]
+
+    def of(name: str) -> list[float | None]:
+        return greatest(samples(result, name).values)
+
+    def share(values: Floats, limits: Any) -> list[str]:
+        return ["" if x is None else f"{100 * x:.0f} %" for x in greatest(values / limits)]
+
     z = result.position[..., 2]
-    path = np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0)
-    shown = np.arange(n) if n <= _VEHICLES else np.sort(np.argsort(-thrust)[:_VEHICLES])
+    thrust, nothing = of("thrust"), [None] * n
+    own, rotors = result.interpolation is None, has_rotors(result)
+    columns = {
+        "mass [kg]": [f"{m:.4g}" for m in mission.agents.mass] if own else nothing,
+        "thrust [N]": thrust if own else nothing,
+        "share of limit": share(result.thrust[..., None], np.array(mission.agents.thrust_limit)[:, None])
+        if np.isfinite(mission.agents.thrust_limit).any() else nothing,
+        "speed [m/s]": of("speed"),
+        "acceleration [m/s²]": of("acceleration"),
+        "lowest [m]": [-x for x in greatest(-z) if x is not None],
+        "highest [m]": greatest(z),
+        "path length [m]": np.linalg.norm(np.diff(result.position, axis=0), axis=2).sum(axis=0).tolist(),
+        "share of rotor limit": share(rotor_forces(result), rotor_limits(mission)[..., None])
+        if rotors else nothing,
+        "tilt [deg]": greatest(tilt(result)) if rotors else nothing,
+        "from the slot [m]": of("tracking_error") if rotors else nothing,
+    }  # fmt: skip
+    order = np.argsort(-np.nan_to_num(np.array(thrust, dtype=float)))
+    shown = np.arange(n) if n <= _VEHICLES else np.sort(order[:_VEHICLES])
     colours = plotting.agent_colours(n)
-    limits = mission.agents.thrust_limit
-    flown, known = _with_rotors(result), result.interpolation is None
-    return [
-        {
-            "name": str(i + 1),
-            "colour": colours[i],
-            "mass": f"{mission.agents.mass[i]:.4g}" if known else "",
-            "thrust": value(float(thrust[i])) if known else "",
-            "used": f"{100 * thrust[i] / limits[i]:.0f} %" if math.isfinite(limits[i]) else "",
-            "speed": value(float(speed[i])),
-            "acceleration": value(float(acceleration[i])),
-            "low": value(float(np.nanmin(z[:, i]))),
-            "high": value(float(np.nanmax(z[:, i]))),
-            "path": value(float(path[i])),
-            "own": [column[i] for column in flown],
-        }
+    rows = [
+        Row((Cell(str(i + 1), colour=colours[i]), *(column[i] for column in columns.values())))
         for i in shown.tolist()
     ]
-
-
-def _with_rotors(result: Result) -> list[list[str]]:
-    """Columns of vehicles with rotors: rotor share, tilt, tracking error; empty for points, none for their flights."""
-    if not has_rotors(result):
-        return []
-    share = rotor_forces(result).max(axis=2) / rotor_limits(result.mission)
-    return [
-        [form(x) if math.isfinite(x) else "" for x in np.fmax.reduce(values, axis=0).tolist()]
-        for values, form in (
-            (share, lambda x: f"{100 * x:.0f} %"),
-            (tilt(result), value),
-            (tracking_error(result), value),
-        )
-    ]
+    return Table(("agent", *columns), rows)
 
 
 def _versions(result: Result) -> list[tuple[str, str]]:
@@ -261,58 +234,68 @@ def _versions(result: Result) -> list[tuple[str, str]]:
 # -- safety table -----------------------------------------------------------------------------------
 
 
-def _safety_table(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """A row for each quantity of any flight, with a cell for each flight."""
+def _safety_table(
+    flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
+) -> Table:
+    """A row for each quantity of any flight; beside the quantity, what is known of one flight, or a cell for each."""
     columns = [
         {row.quantity: row for row in safety(*each)} for each in zip(flights, verdicts, strict=True)
     ]
-    return [
-        {
-            "name": name,
-            "text": text,
-            "cells": [_safety_cell(name, column.get(name)) for column in columns],
-        }
-        for name, text in {row.quantity: row.text for c in columns for row in c.values()}.items()
+    names = {row.quantity: Cell(row.quantity, row.text) for c in columns for row in c.values()}
+    if len(flights) == 1:
+        rows = [
+            Row((names[row.quantity], *_safety_cells(row)), _level(row))
+            for row in columns[0].values()
+        ]
+        heads = ("quantity", "limit", "worst", "margin", "when", "who")
+        return Table(heads, rows, ("margin", "when", "who"))
+    rows = [
+        Row((cell, *(_safety_cell(name, column.get(name)) for column in columns)))
+        for name, cell in names.items()
     ]
+    return Table(("quantity", *labels), rows, labels)
 
 
-def _safety_cell(name: str, row: Safety | None) -> dict[str, Any]:
-    nothing = quantity(name.replace(" ", "_")).nothing or "nothing to measure"
-    if row is None:
-        return {"state": "free", "worst": "", "nothing": nothing}
-    margin, used, worst = row.margin, row.used, row.worst
-    state = "free" if row.limit is None else "ok" if row.passed else "failed"
+def _level(row: Safety) -> Level:
+    return "" if row.limit is None else "ok" if row.passed else "fails"
+
+
+def _nothing(name: str) -> str:
+    return quantity(name.replace(" ", "_")).nothing or "nothing to measure"
+
+
+def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
+    """Limit, worst value, margin, when and who."""
+    if (worst := row.worst) is None:
+        return row.fact.bound, _nothing(row.quantity), "", "", ""
     left = ""
-    if margin is not None:
-        left = f"{value(abs(margin), row.unit)} {'left' if margin >= 0 else 'beyond'}"
-    return {
-        "state": state,
-        "sign": "≤" if not row.at_least else "≥" if row.limit else ">",
-        "limit": "" if row.limit is None else value(row.limit, row.unit),
-        "worst": "" if worst is None else value(worst.value, row.unit),
-        "nothing": nothing if worst is None else "",
-        "left": left,
-        "used": None if used is None else min(max(used, 0.0), 1.0),
-        "when": "" if worst is None else f"{worst.when:.2f} s" + ", at samples" * worst.at_samples,
-        "who": "" if worst is None else worst.who,
-        "phase": "" if worst is None else worst.phase,
-    }
+    if row.margin is not None:
+        left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
+    when = f"{worst.when:.2f} s" + ", at samples" * worst.at_samples
+    margin, at = Cell(left, share=row.used), Cell(when, worst.phase)
+    return row.fact.bound, value(worst.value, row.unit), margin, at, worst.who
+
+
+def _safety_cell(name: str, row: Safety | None) -> Cell:
+    """The worst value of one of several flights, with its limit, whom and when."""
+    if row is None:
+        return Cell(_nothing(name))
+    limit, worst, _, when, who = _safety_cells(row)
+    small = ", ".join(str(x) for x in (limit, who, getattr(when, "text", "")) if x)
+    return Cell(str(worst), small, level=_level(row))
 
 
 # -- what differs ------------------------------------------------------------------------------------
 
 
-def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
-    """Numbers of the flights side by side, with whether they differ."""
-
-    def misses(_: Result, verdict: Verdict) -> float | None:
-        found = [p.waypoint.position for p in verdict.phases if p.waypoint is not None]
-        return max((miss for miss in found if miss is not None), default=None)
-
+def _numbers(
+    flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
+) -> Table:
+    """Numbers of the flights side by side, with how much they differ from those of the first."""
     measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
-        ("greatest waypoint miss", "m", misses),
+        ("greatest waypoint miss", "m", partial(_checked, "waypoint_position")),
         ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
         *((q.text, shown(q.unit), partial(_checked, q.name)) for q in QUANTITIES.values()),
     ]
@@ -321,21 +304,15 @@ def _numbers(flights: Sequence[Result], verdicts: Sequence[Verdict]) -> list[dic
         found = [measure(*each) for each in zip(flights, verdicts, strict=True)]
         if all(x is None for x in found):
             continue
-        rows.append(
-            {
-                "name": name,
-                "unit": unit,
-                "cells": ["–" if x is None else value(x) for x in found],
-                "change": [_change(found[0], x) for x in found],
-                "same": all(_same(found[0], x) for x in found),
-            }
-        )  # fmt: skip
-    return rows
+        cells = [Cell("–" if x is None else value(x), _change(found[0], x)) for x in found]
+        rows.append(Row((f"{name} [{unit}]" if unit else name, *cells)))
+    return Table(("quantity", *labels), rows)
 
 
 def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
-    return next((check.worst for check in verdict.checks if check.check == name), None)
+    check = verdict.by_name.get(name)
+    return None if check is None else check.worst
 
 
 def _mean(result: Result) -> float | None:
@@ -363,18 +340,18 @@ def _change(first: float | None, x: float | None) -> str:
     return f"{percent:+.0f} %".replace("-", "−") if abs(percent) >= 0.5 else ""
 
 
-def _keys(missions: Sequence[Mission]) -> list[dict[str, Any]]:
+def _keys(missions: Sequence[Mission], labels: Sequence[str]) -> Table:
     """Keys of the mission files that differ between missions."""
     flat = [dict(_flat(mission.to_dict())) for mission in missions]
     rows = []
     for key in dict.fromkeys(key for one in flat for key in one):
-        values = [one.get(key, "") for one in flat]
+        values = [one.get(key, "not set") for one in flat]
         if key != "name" and len(set(values)) > 1:
-            rows.append({"key": key, "values": [clean(v, 60) for v in values]})
+            rows.append(Row((key, *(clean(v, 60) for v in values))))
     if len(rows) > _KEYS:
-        more = {"key": f"and {len(rows) - _KEYS} more keys", "values": ["…"] * len(missions)}
+        more = Row((f"and {len(rows) - _KEYS} more keys", *["…"] * len(missions)))
         rows = [*rows[:_KEYS], more]
-    return rows
+    return Table(("key", *labels), rows, labels)
 
 
 def _flat(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
@@ -405,6 +382,7 @@ _CAPTIONS = {
     "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
     "rotors": "Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit.",
     "operation": "Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.",
+    "motion": "Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits.",
     "vehicles": "Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give.",
 }  # fmt: skip
 
@@ -416,7 +394,8 @@ def _figures(result: Result) -> list[dict[str, str]]:
 
 def _figure(result: Result, name: str) -> dict[str, str]:
     svg = plotting.rendered(result, name, ["svg"])["svg"]
-    return _picture(name, svg, _CAPTIONS.get(name, ""))
+    pairs = name == "constraint_error" and not len(result.edges)
+    return _picture(name, svg, "Shape error of all pairs." if pairs else _CAPTIONS.get(name, ""))
 
 
 def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:

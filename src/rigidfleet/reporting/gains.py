@@ -28,13 +28,14 @@ class Line(NamedTuple):
 
 def explained(mission: Mission) -> list[Line]:
     """The gains of a mission, one by one."""
-    return [*_constraint(mission), *_tracking(mission), *_regulators(mission)]
+    constraint = _constraint(mission) if len(mission.edges) else []
+    return [*constraint, *_tracking(mission), *_regulators(mission)]
 
 
 def response(mission: Mission, t: list[float]) -> list[float] | None:
     """Error c(t)/c(0) of a distance with c'(0) = 0; None without stabilisation."""
     c = mission.constraint
-    if c.stabilisation == "none":
+    if c.stabilisation == "none" or not len(mission.edges):
         return None
     return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
 

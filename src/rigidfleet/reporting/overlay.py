@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet._common.quantities import QUANTITIES, shown
 from rigidfleet.plotting import contents
 from rigidfleet.plotting import style as st
 from rigidfleet.reporting import gains
+from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -41,27 +43,20 @@ def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Distances, thrust, speed and errors over time, as an SVG."""
-    panels: list[tuple[str, Callable[[Result], Floats], bool]] = [
-        ("least distance between vehicles [m]", lambda r: _finite(r.separation), False),
-        ("greatest thrust [N]", lambda r: _greatest(r.thrust), False),
-        ("greatest speed [m/s]", lambda r: _greatest(np.linalg.norm(r.velocity, axis=2)), False),
-        ("greatest distance from a slot [m]", slot_error, True),
-        ("greatest constraint error [m]", lambda r: _greatest(np.abs(r.constraint)), True),
-    ]
+    panels = ["separation", "thrust", "speed", "tracking_error", "constraint"]
     if any(flight.mission.obstacles for flight in flights):
-        panels.insert(
-            1, ("least distance to an obstacle [m]", lambda r: _finite(r.clearance), False)
-        )
+        panels.insert(1, "clearance")
     with st.settings():
         rows = (len(panels) + 1) // 2
         fig = st.blank(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
-        for ax, (name, values, logarithmic) in zip(axes, panels, strict=False):
+        for ax, name in zip(axes, panels, strict=False):
             known = [
-                _panel(ax, flight, values(flight), look)
+                _panel(ax, flight, samples(flight, name).worst, look)
                 for flight, look in zip(flights, _looks(flights), strict=True)
             ]
-            ax.set_title(name)
+            q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
+            ax.set_title(f"{'least' if q.at_least else 'greatest'} {q.called} [{shown(q.unit)}]")
             if not any(known):
                 st.note(ax, "nothing to show")
             elif logarithmic:
@@ -80,7 +75,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
 
 def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
     """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
-    times = [s for m in missions if (s := m.constraint.settling_time) is not None]
+    times = [s for m in missions if len(m.edges) and (s := m.constraint.settling_time) is not None]
     if not times:
         return None
     t = np.linspace(0.0, 1.6 * max(times), 400)
@@ -99,24 +94,10 @@ def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None
         return _svg(fig)
 
 
-def slot_error(result: Result) -> Floats:
-    """Greatest distance (K,) [m] of an agent from its slot; NaN if there is no slot."""
-    return _greatest(np.linalg.norm(result.position - result.slot_position, axis=2))
-
-
 def _panel(ax: Axes, flight: Result, values: Floats, look: dict[str, Any]) -> bool:
     """Draw one flight's line; return whether there was anything to draw."""
     st.line(ax, flight.time, values, **look)
     return bool(np.isfinite(values).any())
-
-
-def _finite(values: Floats) -> Floats:
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-def _greatest(values: Floats) -> Floats:
-    """Greatest of values (K, n) at each sample; NaN if there are none."""
-    return np.fmax.reduce(_finite(values), axis=1, initial=np.nan)
 
 
 def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:

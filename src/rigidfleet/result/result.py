@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
 import numpy as np
 
-from rigidfleet._common import markup
 from rigidfleet._common.arguments import as_path
+from rigidfleet._common.facts import Fact, Row, Sheet, Shown, Table, worst_values
 from rigidfleet._common.files import write_file
-from rigidfleet._common.quantities import QUANTITIES, quantity
+from rigidfleet._common.quantities import quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -35,6 +35,10 @@ def _v(dims: str, units: str, text: str) -> Variable:
 
 
 _LABELLED = {dim: len(names) for dim, names in LABELS.items()}
+
+
+#: Quantities whose worst values are shown.
+_WORST = ("separation", "clearance", "speed", "thrust", "rotor_force", "tracking_error")
 
 
 #: Names of fields, and a function that computes them when they are first asked for.
@@ -61,7 +65,7 @@ def _now() -> str:
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class Result:
+class Result(Shown):
     """Record of a flight: the states of all vehicles, the forces on them, and the mission.
 
     `simulate` returns one; `save` writes it to a netCDF-4 file, and `Result.load` reads it back:
@@ -383,25 +387,28 @@ class Result:
             f"{len(self.time)} samples from {self.time[0]:g} to {self.time[-1]:g} s, {end}>"
         )
 
-    def _repr_html_(self) -> str:
-        """Show the flight in a notebook: its contents and its worst values."""
+    def facts(self) -> Sheet:
+        """What the flight consists of, and its worst values."""
         try:
             name, title = self.mission.name, self.mission.title
         except ResultError:
             name, title = "Result", "of a mission that cannot be read"
-        rows = [
-            ("agents", f"{self.n_agents}"),
-            ("edges", f"{len(self.edges)}"),
-            ("phases", ", ".join(phase.name for phase in self.phases)),
-            ("time", f"{self.time[0]:g} to {self.time[-1]:g} s, {len(self.time)} samples"),
-            ("ending", "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"),
+        end = "complete" if self.complete else f"incomplete: {self.ending or 'stopped'}"
+        about = {
+            "agents": self.n_agents,
+            "edges": len(self.edges) or None,
+            "phases": ", ".join(phase.name for phase in self.phases),
+            "time": f"{self.time[0]:g} to {self.time[-1]:g} s, {len(self.time)} samples",
+            "ending": end,
+        }
+        rows = [Row(item) for item in about.items() if item[1] is not None]
+        worst = [
+            Fact(f"{q.sense} {q.called}", x.value, q.unit, when=x.time)
+            for q in map(quantity, _WORST)
+            if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
-        for name in ("separation", "clearance", "speed", "thrust", "rotor_force", "tracking_error"):
-            if (x := self.extreme(name)) is not None and math.isfinite(x.value):
-                q = QUANTITIES[name]
-                words = f"{q.sense} {q.called}"
-                rows.append((words, f"{x.value:.3g} {q.unit} at {x.time:.2f} s"))
-        return markup.shown(name, title, (), rows)
+        contents = Table(("about", "result"), rows, ("result",), bare=True)
+        return Sheet(name, title, [contents, worst_values("quantity", worst)])
 
     @property
     def n_agents(self) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,6 +41,11 @@ class Spectrum:
     def condition(self) -> float:
         """Condition number of A without rigid motions; infinite if the formation is flexible."""
         return self.w_max / self.w if self.w > 0 else np.inf
+
+    def data(self) -> dict[str, Any]:
+        """Plain data."""
+        condition = self.condition if self.w > 0 else None
+        return {"w": self.w, "index": self.index, "condition": condition, "free": self.free}
 
 
 def spectrum(points: ArrayLike, edges: Ints, masses: ArrayLike) -> Spectrum:

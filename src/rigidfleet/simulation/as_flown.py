@@ -9,7 +9,7 @@ from typing import Any
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import near
-from rigidfleet.mission.kinds import KINDS
+from rigidfleet.mission.kinds import AnyPhase
 from rigidfleet.mission.losses import ON_LOSS
 from rigidfleet.planning.timing import timed_leg
 from rigidfleet.planning.transitions import expanded
@@ -97,7 +97,8 @@ def check_formation(mission: Mission, phase: Phase) -> None:
     MissionError
         The mission has no such formation, the formation has no slots to track, or the phase has no flight of its own.
     """
-    if not isinstance(phase, tuple(KINDS.values())):
+    # What a script gives may be anything.
+    if not isinstance(phase, AnyPhase):
         raise wrong_type(
             "a phase (a table as in a mission file, or one of a mission's phases)", phase
         )

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.kept import kept
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native, packing
@@ -25,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Limits, Mission, Obstacle
 from rigidfleet.mission.model import Fleet
 from rigidfleet.result import PAD, Extremum, PhaseRecord
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -65,27 +64,10 @@ _STORED = [(name, k, 1.0 if QUANTITIES[name].at_least else -1.0) for name, k in 
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
-#: Size of an integrator: states, states in its trail, agents, edges, whether accelerations by direction are kept.
-_Size = tuple[int, int, int, int, bool]
-#: Integrators that no flight uses, by size, because their trails are large; how many of each.
-_idle: dict[_Size, list[records.IntegratorState]] = {}
-_KEPT = 8
-
-
-def _idle_integrator(size: _Size) -> records.IntegratorState | None:
-    try:
-        return _idle[size].pop()
-    except (KeyError, IndexError):
-        return None
-
-
 def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...], t: float) -> Ints:
     """Whether agents stand on obstacles at a time [s] (N,)."""
     below = proximity.below(position, radius, obstacles, np.full(len(radius), t), PAD)
     return np.any(below, axis=0).astype(np.int64)
-
-
-_standing_kept = kept(_standing)
 
 
 class CurveWatch:
@@ -117,10 +99,7 @@ class CurveWatch:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        # Obstacles that are not boxes may be large, and are not to be kept.
-        standing = _standing_kept if self.solids is None else _standing
-        self.stood = standing(fleet.position, self.radius, tuple(obstacles), t)
-        self.standing = self.stood.copy()
+        self.standing = _standing(fleet.position, self.radius, tuple(obstacles), t)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
@@ -131,7 +110,7 @@ class CurveWatch:
         #: Obstacles of all kinds, unless all are boxes that the monitor itself takes.
         self.solids = None
         if None in corners:
-            self.solids, corners = joined([thing.solid for thing in obstacles]), []
+            self.solids, corners = join([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
     def _begin_monitor(self, states: int, gauge: int, steps: int) -> None:
@@ -177,7 +156,7 @@ class CurveWatch:
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
         steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, np.arange(steps))
+        self._take_solids(problem, state, 0, steps)
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
@@ -217,24 +196,21 @@ class CurveWatch:
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
         arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
-        self._take_solids(problem, state, np.arange(len(steps[0])))
+        self._take_solids(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
         found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
         return found
 
-    def _take_solids(self, problem: Problem, state: records.IntegratorState, steps: Ints) -> None:
+    def _take_solids(
+        self, problem: Problem, state: records.IntegratorState, first: int, end: int
+    ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
-        if self.solids is None:
-            return
-        from rigidfleet.kernel import obstacles  # loads the compiler
+        if self.solids is not None:
+            from rigidfleet.kernel.engine.solids import watch_solids  # loads the compiler
 
-        trail, body = state.trail, bool(problem.body_formulation)
-        laid = obstacles.layout(problem.vehicles.m, problem.graph.edges, body)
-        watched = obstacles.monitor_of(self.monitor.monitor)
-        for row in _rows(state, steps):
-            obstacles.watch(trail.points[row], *trail.clock[row], laid, self.solids, watched)
+            watch_solids(self.monitor, problem, state, first, end, self.solids)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -374,7 +350,8 @@ class Extremes(CurveWatch):
     def __init__(self, mission: Mission) -> None:
         super().__init__(mission.fleet, mission.obstacles, mission.limits)
         self.state: records.IntegratorState | None = None  # of the integrator that is monitored
-        self.size: _Size | None = None  # for which there is a monitor
+        #: States, states in its trail, edges, for which there is a monitor.
+        self.size: tuple[int, int, int] | None = None
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
         self._touching: Future[None] | None = None
@@ -388,22 +365,6 @@ class Extremes(CurveWatch):
         if self.size is not None:
             found = self.monitor.monitor
             self.monitor = native.Watch(found._replace(boxes=self.boxes, count=found.count.copy()))
-
-    @property
-    def reusable(self) -> bool:
-        """Whether another flight of the mission can be monitored after `restart`: no vehicle was lost."""
-        return self.n <= _FEW and bool(self.left.all())
-
-    def restart(self) -> None:
-        """Forget the flight that was monitored."""
-        self.worst[:] = self.none
-        self.low.fill(np.inf)
-        self.when.fill(0.0)
-        self.who.fill(-1)
-        self.standing[:] = self.stood
-        self.of_vehicles, self.avoidance, self.led, self.touched = {}, None, {}, {}
-        if self.size is not None:
-            self.monitor.monitor.count[:] = 0, records.ANY_STEP, records.ANY_STEP
 
     def begin(
         self,
@@ -421,18 +382,14 @@ class Extremes(CurveWatch):
         ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
         thread.
         """
-        size = len(y), states or len(y), self.n, edges, self.directed
-        known = size == self.size
-        if not known:
-            self.let_go()
-        state = self.state or _idle_integrator(size)
-        if state is None:
-            trail = records.trail(*size[1:])
-            state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
+        size = len(y), states or len(y), edges
+        state = self.state
+        if state is not None and size == self.size:
+            self.state = records.integrator_in(state, y, t, rtol=rtol, atol=atol)
         else:
-            state = records.restarted(state, y, t, rtol=rtol, atol=atol)
-        self.state, self.size = state, size
-        if not known:
+            trail = records.trail(size[1], self.n, edges, self.directed)
+            self.state = state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
+            self.size = size
             steps, gauge = state.trail.gauge.shape
             self._begin_monitor(size[1], gauge, steps)
             if aside:
@@ -440,15 +397,7 @@ class Extremes(CurveWatch):
                 # reaches after it has handed over steps are touched while it flies these.
                 half = self._half(state)
                 self._touching = self._beside().submit(state.trail.points[half:].fill, 0.0)
-        return state
-
-    def let_go(self) -> None:
-        """Let the monitors of other flights use the integrator."""
-        if self.state is not None and self.size is not None and self.n <= _FEW:
-            idle = _idle.setdefault(self.size, [])
-            if len(idle) < _KEPT:
-                idle.append(self.state)
-        self.state = None
+        return self.state
 
     @staticmethod
     def _half(state: records.IntegratorState) -> int:
@@ -487,7 +436,7 @@ class Extremes(CurveWatch):
         new: Ints = np.arange(int(count[records.STAYED]), steps)
         listed = int(count[records.LISTED_DISTANCES])
         rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, new)
+        self._take_solids(problem, state, steps - len(new), steps)
         if self.n > _FEW:
             for step in new:
                 self._step(problem, work, state, step)
@@ -541,31 +490,31 @@ class Extremes(CurveWatch):
 
         Vehicles ``gone`` (N,) were lost before the phase; those that are ``lost`` (N,) in it count up to then.
         """
+        self.of_vehicles = {}
         rotors, left = ~(vehicles.point | gone), np.flatnonzero(~gone)
         for k, kind, sign in _SAMPLED:
             self._take_first(kind, sign * state.worst[left, k], state.worst_time[left, k], left)
         load, when = (x[left, fleet.LOAD] for x in (state.worst, state.worst_time))
         self._take_first(records.THRUST_MARGIN, vehicles.limit[left] - load, when, left)
-        found: dict[str, Extremum] = {}
+        rows: dict[str, tuple[Floats, Floats]] = {}
         if rotors.any():
             peak = np.where(rotors[:, None], state.peak, -1.0)
             share = peak / vehicles.force[:, 1:]
             i, j = (int(k) for k in np.unravel_index(int(share.argmax()), share.shape))
-            found["rotor_force"] = Extremum(float(peak[i, j]), float(state.peak_time[i, j]), i, j)
-            upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
-            i = int(upright.argmin())
-            angle = math.acos(min(max(float(upright[i]), -1.0), 1.0))
-            found["tilt"] = Extremum(angle, float(state.worst_time[i, fleet.UPRIGHT]), i, -1)
-        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
-        i = int(error.argmax())
-        if error[i] > 0.0:
-            found["tracking_error"] = Extremum(
-                float(error[i]), float(state.worst_time[i, fleet.ERROR]), i, -1
+            self.of_vehicles["rotor_force"] = Extremum(
+                float(peak[i, j]), float(state.peak_time[i, j]), i, j
             )
+            upright = np.where(rotors, state.worst[:, fleet.UPRIGHT], 1.0)
+            angle = np.arccos(np.clip(upright, -1.0, 1.0))
+            rows["tilt"] = angle, state.worst_time[:, fleet.UPRIGHT]
+        error = np.where(gone, -1.0, state.worst[:, fleet.ERROR])
+        if error.max() > 0.0:
+            rows["tracking_error"] = error, state.worst_time[:, fleet.ERROR]
         share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
-        i = int(share.argmax())
-        found["saturation"] = Extremum(float(share[i]), float(state.clock[fleet.TIME]), i, -1)
-        self.of_vehicles = found
+        rows["saturation"] = share, np.full(self.n, state.clock[0])
+        for name, (values, times) in rows.items():
+            i = int(values.argmax())
+            self.of_vehicles[name] = Extremum(float(values[i]), float(times[i]), i, -1)
 
     def _avoided(self) -> dict[str, Extremum]:
         """What avoidance in flight has recorded of the phase so far, by name."""

@@ -35,11 +35,13 @@ from rigidfleet.simulation.callbacks import (
     Observation,
     RotorCommand,
 )
+from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.preparation import prepared
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
 from rigidfleet.simulation.sampling import Sampling, times_asked
-from rigidfleet.solids.records import joined
+from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -206,8 +208,8 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self._prepared = prepared(as_mission(mission))
-        self.mission = mission = self._prepared.mission
+        preparation = prepared(as_mission(mission))
+        self.mission = mission = preparation.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (("controller", controller), ("progress", progress)):
@@ -227,11 +229,11 @@ class Flight:
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
         r, v = mission.fleet.position.copy(), mission.fleet.velocity.copy()
-        self._begins = self._reached = changed(at_start(mission), r=r, v=v)
+        self._reached = changed(at_start(mission), r=r, v=v)
         self._vehicles = Vehicles(mission, self._push.max_step) if mission.vehicle_models else None
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = self._prepared.disturbance if self._vehicles is None else None
-        self._extremes = self._prepared.extremes()
+        self._disturbance = preparation.disturbance if self._vehicles is None else None
+        self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
             None  # the phase before, if its last state is not known yet
@@ -322,9 +324,8 @@ class Flight:
                 return False
             phase = self._route[self._following]
             self._following += 1
-        elif isinstance(
-            phase, Mapping
-        ):  # checked first: a phase under way goes on where it has errors
+        elif isinstance(phase, Mapping):  # no phase yet
+            # Checked first: a phase under way goes on where it has errors.
             flown = len(self.phases) - (self._active is not None and not self._active.flew)
             phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
         else:
@@ -335,14 +336,15 @@ class Flight:
         if self._asked:
             self._report(phase, planning=True)
         try:
-            plan = self._planned(phase)
+            leg = timed_leg(self.mission, phase, self._now, len(self._asked))
+            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
-            make = ActivePhase
+            stepper = PointPhase
             if self._vehicles is not None:
-                make = partial(SampledPhase, vehicles=self._vehicles)
-            self._active = make(
-                len(self.phases), plan, extremes=self._extremes, external=self.external,
+                stepper = partial(SampledPhase, vehicles=self._vehicles)
+            self._active = ActivePhase(
+                len(self.phases), plan, stepper, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip
         except MissionError as error:
@@ -491,9 +493,7 @@ class Flight:
         if self._ended is not None:  # no phase follows
             self._ended.release()
             self._ended = None
-        result = self.record(self.pieces, None if own else self._asked)
-        self._prepared.give_back(self._extremes)
-        return result
+        return self.record(self.pieces, None if own else self._asked)
 
     def record(
         self,
@@ -539,7 +539,7 @@ class Flight:
         self._extremes.among(obstacles)
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
-            solids = joined([thing.solid for thing in obstacles])
+            solids = join([thing.solid for thing in obstacles])
             vehicles.avoidance = among(vehicles.avoidance, solids)
 
     def contact(self) -> Extremum | None:
@@ -549,14 +549,6 @@ class Flight:
         return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
-
-    def _planned(self, phase: Phase) -> PhasePlan:
-        """The plan of a phase from the state now, with its times known."""
-        now, disturbance, push = self._now, self._disturbance, self._push
-        if now is self._begins and now.lost is None:
-            return self._prepared.first_plan(phase, now, disturbance, push)
-        leg = timed_leg(self.mission, phase, now, len(self._asked))
-        return plan_phase(self.mission, leg, disturbance=disturbance, external=push)
 
     @property
     def _now(self) -> PhaseState:
@@ -601,7 +593,8 @@ class Flight:
         if lost.any():
             self._extremes.lose(lost)
             self._now.lost = lost
-        self._route = [*self._asked, *after_loss(self.mission, self._now)]
+        legs = after_loss(self.mission, self._now)
+        self._route = [*self._asked, *(leg.phase for leg in legs)]
         self._following = len(self._asked)
 
     def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:
@@ -625,7 +618,7 @@ class Flight:
         record.extremes = self._extremes.phase()
         record.abandoned = abandoned
         record.controller = None if self.controller is None else active.asked > 0
-        if active.delay > 0.0:
+        if active.stepper.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.settled
         active.count()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,20 +18,18 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.reference import ByEdge
-from rigidfleet.planning.vehicles import TickTables, first_yaw, sampled_flight, turn_from
-from rigidfleet.simulation.active_phase import ActivePhase
+from rigidfleet.planning.vehicles import TickTables, Turn, first_yaw, sampled_flight, turn_from
+from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Command,
-    Controller,
     Observation,
     checked_command,
     named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
-from rigidfleet.simulation.recording import LayerSamples, Led, VehicleSamples
-from rigidfleet.simulation.solver_setup import equip
+from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
 from rigidfleet.typing import Floats
 
 #: Greatest number of ticks in a table, and of steps between two returns to Python.
@@ -61,55 +58,55 @@ class Vehicles:
         self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
 
 
-class SampledPhase(ActivePhase):
-    """A phase of vehicles with sampled control, under way.
+class SampledPhase(Stepper):
+    """A phase under way that vehicles with sampled control fly, between the ticks of their autopilots.
 
-    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, ``state.y`` holds the
-    true state, in the layout of the continuous flight.
+    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, the phase's ``state.y``
+    holds the true state, in the layout of the continuous flight.
     """
 
     by_ticks = True
 
-    def __init__(self, *arguments: Any, vehicles: Vehicles, **options: Any) -> None:
+    def __init__(self, phase: ActivePhase, vehicles: Vehicles) -> None:
+        super().__init__(phase)
+        plan = phase.plan
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
-            vehicles.avoidance = avoidance.renewed(vehicles.avoidance)
+            vehicles.avoidance = avoidance.of_next_phase(vehicles.avoidance)
         self.led = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.led_until = -math.inf  # end of what the leader has decided [s]
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
         self.leader: Leader | None = None
-        super().__init__(*arguments, **options)
-        if vehicles.layers is not None and self.plan.problem.control.kind == TRACKING:
+        if vehicles.layers is not None and plan.problem.control.kind == TRACKING:
             period = self.flight.every * self.flight.steps * self.flight.h
-            self.leader = Leader(vehicles.layers, self.plan, period)
+            self.leader = Leader(vehicles.layers, plan, period)
             self.leader.deviation.scale = vehicles.scale
-        yaw = vehicles.tables.yaw
-        self.turn = turn_from(self.plan.problem, self.plan.start, yaw, vehicles.yaw)
+        self.turn = turn_from(plan.problem, plan.start, vehicles.tables.yaw, vehicles.yaw)
 
-    def _start(self, y: Floats, t: float) -> None:
-        plan, given = self.plan, self.vehicles
+    def begin(self, y: Floats, t: float) -> None:
+        """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
+        phase, plan, given = self.phase, self.phase.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
-        self.workspace, self.solver = equip(plan)
         rtol, atol = plan.integrator.rtol, plan.tolerances
-        self.state = self.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
-        lost = self.flight.vehicles._replace(lost=self.lost.copy())
+        phase.state = phase.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
+        lost = self.flight.vehicles._replace(lost=phase.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
-        if self.parted.any():
-            parted = np.ascontiguousarray(plan.links_lost[0][self.parted])
+        if phase.parted.any():
+            parted = np.ascontiguousarray(plan.links_lost[0][phase.parted])
             sensing = self.flight.sensing._replace(parted=parted)
             self.flight = self.flight._replace(sensing=sensing)
-            self.evaluate()  # the slots by which vehicles without a link presume each other
+            phase.evaluate()  # the slots by which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], given.state
-        begun = fleet.begin(self.flight, given.S, self.workspace, frame=frame)
+        begun = fleet.begin(self.flight, given.S, phase.workspace, frame=frame)
         if before is None:
             begun.integral[:] = integral
         else:
-            renewed = fleet.renewed(before, self.workspace, integral, frame=frame)
-            if self.parted.any():  # without a link, vehicles do not come to the same integrals
+            renewed = fleet.under_problem(before, phase.workspace, integral, frame=frame)
+            if phase.parted.any():  # without a link, vehicles do not come to the same integrals
                 own = [
                     ByEdge().updated(given.edges, x).of(plan.edges, integral)
                     for x in before.integral
@@ -119,145 +116,148 @@ class SampledPhase(ActivePhase):
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
-        trail = self.state.trail
+        trail = phase.state.trail
         self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
         if given.avoidance is not None:
             given.avoidance = avoidance.holding(given.avoidance, m)
         given.edges = plan.edges
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
-            self.gone = self.lost.copy()  # (N,) vehicles that do not fly in this phase
+            self.gone = phase.lost.copy()  # (N,) vehicles that do not fly in this phase
             begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
 
     # -- flying -----------------------------------------------------------------------------------
 
-    def fly_to(self, t_end: float, controller: Controller | None, rate: float) -> None:
-        """Fly to ``t_end`` [s], or to the end of the phase, which comes later if the formation waits."""
+    def decide(self, *, by_law: bool) -> float:
+        """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
         leader, given = self.leader, self.vehicles.avoidance
-        if leader is None or given is None or controller is not None or self.steered:
-            super().fly_to(t_end, controller, rate)
-            return
-        whole = t_end >= self.plan.t_end
-        while self.t < (self.plan.t_end if whole else t_end):
-            end = leader.next_end(self.t, self.vehicles.output_step)
-            if self.t >= self.led_until:
-                self.led_until = end
-                if (problem := leader.lead(self.t, end, given)) is not None:
-                    self._follow_leader(problem)
-            end = min(self.led_until, self.plan.t_end if whole else t_end)
-            super().fly_to(end, controller, rate)
+        if leader is None or given is None or not by_law or self.steered:
+            return math.inf
+        t = self.phase.t
+        end = leader.next_end(t, self.vehicles.output_step)
+        if t >= self.led_until:
+            self.led_until = end
+            if (problem := leader.lead(t, end, given)) is not None:
+                self._renew(problem)
+                self.led = leader.leads
+        return self.led_until
 
     @property
     def delay(self) -> float:
         """Time by which the events of the phase come later than planned [s]."""
         return 0.0 if self.leader is None else self.leader.clock.delay
 
-    def _follow_leader(self, problem: Problem) -> None:
-        """Continue with a problem that the leader has made of the plan's."""
-        self._renew(problem)
-        self.led = self.leader is not None and self.leader.leads
+    @property
+    def turn_about_vertical(self) -> Turn:
+        """How vehicles turn about the vertical."""
+        return self.turn
 
-    def lead(self, problem: Problem) -> None:
-        """Continue with another problem that somebody else has made: the layers above the barriers then rest."""
+    def steer(self, problem: Problem) -> None:
+        """Take up a problem that was made by hand: the layers above the barriers then rest."""
         self.steered = True
         if self.leader is not None:
             self.leader.now = None
-        self._renew(problem)
+        self._turn_on(problem)
 
     def _renew(self, problem: Problem) -> None:
-        """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
-        yaw = self.vehicles.tables.yaw
-        if yaw.kind == "along":
-            now = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
-            self.turn = turn_from(problem, self.t, yaw, now)
-        self.led = True
-        ActivePhase.lead(self, problem)
+        """Continue with a problem that the leader has made of the plan's."""
+        self._turn_on(problem)
+        self.phase.renew(problem)
 
-    def observe(self) -> Observation:
+    def _turn_on(self, problem: Problem) -> None:
+        """Let vehicles that turn along their way do so from the yaw they have now, by another problem."""
+        tables, t = self.vehicles.tables, self.phase.t
+        if tables.yaw.kind == "along":
+            now = tables.yaw_at(self.phase.plan.problem, t, self.turn)
+            self.turn = turn_from(problem, t, tables.yaw, now)
+        self.led = True
+
+    def observed(self, observation: Observation) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
-        found, S = super().observe(), self.sampled.S
+        phase, S = self.phase, self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
             self._supply()
-            now = fleet.segment(len(S), len(self.plan.edges), self.t, max_steps=0)  # to measure
-            fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
+            now = fleet.segment(len(S), len(phase.plan.edges), phase.t, max_steps=0)  # to measure
+            fly_ticks(phase.plan.problem, phase.workspace, self.flight, self.sampled, now)
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
             # About the path of that tick, if there are any
             seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
         return replace(
-            found, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
+            observation, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
             rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
 
-    def _under(self, controller: Controller) -> Problem:
-        """The problem with what a user's controller asks for now: forces, thrust and attitude, or speeds of rotors."""
-        self.flight = self.flight._replace(commands=fleet.no_commands(len(self.lost)))
-        return super()._under(controller)
+    def drop_command(self) -> None:
+        """Drop the last command of vehicles."""
+        self.flight = self.flight._replace(commands=fleet.no_commands(len(self.phase.lost)))
 
-    def _commanded(self, given: Command) -> Problem:
+    def commanded(self, command: Command) -> Problem:
         """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
-        arrays = checked_command(given, len(self.lost), self.t)
+        t = self.phase.t
+        arrays = checked_command(command, len(self.phase.lost), t)
         if self.flight.vehicles.point.any():
             raise FlightError(
-                f"the controller returned {named(given)} at t = {self.t:.3f} s, but some agents are points;"
+                f"the controller returned {named(command)} at t = {t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
         if self.vehicles.avoidance is not None:
             raise FlightError(
-                f"the controller returned {named(given)} at t = {self.t:.3f} s, which [avoidance] cannot"
+                f"the controller returned {named(command)} at t = {t:.3f} s, which [avoidance] cannot"
                 " change; return forces [N], or remove [avoidance]"
             )
-        if isinstance(given, AttitudeCommand):
+        if isinstance(command, AttitudeCommand):
             commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
             commands = self.flight.commands._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
         self.flight = self.flight._replace(commands=commands)
-        return self.plan.problem._replace()  # not the plan's own: a loss has to keep it held
+        return self.phase.plan.problem._replace()  # not the plan's own: a loss has to keep it held
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
-        self.extremes.avoidance = self.vehicles.avoidance
+        phase = self.phase
+        phase.extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
-            self.extremes.led = self.leader.extremes(self.t)
+            phase.extremes.led = self.leader.extremes(phase.t)
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
-            within = (abs(self.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
-            self.state.count[records.TRAILED] = rows if within.all() else int(within.argmin())
-            self.extremes.take_path(self.flown, self.workspace, self.state)
-            self.sampled.count[fleet.TRAILED] = self.state.count[records.TRAILED] = 0
+            within = (abs(phase.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
+            phase.state.count[records.TRAILED] = rows if within.all() else int(within.argmin())
+            phase.extremes.take_path(self.flown, phase.workspace, phase.state)
+            self.sampled.count[fleet.TRAILED] = phase.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
             ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-            self.extremes.take_vehicles(
-                self.sampled, self.flight.vehicles, self.gone, self.lost, ticks
+            phase.extremes.take_vehicles(
+                self.sampled, self.flight.vehicles, self.gone, phase.lost, ticks
             )
             self.unjudged = False
 
-    def _segment(self, problem: Problem, t_end: float) -> None:
+    def fly(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
-        plan, sampled = self.plan, self.sampled
+        phase, plan, sampled = self.phase, self.phase.plan, self.sampled
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
-        times = self.times(t_end)
-        self.begun, given = True, self.vehicles.avoidance
+        times = phase.times(t_end)
+        phase.begun, given = True, self.vehicles.avoidance
         call = fleet.segment(n, m, t_end, times, _STEPS)
         sampled.count[fleet.SAMPLES] = 0
         status = records.PAUSED
         try:
             while status == records.PAUSED:
                 self._supply()
-                status = fly_ticks(problem, self.workspace, self.flight, sampled, call, given)
+                status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, given)
                 self._follow()
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
-                    self.state.clock[records.TIME] = t_end
-                if self.external is not None:
-                    self.external.check()
-                self.check()
+                    phase.state.clock[records.TIME] = t_end
+                if phase.external is not None:
+                    phase.external.check()
+                phase.check()
                 self.watch(last=False)
-                self.pause(self.t)
+                phase.pause(phase.t)
         finally:
             done = int(sampled.count[fleet.SAMPLES])
             finite = np.isfinite(call.S[:done]).all(axis=(1, 2)) & np.isfinite(call.dS[:done]).all(
@@ -269,22 +269,22 @@ class SampledPhase(ActivePhase):
         if not np.isfinite(sampled.S).all():
             who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
-                f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
+                f"the motion of {who} grows beyond all bounds by t = {phase.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
             )
         if given is not None and given.count[avoidance.FULL]:
             raise StoppedError(
-                f"avoidance cannot go on at t = {self.t:.2f} s: too many vehicles are near each other for their"
+                f"avoidance cannot go on at t = {phase.t:.2f} s: too many vehicles are near each other for their"
                 " speeds. Fly slower, or farther apart"
             )
         if status != records.FINISHED:
-            own = self.external is not None
-            raise StoppedError(diagnose(self.place, own_force=own, collapsed=True))
+            own = phase.external is not None
+            raise StoppedError(diagnose(phase.place, own_force=own, collapsed=True))
 
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
-        planned, given = self.plan.problem, self.vehicles.tables
+        planned, given = self.phase.plan.problem, self.vehicles.tables
         if planned is self.tabled and tables.first <= tick < tables.last:
             return
         if planned is not self.tabled and given.compensated:
@@ -293,54 +293,50 @@ class SampledPhase(ActivePhase):
             for known in (s.seen, s.history, s.sent, s.heard):
                 np.add(known, moved, out=known)
         # A piece of a reference that is led holds until the next stop
-        until = self.plan.t_end
+        until = self.phase.plan.t_end
         if self.led:
-            until = min(until, self.led_until if not self.steered else self.stop)
+            until = min(until, self.led_until if not self.steered else self.phase.stop)
         last = min(tick + _TICKS, math.ceil(until * given.rate) + 1)
         made = given.made(tick, max(last, tick + 1), planned, self.turn)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
     def _follow(self) -> None:
         """Take over the true state, and what it cost."""
-        n, m = len(self.plan.masses), len(self.plan.edges)
-        y, state, sampled = self.state.y, self.state, self.sampled
+        plan, state, sampled = self.phase.plan, self.phase.state, self.sampled
+        n, m, y = len(plan.masses), len(plan.edges), state.y
         y[: 3 * n], y[3 * n : 6 * n] = sampled.S[:, :3].ravel(), sampled.S[:, 3:6].ravel()
         y[6 * n : 6 * n + m] = sampled.integral[0]
-        if self.plan.frame is not None:
+        if plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
         state.clock[records.TIME] = sampled.clock[fleet.TIME]
         state.count[records.EVALUATIONS] = 4 * sampled.count[fleet.STEPS]
         state.count[records.ACCEPTED] = sampled.count[fleet.STEPS]
 
-    def _led(self, times: Floats) -> Led:
-        """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""
-        return tuple((*span[:3], self.turn) for span in super()._led(times))
-
-    def end(self) -> Any:
-        """End the phase; the vehicles keep their states."""
-        self.vehicles.yaw = self.vehicles.tables.yaw_at(self.plan.problem, self.t, self.turn)
+    def end(self) -> None:
+        """End the phase; the vehicles keep their states, and so the workspace, to which these may refer."""
+        self.vehicles.yaw = self.vehicles.tables.yaw_at(
+            self.phase.plan.problem, self.phase.t, self.turn
+        )
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:
             self.vehicles.scale = self.leader.deviation.scale
-        return super().end()
-
-    def release(self) -> None:
-        """Keep the workspace: the state of the next phase may refer to it."""
 
     # -- recording --------------------------------------------------------------------------------
 
     def _keep(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
-        plan = self.plan
+        plan = self.phase.plan
         S, times = call.S[:done], call.times[:done]
         parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
         frame = np.full((done, 4), np.nan)
         if plan.frame is not None:
             frame = call.frame[:done]
             parts.append(frame)
-        planned = native.record(plan.problem, self.workspace, times, np.concatenate(parts, axis=1))
+        planned = native.record(
+            plan.problem, self.phase.workspace, times, np.concatenate(parts, axis=1)
+        )
         out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
-        self.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
+        self.phase.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
     def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
         """Samples of what avoidance did."""

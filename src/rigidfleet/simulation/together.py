@@ -16,6 +16,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.flight import Flight, simulate
+from rigidfleet.simulation.point_phase import PointPhase
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.engine.batch import Vector  # imports the compiler
@@ -47,9 +48,10 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
         if not any(going):
             return [flight.finish() for flight in flights]
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
-        if all(going) and _alike(active):
+        steppers = [x.stepper for x in active if isinstance(x.stepper, PointPhase)]
+        if all(going) and len(steppers) == len(active) and _alike(active):
             vector = vector or _vector(active)
-            if not _fly(active, vector):
+            if not _fly(steppers, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
                 flight.arrive()
@@ -70,11 +72,10 @@ def _alike(active: Sequence[ActivePhase]) -> bool:
 
 
 def _plain(phase: ActivePhase) -> bool:
-    """Whether a phase is one of points, of a given duration, without losses and calls of users' functions."""
+    """Whether a phase has a given duration, without losses and calls of users' functions."""
     plan = phase.plan
     return (
-        type(phase) is ActivePhase
-        and plan.phase.settle is None
+        plan.phase.settle is None
         and phase.solver is None
         and phase.external is None
         and not plan.loses
@@ -96,13 +97,14 @@ def _vector(active: Sequence[ActivePhase]) -> Vector:
     return batch.Vector(_filled([phase.plan.problem.disturbance for phase in active]))
 
 
-def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
+def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
     """Fly phases to their end in common steps and record them; return whether they came there."""
     from rigidfleet.kernel.engine.tracer import UnfitError
 
+    active = [stepper.phase for stepper in steppers]
     t_end = active[0].plan.t_end
     times = active[0].times(t_end)
-    stretches = [phase.prepare(phase.plan.problem, times) for phase in active]
+    stretches = [stepper.prepare(stepper.phase.plan.problem, times) for stepper in steppers]
     try:
         vector.begin(
             _filled([stretch.problem for stretch in stretches]),
@@ -120,10 +122,10 @@ def _fly(active: Sequence[ActivePhase], vector: Vector) -> bool:
         if status == records.PAUSED:
             for phase in active:
                 phase.watch(last=False)
-            if active[0].stalled():
+            if steppers[0].stalled():
                 return False
-    for phase, stretch in zip(active, stretches, strict=True):
-        phase.record(stretch)
+    for stepper, stretch in zip(steppers, stretches, strict=True):
+        stepper.record(stretch)
     return status == records.FINISHED
 
 

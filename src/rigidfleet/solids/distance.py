@@ -46,9 +46,9 @@ def zero(x: Numbers) -> Any:
 @lru_cache(4)
 def _zeros(shape: tuple[int, ...]) -> Floats:
     """Zeros that nobody writes to."""
-    found = np.zeros(shape)
-    found.flags.writeable = False
-    return found
+    zeros = np.zeros(shape)
+    zeros.flags.writeable = False
+    return zeros
 
 
 #: Greatest number of zeros: more would not stay in the processor's cache.
@@ -215,7 +215,7 @@ def below(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
 def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Whether the point is inside a solid of triangles: a convex hull or a height map."""
     size = s.size[b]
-    found = (
+    inside = (
         (x >= size[0])
         & (x <= size[3])
         & (y >= size[1])
@@ -223,11 +223,11 @@ def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         & (z >= size[2])
         & (z <= size[5])
     )
-    if not some(found):
-        return found
+    if not some(inside):
+        return inside
     if s.kind[b] == HEIGHTS:
         _, _, height = below(x, y, b, s)
-        return found & (z <= height)
+        return inside & (z <= height)
     for m in range(s.first[b, 1], s.last[b, 1]):
         t = s.triangles[m]
         e, f, g = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
@@ -237,8 +237,8 @@ def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
             + (y - t[0, 1]) * (g * p - e * r)
             + (z - t[0, 2]) * (e * q - f * p)
         )
-        found = found & (out <= 0.0)
-    return found
+        inside = inside & (out <= 0.0)
+    return inside
 
 
 # -- any solid -----------------------------------------------------------------------------------------
@@ -248,10 +248,10 @@ def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Numbe
     """Signed distance [m] from solid b of a record s; negative inside."""
     kind = s.kind[b]
     if kind == ROUNDED:
-        found = from_box(x, y, z, s.size[b])
+        near = from_box(x, y, z, s.size[b])
         if s.rounding[b] > 0.0:
-            found = found - s.rounding[b]
-        return found
+            near = near - s.rounding[b]
+        return near
     if kind == CYLINDER:
         return from_cylinder(x, y, z, s.size[b])
     _, _, _, squared = off_surface(x, y, z, b, s)

@@ -27,20 +27,20 @@ def outline(solid: Solids) -> Outline:
     """The surface of a finite solid, alone in its record, without its motion; world axes."""
     size, kind = solid.size[0], solid.kind[0]
     if kind == HEIGHTS:
-        found = _terrain(solid)
+        own = _terrain(solid)
     elif kind == HULL:
-        found = Outline(solid.triangles, _creases(solid.triangles))
+        own = Outline(solid.triangles, _creases(solid.triangles))
     elif kind == CYLINDER:
-        found = _turned(
+        own = _revolve(
             np.array([[0, -size[1]], [size[0], -size[1]], [size[0], size[1]], [0, size[1]]])
         )
     elif solid.rounding[0] > 0.0:
         angle = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
-        found = _turned(solid.rounding[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        own = _revolve(solid.rounding[0] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     else:
-        found = _box(size)
+        own = _box(size)
     T, o = solid.turn[0], solid.origin[0]
-    return Outline(found.triangles @ T + o, found.lines @ T + o)
+    return Outline(own.triangles @ T + o, own.lines @ T + o)
 
 
 def places(solid: Solids, times: Floats) -> Floats:
@@ -56,7 +56,7 @@ def _box(size: Floats) -> Outline:
     return Outline(triangles, corner[edges])
 
 
-def _turned(profile: Floats) -> Outline:
+def _revolve(profile: Floats) -> Outline:
     """Surface of revolution about z of a profile (P, 2) of radii and heights, from below to above."""
     angle = np.linspace(0.0, 2 * np.pi, _SIDES + 1)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -116,12 +116,12 @@ def hull(points: ArrayLike) -> Form:
     origin = points.mean(axis=0)
     about = points - origin
     try:
-        found = ConvexHull(about)
+        convex = ConvexHull(about)
     except QhullError as error:
         raise ValueError("the points lie in a plane") from error
-    corners = about[found.simplices]  # (T, 3, 3), the order of corners as Qhull happens to give it
+    corners = about[convex.simplices]  # (T, 3, 3), the order of corners as Qhull happens to give it
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    inwards = np.einsum("ta,ta->t", normal, found.equations[:, :3]) < 0
+    inwards = np.einsum("ta,ta->t", normal, convex.equations[:, :3]) < 0
     corners[inwards] = corners[inwards][:, [0, 2, 1]]
     low, high = about.min(axis=0), about.max(axis=0)
     return Form(HULL, origin, _UPRIGHT, [*low, *high], triangles=corners)
@@ -182,7 +182,7 @@ def single(
     )  # fmt: skip
 
 
-def joined(parts: Sequence[Solids]) -> Solids:
+def join(parts: Sequence[Solids]) -> Solids:
     """All solids of several records in one."""
     if not parts:
         return single(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))

@@ -23,7 +23,7 @@ from rigidfleet._common.renamed import successor
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
-from rigidfleet.mission.findings import FindingCollector, Keys, Shared, unknown_key
+from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown_key
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part
@@ -239,9 +239,9 @@ class Sweep:
     def random(self) -> bool:
         """Whether the first run has random numbers: of noise, gusts, links or sensing."""
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
-        return any(keypaths.look_up(self.varied(0), keys) for keys in tables)
+        return any(look_up(self.varied(0), keys) for keys in tables)
 
-    @cached_property
+    @property
     def document(self) -> dict[str, Any]:
         """The mission as plain data, as written."""
         return self.mission.to_dict()
@@ -282,19 +282,19 @@ class Sweep:
         return found[::-1]
 
     def varied(self, run: int, values: Sequence[Any] | None = None) -> dict[str, Any]:
-        """The mission of a run as plain data, not yet checked; what does not vary is shared with `document`.
+        """The mission of a run as plain data, not yet checked.
 
         ``values`` are those of the run, if they are known.
         """
         varied = {column.keys for column in self.columns}
-        document = _copied(self.document, [*varied, *((*keys, "") for keys in _SEEDED)])
+        document = self.mission.to_dict()
         for column, value in zip(self.columns, values or self.values(run), strict=True):
             apply(document, self.whole, column, value)
         if self.header.random_numbers == "own":
             stream = np.random.SeedSequence(self.seed, spawn_key=(run, 1))
             seed = int(stream.generate_state(1)[0] >> 1)
             for keys in _SEEDED:
-                table = keypaths.look_up(document, keys)
+                table = look_up(document, keys)
                 if table is not None and (*keys, "seed") not in varied:
                     table["seed"] = seed
         return document
@@ -307,11 +307,7 @@ class Sweep:
         MissionError
             It has errors.
         """
-        return Mission.from_plain(self.varied(run, values), f"run {run}", self._shared)
-
-    @cached_property
-    def _shared(self) -> Shared:
-        return Shared(self.document)
+        return Mission.from_plain(self.varied(run, values), f"run {run}")
 
     def _data(self) -> dict[str, Any]:
         return {
@@ -322,20 +318,6 @@ class Sweep:
             "seed": self.seed,
             "evaluate": self.evaluate,
         } | self.header.model_dump(include=_LATER, exclude_defaults=True)
-
-
-def _copied(x: Any, places: Sequence[Keys]) -> Any:
-    """A copy of plain data in which the tables and lists on the way to some places are copied, and others shared."""
-    if not isinstance(x, dict | list):
-        return x
-    new: Any = x.copy()
-    below: dict[Any, list[Keys]] = {}
-    for first, *rest in filter(None, places):
-        below.setdefault(first, []).append(tuple(rest))
-    for key, further in below.items():
-        if (there := keypaths.look_up(x, (key,))) is not None:
-            new[key] = _copied(there, further)
-    return new
 
 
 def _axis(column: SweepColumn, k: int) -> str | int:
@@ -361,7 +343,7 @@ def apply(
     document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
 ) -> None:
     """Apply a value of a column to a document; all numbers at its place change alike."""
-    there = keypaths.numbers(keypaths.look_up(whole, column.keys))
+    there = keypaths.numbers(look_up(whole, column.keys))
     integral = all(isinstance(x, int) for x in there)
 
     def changed(there: Any) -> Any:
@@ -474,7 +456,7 @@ def _fits(
         if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
             collector.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
     for keys in places:
-        leaves = keypaths.numbers(keypaths.look_up(whole, keys))
+        leaves = keypaths.numbers(look_up(whole, keys))
         absent = any(x is None for x in leaves)
         table = next((x for x in leaves if isinstance(x, dict)), None)
         words = [x for x in leaves if not is_number(x)]
@@ -522,7 +504,7 @@ def _taken(
         value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
         apply(document, whole, column, value)
     try:
-        Mission.from_dict(document)
+        Mission.from_plain(document, "<dict>")
     except MissionError as error:
         for finding in error.findings:
             names = [[c.name, finding.key.replace("[", ".")] for _, c in lacked]

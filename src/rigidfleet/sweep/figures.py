@@ -327,7 +327,7 @@ def _axis_label(table: Table, name: str) -> str:
 def _limits(table: Table) -> dict[str, float]:
     """Limits of the mission for metrics, unless they vary."""
     moved = {key for column in table.sweep.columns for key in column.keys[:2]}
-    limits = {q.name: q.limit_of(table.sweep.mission) for q in QUANTITIES.values() if q.metric}
+    limits = {q.name: q.limit_of(table.sweep.mission) for q in QUANTITIES.values() if q.checked}
     return {
         name: float(np.min(limit)) / (100.0 if QUANTITIES[name].unit == "%" else 1.0)
         for name, limit in limits.items()

@@ -102,7 +102,7 @@ def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[in
     found = {}
     for k in np.flatnonzero(~(bounded & apart)):
         try:
-            Mission.from_dict(sweep.varied(runs[k]))
+            sweep.mission_of(runs[k])
         except MissionError as error:
             found[int(k)] = refusal(error)
     return found

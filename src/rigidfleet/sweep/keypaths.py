@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 from rigidfleet._common.toml import toml_key
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission import Mission
-from rigidfleet.mission.findings import Keys, model_of
+from rigidfleet.mission.findings import Keys, look_up, model_of
 from rigidfleet.mission.values import Part, PerAgent, PerAgentError, PerAxis
 
 #: Stands for any index or name.
@@ -70,16 +70,6 @@ def whole_document(mission: Mission) -> dict[str, Any]:
     """A mission as plain data with all defaults; None for optional keys without a value."""
     whole: dict[str, Any] = _filled(mission, mission.n_agents)
     return whole
-
-
-def look_up(data: Any, keys: Keys) -> Any:
-    """Value at a place; None if there is none."""
-    for k in keys:
-        try:
-            data = data[k]
-        except (KeyError, IndexError, TypeError):
-            return None
-    return data
 
 
 def change(

@@ -58,7 +58,7 @@ METRICS: dict[str, Metric] = {
     **{
         q.name: Metric(_NOTATION.get(q.unit, q.unit), q.text)
         for q in QUANTITIES.values()
-        if q.metric
+        if q.checked
     },
     "rotor_share": Metric(
         "1", "rotor force closest to its limit, as a share of it; only of vehicles with rotors"
@@ -94,8 +94,9 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
         found[f"waypoint_{name}"] = _greatest(misses)
-    worst = {f.check: f.worst for f in verdict.checks if f.worst is not None}
-    if (rotor := next((f for f in verdict.checks if f.check == "rotor_force"), None)) is not None:
+    checks = verdict.by_name
+    worst = {name: f.worst for name, f in checks.items() if f.worst is not None}
+    if (rotor := checks.get("rotor_force")) is not None:
         worst["rotor_share"] = (rotor.worst or 0.0) / (rotor.limit or math.inf)
     if "saturation" in worst:
         worst["saturation"] /= 100.0

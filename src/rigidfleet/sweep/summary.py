@@ -8,21 +8,17 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from statistics import NormalDist
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
 from rigidfleet._common.plain import plain
+from rigidfleet.sweep import store
 from rigidfleet.sweep.metrics import METRICS, readable
 from rigidfleet.sweep.record import called
-from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.variation import is_number
 from rigidfleet.typing import Bools, Floats, Ints
-
-if TYPE_CHECKING:
-    from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
-    from rich.table import Table as Grid
-
 
 #: Percentiles of metrics.
 PERCENTILES = (0, 5, 25, 50, 75, 95, 100)
@@ -47,6 +43,11 @@ class Rate:
     rate: float
     low: float
     high: float
+
+    @property
+    def interval(self) -> str:
+        """The interval in words."""
+        return f"{100 * self.low:.3g} to {100 * self.high:.3g} %"
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Driver:
 
 
 @dataclass(frozen=True)
-class Summary:
+class Summary(Shown):
     """Summary of a sweep.
 
     Attributes
@@ -117,11 +118,53 @@ class Summary:
         """The summary as JSON text."""
         return json.dumps(self.to_dict(), ensure_ascii=False, allow_nan=False, indent=2)
 
-    def __rich__(self) -> RenderableType:
-        return _rendered(self)
+    def facts(self) -> Sheet:
+        """Percentiles, reasons of failure, rank correlations, and the rate of success."""
+        s, n = self.success, len(self.drivers)
+        strong = [d for d in self.drivers if d.adjusted < _CHANCE]
+        parts = [self._percentiles(), self._reasons(), self._correlations(strong)]
+        if n:
+            words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
+            parts.append(Line(words))
+        if self.random_numbers != "none":
+            words = {"shared": "the same in all runs", "own": "of each run its own"}
+            numbers = words.get(self.random_numbers, "by varied seeds")
+            parts.append(Line(f"Random numbers: {numbers}."))
+        for name, rates in self.by_value.items():
+            rows = [Row((word, f"{100 * r.rate:.3g} %", r.interval)) for word, r in rates.items()]
+            parts.append(Table((name, "passed", "95 % interval"), rows))
+        if s.of:
+            words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} % (95 % interval {s.interval})."
+            parts.append(Line(words, "ok" if s.count == s.of else "note"))
+        return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
+
+    def _percentiles(self) -> Table:
+        rows = [
+            Row((name, readable(METRICS[name].unit), *values))
+            for name, values in self.percentiles.items()
+        ]
+        return Table(
+            ("metric", "unit", "min", "5 %", "25 %", "median", "75 %", "95 %", "max"), rows
+        )
+
+    def _reasons(self) -> Table:
+        rows = []
+        for reason, count in self.reasons.items():
+            example = self.examples[reason]
+            words = f"run {example.run}{': ' if example.detail else ''}{example.detail}"
+            rows.append(
+                Row((called(reason), count, f"{100 * count / self.success.of:.3g} %", words))
+            )
+        return Table(("failed check", "runs", "of all", "for example"), rows, ("for example",))
+
+    def _correlations(self, strong: Sequence[Driver]) -> Table:
+        """The strongest, those with success first."""
+        first = sorted(strong, key=lambda d: d.outcome != "success")[:_SHOWN]
+        rows = [Row((d.varied, d.outcome, f"{d.correlation:+.2f}")) for d in first]
+        return Table(("varied number", "outcome", "rank correlation"), rows, ("outcome",))
 
 
-def summarise(table: Table) -> Summary:
+def summarise(table: store.Table) -> Summary:
     """Summarise the finished runs of a sweep."""
     percentiles = {}
     for name, values in table.metrics.items():
@@ -152,13 +195,13 @@ def summarise(table: Table) -> Summary:
     )
 
 
-def failures(table: Table) -> dict[str, int]:
+def failures(table: store.Table) -> dict[str, int]:
     """Number of runs that failed each check, most frequent first."""
     failed = [reason for reasons in table.reason for reason in reasons.split(", ") if reason]
     return dict(Counter(failed).most_common())
 
 
-def _examples(table: Table) -> dict[str, Example]:
+def _examples(table: store.Table) -> dict[str, Example]:
     """An example of each reason, preferably a run that fails it first: messages are about the first check."""
     told: dict[str, Example] = {}
     others: dict[str, Example] = {}
@@ -188,7 +231,7 @@ def interval(k: Ints, n: Ints) -> tuple[Floats, Floats]:
     return np.where(k == 0, 0.0, middle - half), np.where(k == n, 1.0, middle + half)
 
 
-def outcomes(table: Table) -> dict[str, Floats]:
+def outcomes(table: store.Table) -> dict[str, Floats]:
     """Outcomes of runs: success and every metric, if they differ between runs."""
     found = {"success": table.passed.astype(float)} | table.metrics
     return {
@@ -198,7 +241,7 @@ def outcomes(table: Table) -> dict[str, Floats]:
     }
 
 
-def varied(table: Table) -> dict[str, Floats]:
+def varied(table: store.Table) -> dict[str, Floats]:
     """Varied numbers by path, without seeds, which have no order, and variations that are not numeric."""
     worded = _worded(table)
     return {
@@ -208,7 +251,7 @@ def varied(table: Table) -> dict[str, Floats]:
     }
 
 
-def drivers(table: Table) -> list[Driver]:
+def drivers(table: store.Table) -> list[Driver]:
     """Rank correlation of every varied number with every outcome, strongest first."""
     found: list[tuple[str, str, float, float]] = []
     numbers = varied(table)
@@ -258,7 +301,7 @@ def _correlated(x: Floats, y: Floats) -> tuple[float, float]:
     return r, max(float(2.0 * stdtr(free, -t)), least)
 
 
-def _worded(table: Table) -> set[str]:
+def _worded(table: store.Table) -> set[str]:
     return {
         column.name
         for column in table.sweep.columns
@@ -270,100 +313,3 @@ def _differs(values: Floats, relative: float = 0.0, absolute: float = 0.0) -> bo
     finite = values[np.isfinite(values)]
     least = max(absolute, relative * np.abs(finite).max(initial=0.0))
     return len(finite) > 1 and bool(np.ptp(finite) > least)
-
-
-# -- printed ----------------------------------------------------------------------------------------
-
-
-#: Headings of percentiles.
-_HEADS = dict(
-    zip(PERCENTILES, ("min", "5 %", "25 %", "median", "75 %", "95 %", "max"), strict=True)
-)
-#: Width at which no table is wrapped [characters].
-_UNBOUND = 1000
-#: Space between columns and percentiles to show, from a wide terminal to a narrow one.
-_CHOICES = (1, PERCENTILES), (0, PERCENTILES), (1, (0, 25, 50, 75, 100)), (1, (0, 50, 100))
-
-
-def _short(x: float) -> str:
-    """A number with three digits, or two digits and a power of ten, in at most six characters and a sign."""
-    size = abs(x)
-    if size >= 99_999.5 or 0.0 < size < 0.01:
-        digits, power = f"{x:.1e}".split("e")
-        return f"{digits}e{int(power)}"
-    return f"{x:.0f}" if size >= 999.5 else f"{x:.3g}"
-
-
-def grid(*columns: str, words: Sequence[str] = (), space: int = 1) -> Grid:
-    """An empty table. If it is too wide, its first column and the columns in ``words`` are wrapped, never numbers."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table as Grid
-
-    table = Grid(box=SIMPLE_HEAD, pad_edge=False, padding=(0, space, 0, 0), header_style="bold")
-    for k, column in enumerate(columns):
-        wraps = k == 0 or column in words
-        table.add_column(
-            column, justify="left" if wraps else "right", no_wrap=not wraps, overflow="fold"
-        )
-    return table
-
-
-class _Percentiles:
-    """Table of metrics with as many percentiles as fit on the terminal."""
-
-    def __init__(self, summary: Summary) -> None:
-        self.summary = summary
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        unbound = options.update_width(_UNBOUND)
-        for space, shown in _CHOICES:
-            table = grid("metric", "unit", *(_HEADS[p] for p in shown), space=space)
-            for name, values in self.summary.percentiles.items():
-                cells = (_short(x) for p, x in zip(PERCENTILES, values, strict=True) if p in shown)
-                table.add_row(name, readable(METRICS[name].unit), *cells)
-            if console.measure(table, options=unbound).maximum <= options.max_width:
-                break
-        yield table
-
-
-def _rendered(summary: Summary) -> RenderableType:
-    from rich.console import Group
-    from rich.text import Text
-
-    s = summary.success
-    head = Text.assemble((summary.name, "bold"), f"  {summary.flown} of {summary.runs} runs")
-    shown: list[RenderableType] = [head, _Percentiles(summary)]
-    if summary.reasons:
-        reasons = grid("failed check", "runs", "of all", "for example", words=("for example",))
-        for reason, count in summary.reasons.items():
-            example = summary.examples[reason]
-            words = Text(f"run {example.run}{': ' if example.detail else ''}{example.detail}")
-            reasons.add_row(called(reason), str(count), f"{100 * count / s.of:.3g} %", words)
-        shown.append(reasons)
-    strong = [d for d in summary.drivers if d.adjusted < _CHANCE]
-    failing = [d for d in strong if d.outcome == "success"]
-    if strong:
-        rank = grid("varied number", "outcome", "rank correlation")
-        for d in (failing + [d for d in strong if d not in failing])[:_SHOWN]:
-            rank.add_row(d.varied, d.outcome, f"{d.correlation:+.2f}")
-        shown.append(rank)
-    if n := len(summary.drivers):
-        words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
-        shown.append(Text(words))
-    if summary.random_numbers != "none":
-        words = {"shared": "the same in all runs", "own": "of each run its own"}
-        shown.append(
-            Text(f"Random numbers: {words.get(summary.random_numbers, 'by varied seeds')}.")
-        )
-    for name, rates in summary.by_value.items():
-        values = grid(name, "passed", "95 % interval")
-        for word, r in rates.items():
-            values.add_row(
-                word, f"{100 * r.rate:.3g} %", f"{100 * r.low:.3g} to {100 * r.high:.3g} %"
-            )
-        shown.append(values)
-    if s.of:
-        words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} %"
-        words += f" (95 % interval {100 * s.low:.3g} to {100 * s.high:.3g} %)."
-        shown.append(Text(words, "bold green" if s.count == s.of else "bold"))
-    return Group(*shown)

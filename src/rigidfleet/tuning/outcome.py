@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from rigidfleet._common import markup
+from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
 from rigidfleet._common.plain import plain
 from rigidfleet.math.margins import Margins
 from rigidfleet.sweep.record import called
-from rigidfleet.sweep.summary import grid
 from rigidfleet.tuning.gains import Gains
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 _WORDS = {
     "shape_tracked": "largest shape error with slots",
@@ -61,7 +58,7 @@ class Flown:
 
 
 @dataclass
-class Tuned:
+class Tuned(Shown):
     """Result of a study; print it to see both sides.
 
     Attributes
@@ -122,7 +119,7 @@ class Tuned:
 
     def to_dict(self) -> dict[str, Any]:
         """The result as plain data; quantities that are not finite are None."""
-        before, after = ({k: _margins(m) for k, m in side.items()} for side in self.margins)
+        before, after = ({k: m.data() for k, m in side.items()} for side in self.margins)
         seen = self.validation
         data = {
             "result": {
@@ -139,25 +136,19 @@ class Tuned:
         return plain(data)
 
     def __str__(self) -> str:
-        rows = [("", "before", "after", "change"), *self.rows()]
-        wide = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        lines = (
-            f"{what:{wide[0]}}  "
-            + "  ".join(f"{x:>{w}}" for x, w in zip(row, wide[1:], strict=True))
-            for what, *row in rows
-        )
-        return "\n".join([*(line.rstrip() for line in lines), self.conclusion])
+        from rich.console import Console
 
-    def _repr_html_(self) -> str:
-        """Show both sides in a notebook."""
-        heads = ("", "before", "after", "change")
-        return markup.shown(self.mission, "tuned", heads, self.rows(), self.conclusion)
+        console = Console(width=200, file=io.StringIO())
+        with console.capture() as capture:
+            console.print(self)
+        return "\n".join(line.rstrip() for line in capture.get().splitlines())
 
-    def __rich__(self) -> RenderableType:
-        table = grid("", "before", "after", "change")
-        for row in self.rows():
-            table.add_row(*row)
-        return table
+    def facts(self) -> Sheet:
+        """Gains, errors and margins on both sides, and the conclusion."""
+        table = Table(("", "before", "after", "change"), [*map(Row, self.rows())])
+        flights = f"{self.flights} flights of {self.candidates} choice{'s' * (self.candidates != 1)} of gains"
+        title = f"{flights}; {self.refused} refused for their margins"
+        return Sheet(self.mission, title, [table, Line(self.conclusion)])
 
     def rows(self) -> list[tuple[str, str, str, str]]:
         """Rows of the table: what, before, after, change."""
@@ -197,9 +188,3 @@ _MARGINS = {
     "delay margin [ms]": lambda m: f"{1e3 * m.delay:.0f}" if m.stable else "unstable",
     "gains times": lambda m: f"{m.gain[0]:.2g} to {m.gain[1]:.3g}" if m.stable else "unstable",
 }
-
-
-def _margins(m: Margins) -> dict[str, Any]:
-    return {
-        "stable": m.stable, "phase_deg": math.degrees(m.phase), "delay_s": m.delay, "gain": list(m.gain)
-    }  # fmt: skip

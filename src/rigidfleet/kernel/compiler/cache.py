@@ -27,7 +27,7 @@ _OWNERS = hasattr(os, "geteuid")
 _LINKS = 40
 _ACL = "system.posix_acl_access"
 #: Whether this process or its parent has warned already.
-told = threading.Event()
+warned = threading.Event()
 
 
 def cache_directory() -> Path:
@@ -40,10 +40,10 @@ def cache_directory() -> Path:
     OSError
         The folder cannot be created, or others could write into it; ``strerror`` says where, and what to do.
     """
-    return _private(_named())
+    return _private(_environment_folder())
 
 
-def _named() -> Path:
+def _environment_folder() -> Path:
     """The folder named by the environment."""
     base = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     return Path(os.path.expanduser(base), "rigidfleet", f"kernel-{_digest()}")
@@ -60,7 +60,7 @@ def _digest() -> str:
 
 
 @contextmanager
-def opened(file: str | Path) -> Generator[IO[bytes]]:
+def open_safely(file: str | Path) -> Generator[IO[bytes]]:
     """Open a file of the cache for reading: exactly the file that was checked, even if its name is changed meanwhile.
 
     Raises
@@ -74,20 +74,21 @@ def opened(file: str | Path) -> Generator[IO[bytes]]:
         return os.open(path, flags | more)
 
     with open(file, "rb", opener=descriptor) as stream:
-        found = os.fstat(stream.fileno())
-        if not stat.S_ISREG(found.st_mode):
+        state = os.fstat(stream.fileno())
+        if not stat.S_ISREG(state.st_mode):
             raise PermissionError(errno.EACCES, f"{file} is not a file")
-        _refuse(file, found)
+        _refuse(file, state)
         yield stream
 
 
 def not_kept(error: OSError) -> None:
     """Warn once that compiled code cannot be cached, whatever the function and reason."""
-    if not told.is_set():
-        told.set()
+    if not warned.is_set():
+        warned.set()
         warnings.warn(
-            f"the compiled flight kernel cannot be cached in {_named()}: {error.strerror or error}. Every process"
-            " compiles it again, which takes about 20 s. Set NUMBA_CACHE_DIR to a folder that only you can write",
+            f"the compiled flight kernel cannot be cached in {_environment_folder()}: {error.strerror or error}. Every"
+            " process compiles it again, which takes about 20 s. Set NUMBA_CACHE_DIR to a folder that only you can"
+            " write",
             RuntimeWarning,
             stacklevel=3,
         )
@@ -125,20 +126,20 @@ def _private(folder: Path) -> Path:
             continue
         there = at / step
         try:
-            found = os.lstat(there)
+            state = os.lstat(there)
         except FileNotFoundError:
             with suppress(FileExistsError):  # made by another process at this moment
                 os.mkdir(there, 0o700)
-            found = os.lstat(there)
-        if not (_own(found) or (found.st_uid == _unnamed() and not shared)):
+            state = os.lstat(there)
+        if not (_own(state) or (state.st_uid == _overflow_user() and not shared)):
             raise _foreign(there)
-        if stat.S_ISLNK(found.st_mode):
+        if stat.S_ISLNK(state.st_mode):
             if (links := links + 1) > _LINKS:
                 raise OSError(errno.ELOOP, f"{there} is a circular link")
             target = Path(os.readlink(there))
             at = Path("/") if target.is_absolute() else at
             rest += reversed(target.parts[target.is_absolute() :])
-        elif stat.S_ISDIR(found.st_mode):
+        elif stat.S_ISDIR(state.st_mode):
             at = there
         else:
             raise NotADirectoryError(errno.ENOTDIR, f"{there} is not a folder")
@@ -146,16 +147,16 @@ def _private(folder: Path) -> Path:
     return at
 
 
-def _refuse(path: str | Path, found: os.stat_result) -> None:
+def _refuse(path: str | Path, state: os.stat_result) -> None:
     """Refuse a file, or the last folder, if others have written it or can write it.
 
     Raises
     ------
     PermissionError
     """
-    if not _own(found):
+    if not _own(state):
         raise _foreign(path)
-    if _others_write(path, found):
+    if _others_write(path, state):
         raise _open_to_others(path)
 
 
@@ -168,13 +169,13 @@ def _open_to_others(path: str | Path) -> OSError:
     return PermissionError(errno.EACCES, f"others can write to {path}; forbid it with {remedy}")
 
 
-def _own(found: os.stat_result) -> bool:
+def _own(state: os.stat_result) -> bool:
     """Whether something belongs to this user or to root."""
-    return not _OWNERS or found.st_uid in (0, os.geteuid())
+    return not _OWNERS or state.st_uid in (0, os.geteuid())
 
 
 @cache
-def _unnamed() -> int | None:
+def _overflow_user() -> int | None:
     """The user id that stands for all users without an id here, including the machine's root; None if all have one.
 
     This happens in containers of ordinary users, such as Apptainer's. On the path to the last folder, items of such an
@@ -188,14 +189,14 @@ def _unnamed() -> int | None:
     return None if (int(first), int(count)) == (0, 2**32 - 1) else nobody
 
 
-def _others_write(path: str | Path, found: os.stat_result) -> bool:
+def _others_write(path: str | Path, state: os.stat_result) -> bool:
     """Whether others can write an item, even if only members of a group."""
-    mode = found.st_mode
-    group = mode & stat.S_IWGRP and not _own_group(path, found)
+    mode = state.st_mode
+    group = mode & stat.S_IWGRP and not _own_group(path, state)
     return _OWNERS and bool(mode & stat.S_IWOTH or group)
 
 
-def _own_group(path: str | Path, found: os.stat_result) -> bool:
+def _own_group(path: str | Path, state: os.stat_result) -> bool:
     """Whether the owner of a file is the only member of its group.
 
     On systems that give each user a group of the same name, a user's files may be writable for that group.
@@ -209,7 +210,7 @@ def _own_group(path: str | Path, found: os.stat_result) -> bool:
         ):  # with an access list, the group's rights are the upper limit for everyone on it
             return False
     try:
-        owner, group = pwd.getpwuid(found.st_uid), grp.getgrgid(found.st_gid)
+        owner, group = pwd.getpwuid(state.st_uid), grp.getgrgid(state.st_gid)
     except KeyError:
         return False
     same = owner.pw_gid == group.gr_gid and owner.pw_name == group.gr_name

@@ -35,7 +35,7 @@ def store(_context, address, word):
 
 
 @compiled
-def gather(objects, count, asked, words):
+def gather(objects, count, expected, words):
     """Write the data addresses and shapes of ``count`` arrays to ``words``; return how many are not as asked.
 
     All arguments are addresses: of the arrays' own addresses, and of three words for each: its first word in ``words``,
@@ -44,11 +44,11 @@ def gather(objects, count, asked, words):
     wrong = 0
     for k in range(count):
         x = load(objects + 8 * k)
-        first = load(asked + 24 * k)
-        dimensions = load(asked + 24 * k + 8)
+        first = load(expected + 24 * k)
+        dimensions = load(expected + 24 * k + 8)
         if (
             (load(x + _DIMENSIONS) & _HALF) != dimensions
-            or load(x + _NUMBERS) != load(asked + 24 * k + 16)
+            or load(x + _NUMBERS) != load(expected + 24 * k + 16)
             or (load(x + _FLAGS) & _CONTIGUOUS) == 0
         ):
             wrong += 1

@@ -22,7 +22,7 @@ from numba.core.caching import (
 from numba.core.ccallback import CFunc
 
 from rigidfleet._common.files import replacing
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, open_safely
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -43,7 +43,7 @@ _CACHED = OPTIONS | {"no_cfunc_wrapper": True}
 
 def compiled(function: F) -> F:
     """Compile for the flight: cached on disk, without the GIL, without allocation."""
-    return _cached(function, _CACHED)
+    return _with_cache(function, _CACHED)
 
 
 def inlined(function: F) -> F:
@@ -51,17 +51,17 @@ def inlined(function: F) -> F:
 
     Where it is not inlined, the linker takes the copy that was loaded first, and copies sum in different orders.
     """
-    return _cached(function, _CACHED | {"forceinline": _OPTIMISES})
+    return _with_cache(function, _CACHED | {"forceinline": _OPTIMISES})
 
 
 def exact(function: F) -> F:
     """Compile with sums as they are written, neither reordered nor fused: the same bits as NumPy's."""
-    return _cached(function, _CACHED | {"fastmath": False})
+    return _with_cache(function, _CACHED | {"fastmath": False})
 
 
 def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
     """Compile the source of a compiled function again, with other functions in place of some that it calls."""
-    return _cached(_copy(function.py_func, name, instead), _CACHED)
+    return _with_cache(_copy(function.py_func, name, instead), _CACHED)
 
 
 def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) -> int:
@@ -119,13 +119,13 @@ class _Files(IndexDataCacheFile):
 
     def _load_index(self) -> Any:
         try:
-            with opened(self._index_path):
+            with open_safely(self._index_path):
                 return super()._load_index()
         except OSError:
             return {}
 
     def _load_data(self, name: str) -> Any:
-        with opened(self._data_path(name)):
+        with open_safely(self._data_path(name)):
             return super()._load_data(name)
 
     def _open_for_write(self, filepath: str) -> Any:
@@ -166,7 +166,7 @@ def _cache(function: Any) -> _Cache | _NoCache:
         return _NoCache(error)
 
 
-def _cached(function: F, options: dict[str, Any]) -> F:
+def _with_cache(function: F, options: dict[str, Any]) -> F:
     dispatcher = numba.njit(**options)(function)
     if _OPTIMISES:
         dispatcher._cache = _cache(function)

@@ -7,8 +7,8 @@ lanes takes eight), an array the words of its data address and shape, a nested t
 field loads its words. They never change while compiled code runs, and the compiler knows this.
 
 Extents of arrays that the tuple's type declares (`rigidfleet.kernel.problem.Extents`) are not loaded. An extent with a
-name passes through a function that returns what it is given; `sized` replaces this function, and makes code for a size
-of the same translation, if `keep_extents` was called before it.
+name passes through a function that returns what it is given; `with_sizes` replaces this function, and makes code for a
+size of the same translation, if `keep_extents` was called before it.
 """
 
 import hashlib
@@ -83,24 +83,24 @@ class _Attribute(AttributeTemplate):
     key = Pointer
 
     def generic_resolve(self, kind: Any, name: str) -> types.Type:
-        found, _ = _field(kind.to, name)
-        return Pointer(found) if isinstance(found, types.BaseNamedTuple) else found
+        field, _ = _field(kind.to, name)
+        return Pointer(field) if isinstance(field, types.BaseNamedTuple) else field
 
 
 @lower_getattr_generic(Pointer)
 def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
-    found, first = _field(kind.to, name)
-    if isinstance(found, types.BaseNamedTuple):
+    field, first = _field(kind.to, name)
+    if isinstance(field, types.BaseNamedTuple):
         return _at(builder, address, first)
-    if isinstance(found, types.Array):
-        array = context.make_array(found)(context, builder)
+    if isinstance(field, types.Array):
+        array = context.make_array(field)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
-        extents = _declared(kind.to.instance_class).get(name, (None,) * found.ndim)
+        extents = _extents_of(kind.to.instance_class).get(name, (None,) * field.ndim)
         shape = [_extent(builder, address, first + 1 + k, x) for k, x in enumerate(extents)]
-        return _described(context, builder, found, array, shape)
-    if found == types.boolean:
+        return _array_at(context, builder, field, array, shape)
+    if field == types.boolean:
         return builder.trunc(_load(builder, address, first), ir.IntType(1))
-    return _load(builder, address, first, context.get_value_type(found))
+    return _load(builder, address, first, context.get_value_type(field))
 
 
 def _at(builder: Any, address: Any, word: int) -> Any:
@@ -115,7 +115,7 @@ def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
 
 
 @cache
-def _declared(kind: type) -> dict[str, Extents]:
+def _extents_of(kind: type) -> dict[str, Extents]:
     """Declared extents of the arrays of a type of named tuple."""
     hints = get_type_hints(kind, include_extras=True)
     about = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
@@ -139,30 +139,30 @@ def _extent(builder: Any, address: Any, word: int, declared: int | str | None) -
 
 
 def keep_extents() -> None:
-    """Keep the functions of named extents, in what is translated from now on, until `sized` replaces them."""
+    """Keep the functions of named extents, in what is translated from now on, until `with_sizes` replaces them."""
     _inlining[0] = "noinline"
 
 
-def sized(text: str, sizes: Mapping[str, int]) -> str:
+def with_sizes(text: str, sizes: Mapping[str, int]) -> str:
     """A module's text in which named extents are these numbers; those not given are as they come.
 
     Raises RuntimeError if the text has no such extent.
     """
-    found = set()
+    named = set()
 
-    def inlined(function: re.Match[str]) -> str:
-        found.add(function[2])
+    def inline(function: re.Match[str]) -> str:
+        named.add(function[2])
         extent = sizes.get(function[2], "%x")
         return f"define linkonce_odr i64 @{function[1]}(i64 %x) alwaysinline {{ ret i64 {extent} }}"
 
     definition = rf'^define [^\n]*@"?({_NAMED.format("([A-Za-z])")})"?\(.*?^}}'
-    text = re.sub(definition, inlined, text, flags=re.DOTALL | re.MULTILINE)
-    if missing := sizes.keys() - found:
+    text = re.sub(definition, inline, text, flags=re.DOTALL | re.MULTILINE)
+    if missing := sizes.keys() - named:
         raise RuntimeError(f"the translated kernel has no extents {', '.join(sorted(missing))}")
     return text
 
 
-def _described(context: Any, builder: Any, kind: types.Array, array: Any, shape: list[Any]) -> Any:
+def _array_at(context: Any, builder: Any, kind: types.Array, array: Any, shape: list[Any]) -> Any:
     """A C-contiguous array without owner, from its address and shape."""
     size = ir.Constant(_WORD, context.get_abi_sizeof(context.get_data_type(kind.dtype)))
     strides, count, step = [], ir.Constant(_WORD, 1), size

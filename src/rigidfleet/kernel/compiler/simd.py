@@ -166,7 +166,7 @@ def smaller(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
     return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-def _fused(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
+def _multiply_add(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
     return builder.call(_llvm(builder, "fma", 3), [a, b, c])
 
 
@@ -192,9 +192,9 @@ def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     if not _ESTIMATES:
         return builder.fdiv(number(1.0), x, flags=_FAST)
     y = _estimate(builder, "rcp", x)
-    e = _fused(builder, builder.fneg(x), y, number(1.0))
-    power = _fused(builder, e, e, e)
-    return _fused(builder, y, _fused(builder, power, e, e), y)
+    e = _multiply_add(builder, builder.fneg(x), y, number(1.0))
+    power = _multiply_add(builder, e, e, e)
+    return _multiply_add(builder, y, _multiply_add(builder, power, e, e), y)
 
 
 @intrinsic
@@ -218,10 +218,10 @@ def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
         root = builder.call(_llvm(builder, "sqrt", 1), [x])
         return builder.fdiv(number(1.0), root, flags=_FAST)
     y = _estimate(builder, "rsqrt", x)
-    e = _fused(builder, builder.fneg(builder.fmul(x, y)), y, number(1.0))
-    series = _fused(builder, number(0.3125), e, number(0.375))
-    series = _fused(builder, series, e, number(0.5))
-    return _fused(builder, builder.fmul(y, e), series, y)
+    e = _multiply_add(builder, builder.fneg(builder.fmul(x, y)), y, number(1.0))
+    series = _multiply_add(builder, number(0.3125), e, number(0.375))
+    series = _multiply_add(builder, series, e, number(0.5))
+    return _multiply_add(builder, builder.fmul(y, e), series, y)
 
 
 def root(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Value:
@@ -289,17 +289,17 @@ def where_positive(_context, x, a, b):
 
 
 @intrinsic
-def collected(_context, addresses, offset):
+def gather(_context, addresses, offset):
     """Lanes of the numbers at eight addresses (8,), plus an offset in numbers."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        given = context.make_array(sig.args[0])(context, builder, args[0]).data
-        pointer, found = ir.DoubleType().as_pointer(), ir.Constant(VECTOR, ir.Undefined)
+        places = context.make_array(sig.args[0])(context, builder, args[0]).data
+        pointer, vector = ir.DoubleType().as_pointer(), ir.Constant(VECTOR, ir.Undefined)
         for lane in range(WIDTH):
-            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
             place = builder.gep(builder.inttoptr(place, pointer), [args[1]])
-            found = builder.insert_element(found, builder.load(place), ir.Constant(_INDEX, lane))
-        return found
+            vector = builder.insert_element(vector, builder.load(place), ir.Constant(_INDEX, lane))
+        return vector
 
     return lanes(addresses, types.int64), generate
 
@@ -309,10 +309,10 @@ def spread(_context, x, addresses, offset):
     """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        given = context.make_array(sig.args[1])(context, builder, args[1]).data
+        places = context.make_array(sig.args[1])(context, builder, args[1]).data
         pointer = ir.DoubleType().as_pointer()
         for lane in range(WIDTH):
-            place = builder.load(builder.gep(given, [ir.Constant(_INDEX, lane)]))
+            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
             place = builder.gep(builder.inttoptr(place, pointer), [args[2]])
             builder.store(builder.extract_element(args[0], ir.Constant(_INDEX, lane)), place)
         return context.get_dummy_value()
@@ -364,7 +364,7 @@ def _fold(_context, x, largest):
     """Sum over the lanes, or the largest one; NaN if any lane is NaN."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
-        def halved(x: ir.Value, combine: Any) -> ir.Value:
+        def combine_halves(x: ir.Value, combine: Any) -> ir.Value:
             width = WIDTH
             while width > 1:
                 width //= 2
@@ -375,8 +375,8 @@ def _fold(_context, x, largest):
                 x = combine(*(builder.shuffle_vector(x, x, side) for side in sides))
             return builder.extract_element(x, ir.Constant(_INDEX, 0))
 
-        total = halved(args[0], builder.fadd)
-        most = halved(args[0], partial(larger, builder))
+        total = combine_halves(args[0], builder.fadd)
+        most = combine_halves(args[0], partial(larger, builder))
         number = builder.fcmp_ordered("ord", total, total)
         most = builder.select(number, most, total)
         return builder.select(args[1], most, total)

@@ -161,9 +161,9 @@ def _blend(reference: Reference) -> tuple[int, float, float]:
     return reference.kind, reference.t0, reference.T_b
 
 
-def _tables(given: Disturbance) -> tuple[object, ...]:
+def _tables(x: Disturbance) -> tuple[object, ...]:
     return (
-        given.active, given.gust.shape, given.noise_r.shape, given.noise_v.shape, given.gust_step, given.noise_step,
+        x.active, x.gust.shape, x.noise_r.shape, x.noise_v.shape, x.gust_step, x.noise_step,
     )  # fmt: skip
 
 
@@ -175,8 +175,8 @@ class Vector:
     given : disturbances of the flights
     """
 
-    def __init__(self, given: Sequence[Disturbance]) -> None:
-        self._tables = Tables(given)
+    def __init__(self, disturbances: Sequence[Disturbance]) -> None:
+        self._tables = Tables(disturbances)
         self._trails: list[Trail] = []
 
     def begin(
@@ -322,10 +322,10 @@ def fly_all(
 
         return work
 
-    found = _share(begin, in_lanes(starts), in_lanes(before), threads)
-    y = unpack(found.y).swapaxes(1, 2).reshape(-1, n)[:count]
-    finished = np.repeat(found.finished, WIDTH)[:count]
-    evaluations = np.repeat(found.evaluations, WIDTH)[:count]
+    ends = _share(begin, in_lanes(starts), in_lanes(before), threads)
+    y = unpack(ends.y).swapaxes(1, 2).reshape(-1, n)[:count]
+    finished = np.repeat(ends.finished, WIDTH)[:count]
+    evaluations = np.repeat(ends.evaluations, WIDTH)[:count]
     lost = ~finished
     if lost.any():
         again = _fly_alone(

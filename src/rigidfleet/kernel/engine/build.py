@@ -19,7 +19,7 @@ from numba import cfunc, typeof, types
 from rigidfleet.kernel import dopri5, measurement, monitor, nearest, recorder, recursion
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, sized
+from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
 from rigidfleet.kernel.engine import objects, packing
 
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
@@ -43,7 +43,7 @@ _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
 def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
-    """Object code of the C functions that `native` calls, `objects.ENTRIES`.
+    """Object code of the C functions of the first library.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
     record, and monitor. The ``second`` process, if there is one, makes what is `apart`.
@@ -65,13 +65,13 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
         return 0
 
     keep_extents()
-    names = list(objects.ENTRIES)
-    functions = zip((integrate_segment, record_segment), names, strict=False)
-    modules = [_module(function, name, objects.ENTRIES[name]) for function, name in functions]
+    entries = objects.ENTRIES["flight"]
+    functions = zip((integrate_segment, record_segment), entries.items(), strict=False)
+    modules = [_module(function, *entry) for function, entry in functions]
     text, symbol, _ = modules[0]
     codes = [_object(*module) for module in modules]
-    three = _object(text, symbol, names[-1], sizes=THREE)
-    made = None if second is None else objects.separated(second.communicate()[0])
+    three = _object(text, symbol, "integrate_three", sizes=THREE)
+    made = None if second is None else objects.separate(second.communicate()[0])
     return [*codes, *(made or apart()), three]
 
 
@@ -93,35 +93,35 @@ def apart() -> list[bytes]:
         monitor.watch_forces(last, problem(p), workspace(w), integrator(state), watching(watch))
         return 0
 
-    def called(function, of):
+    def caller(function, of):
         def call(address):
             function(of(address))
             return 0
 
         return call
 
-    def gather(of, count, asked, words):
-        return gathering.gather(of, count, asked, words)
+    def gather(of, count, expected, words):
+        return gathering.gather(of, count, expected, words)
 
     functions = (
         bound_moves,
         watch_distances,
         watch_forces,
-        called(measurement.measure, measured),
-        called(measurement.spectrum, spectrum),
-        called(nearest.nearest_boxes, boxes),
-        called(recursion.follow, recursing),
+        caller(measurement.measure, measured),
+        caller(measurement.spectrum, spectrum),
+        caller(nearest.nearest_boxes, boxes),
+        caller(recursion.follow, recursing),
         gather,
     )
-    entries = zip(functions, list(objects.ENTRIES.items())[2:-1], strict=True)
+    entries = list(objects.ENTRIES["flight"].items())[2:-1]
     return [
-        _object(*_module(function, name, words), loops=name == "rigidfleet_nearest")
-        for function, (name, words) in entries
+        _object(*_module(function, name, words), loops=name == "nearest")
+        for function, (name, words) in zip(functions, entries, strict=True)
     ]
 
 
 def sampled_code() -> list[bytes]:
-    """Object code of the two C functions of sampled flights, `objects.SAMPLED_ENTRIES`."""
+    """Object code of the two C functions of sampled flights."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
     problem, workspace, *_, flight, state, segment, evaluation, _, _, _, _, _ = _pointers()
@@ -134,22 +134,22 @@ def sampled_code() -> list[bytes]:
     def evaluate(f, call):
         return quadrotor.evaluate(flight(f), evaluation(call))
 
-    entries = zip((fly, evaluate), objects.SAMPLED_ENTRIES.items(), strict=True)
-    modules = [_module(function, *entry) for function, entry in entries]
+    functions = zip((fly, evaluate), objects.ENTRIES["sampled"].items(), strict=True)
+    modules = [_module(function, *entry) for function, entry in functions]
     return [_object(*module, hot=_HOT_SAMPLED) for module in modules]
 
 
 def avoidance_code() -> list[bytes]:
-    """Object code of avoidance in flight, `objects.AVOIDANCE_ENTRY`."""
+    """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
     problem, workspace, *_, flight, state, _, _, avoidance, _, _, _, _ = _pointers()
 
-    def avoid(f, s, given, _):
-        a = avoidance(given)
+    def avoid(f, s, address, _):
+        a = avoidance(address)
         return guard.avoid(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
 
-    return [_object(*_module(avoid, objects.AVOIDANCE_ENTRY), hot=())]
+    return [_object(*_module(avoid, "avoid", objects.ENTRIES["avoidance"]["avoid"]), hot=())]
 
 
 #: The makers of the libraries beside the first, and of the part that a second process makes of that.
@@ -160,7 +160,7 @@ def _pointers() -> list[Any]:
     return [pointer(typeof(x)) for x in packing.examples()]
 
 
-def _module(function: Any, name: str, arguments: int = 4) -> tuple[str, str, str]:
+def _module(function: Any, name: str, arguments: int) -> tuple[str, str, str]:
     """Input of `_object`: the module of a C function of so many addresses, its symbol, and its ``name``."""
     made = cfunc(types.int64(*(types.int64,) * arguments), **OPTIONS)(function)
     return made.inspect_llvm(), made.native_name, name
@@ -175,11 +175,11 @@ def _object(
     *,
     loops: bool = False,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, now called ``name``, is called from outside; see `sized`.
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`.
 
     ``loops``: make vectors of its loops.
     """
-    module = _simplified(sized(text, sizes), symbol, name, hot)
+    module = _simplify(with_sizes(text, sizes), symbol, name, hot)
     builder = _passes(3, loops=loops)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
@@ -190,14 +190,14 @@ def _object(
     return objects.target_machine().emit_object(module)
 
 
-def _simplified(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> llvm.ModuleRef:
-    """Return a module of which ``symbol`` alone, now called ``name``, is called from outside; ``hot`` is inlined."""
+def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) -> llvm.ModuleRef:
+    """Return a module of which ``symbol`` alone, the function ``name``, is called from outside; ``hot`` is inlined."""
     # Only addresses of named tuples are declared dereferenceable, and these are never written.
     module = llvm.parse_assembly(re.sub(r"(?=dereferenceable\(\d+\))", "readonly ", text))
     inlined = tuple(f"{len(name)}{name}B" for name in hot)  # as in Numba's mangled names
     for thing in (*module.functions, *module.global_variables):
         if thing.name == symbol:
-            thing.name, thing.linkage = name, "external"
+            thing.name, thing.linkage = objects.symbol(name), "external"
         elif not thing.is_declaration:
             thing.linkage = "internal"
             if thing.is_function and any(name in thing.name for name in inlined):
@@ -228,4 +228,4 @@ def main(part: str) -> None:
             objects.build_process("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
         codes = machine_code(second)
-    sys.stdout.buffer.write(objects.concatenated(codes))
+    sys.stdout.buffer.write(objects.concatenate(codes))

@@ -20,7 +20,7 @@ from numba.extending import intrinsic
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, collected, unpack
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, gather, unpack
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_bounds, lane_steps
 from rigidfleet.kernel.engine.lane_bounds import Search
@@ -82,7 +82,7 @@ def unrolled(problem: Problem) -> UnrolledProblem:
         The problem has branches that depend on the state.
     """
     description, values, _ = structure(problem)
-    return _prepared(problem, description, values[:, None], lambda: Trace(problem))
+    return _prepare(problem, description, values[:, None], lambda: Trace(problem))
 
 
 def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
@@ -103,7 +103,7 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
     description = flight_structure(first, values, moves)
-    ready = _prepared(first, description, values, lambda: FlightTrace(first, values, moves))
+    ready = _prepare(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
         before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
         **tables,
@@ -123,10 +123,10 @@ class Tables:
     These rows alone become lanes, in the same memory for each phase: they stay in the cache while it is flown.
     """
 
-    def __init__(self, given: Sequence[Disturbance]) -> None:
-        self._steps = {"gust": given[0].gust_step, "noise": given[0].noise_step}
+    def __init__(self, disturbances: Sequence[Disturbance]) -> None:
+        self._steps = {"gust": disturbances[0].gust_step, "noise": disturbances[0].noise_step}
         self._whole = {
-            name: [np.ascontiguousarray(getattr(x, name)) for x in given] for name in _TABLES
+            name: [np.ascontiguousarray(getattr(x, name)) for x in disturbances] for name in _TABLES
         }
         self._addresses = {name: _addresses(parts) for name, parts in self._whole.items()}
         self._lanes = dict.fromkeys(_TABLES, simd.empty((0,)))
@@ -177,10 +177,10 @@ def _addresses(arrays: Sequence[Floats]) -> Ints:
 @compiled
 def _interleave(addresses, first, made):
     for k in range(made.shape[0]):
-        made[k] = collected(addresses, first + k)
+        made[k] = gather(addresses, first + k)
 
 
-def _prepared(
+def _prepare(
     problem: Problem, description: bytes, values: Floats, trace: Callable[[], Trace]
 ) -> UnrolledProblem:
     name = hashlib.sha256(description).hexdigest()[:16]
@@ -188,11 +188,11 @@ def _prepared(
         code = Code(trace())
         _KNOWN[name] = code, _compile(code, name), _compile_before(code, name)
     code, address, before = _KNOWN[name]
-    uniform, given = (
+    uniform, distinct = (
         simd.empty((len(code.inputs),)),
         simd.pack(np.broadcast_to(values, (len(values), WIDTH))),
     )
-    before(given.ctypes.data, uniform.ctypes.data)
+    before(distinct.ctypes.data, uniform.ctypes.data)
     reference, none = problem.reference, simd.empty((0, 1))
     lanes = lambda count: simd.empty((count,))  # noqa: E731
     return UnrolledProblem(
@@ -292,37 +292,37 @@ def _compile(code: Code, name: str) -> int:
             builder.call(_emit(builder.module, code), arguments)
             return context.get_dummy_value()
 
-        given = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
-        return types.void(*given), generate
+        kinds = y, dy, gauge, uniform, before, time, known, motion, gust, noise_r, noise_v, wanted
+        return types.void(*kinds), generate
 
     return compiled_for_c(_derivative, f"derivative_{name}", arguments=_ARGUMENTS, _lines=lines)
 
 
-def _numbers_before(given, uniform):
+def _numbers_before(numbers, uniform):
     """What depends on a problem's numbers alone: each copy of `_before` has its own."""
     raise NotImplementedError
 
 
-def _before(given, uniform):
-    _numbers_before(given, uniform)
+def _before(numbers, uniform):
+    _numbers_before(numbers, uniform)
 
 
 def _compile_before(code: Code, name: str) -> Callable[[int, int], None]:
     """Compile what is known before a flight: a function of the addresses of numbers (D,) and inputs (U,), in lanes."""
 
     @intrinsic
-    def numbers_before(_context, given, uniform):
+    def numbers_before(_context, source, uniform):
         def generate(context: Any, builder: Any, _sig: Any, arguments: Any) -> Any:
             numbers, inputs = arguments
             load = lambda b, x: b.load(_element(b, numbers, x.arguments[0]), align=8)  # noqa: E731
-            value = _valued(builder, load)
+            value = _value_of(builder, load)
             for x in code.before:
                 value(x)
             for index, x in enumerate(code.inputs):
                 builder.store(value(x), _element(builder, inputs, index), align=8)
             return context.get_dummy_value()
 
-        return types.void(given, uniform), generate
+        return types.void(source, uniform), generate
 
     address = compiled_for_c(_before, f"before_{name}", arguments=2, _numbers_before=numbers_before)
     return ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(address)
@@ -334,7 +334,7 @@ def _element(builder: ir.IRBuilder, array: ir.Value, index: int) -> ir.Value:
     return builder.gep(vectors, [ir.Constant(ir.IntType(64), index)])
 
 
-def _valued(
+def _value_of(
     builder: ir.IRBuilder,
     load: Callable[[ir.IRBuilder, Symbol], ir.Value],
     known: Sequence[Symbol] = (),
@@ -392,16 +392,18 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
         return load(builder, x)
 
     names = "asked", "moment", "state", "gauge", "end"
-    asked, of_moment, of_state, of_gauge, end = map(function.append_basic_block, names)
+    entry, of_moment, of_state, of_gauge, end = map(function.append_basic_block, names)
     bits = ir.IntType(64)
 
     def branch(builder: ir.IRBuilder, bit: int, there: ir.Block, otherwise: ir.Block) -> None:
-        found = builder.and_(builder.ptrtoint(wanted, bits), ir.Constant(bits, bit))
-        builder.cbranch(builder.icmp_unsigned("!=", found, ir.Constant(bits, 0)), there, otherwise)
+        bits_wanted = builder.and_(builder.ptrtoint(wanted, bits), ir.Constant(bits, bit))
+        builder.cbranch(
+            builder.icmp_unsigned("!=", bits_wanted, ir.Constant(bits, 0)), there, otherwise
+        )
 
-    branch(ir.IRBuilder(asked), OF_MOMENT, of_moment, of_state)
+    branch(ir.IRBuilder(entry), OF_MOMENT, of_moment, of_state)
     builder = ir.IRBuilder(of_moment)
-    value = _valued(builder, load, code.inputs)
+    value = _value_of(builder, load, code.inputs)
     for x in code.moment:
         value(x)
     for index, x in enumerate(code.known):
@@ -409,18 +411,18 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
     builder.branch(of_state)
 
     builder.position_at_end(of_state)
-    value = _valued(builder, load_known, code.inputs + code.known)
+    value = _value_of(builder, load_known, code.inputs + code.known)
     for x in code.lines:
         value(x)
     whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
         if index < code.coordinates:  # a velocity, see `lane_steps`
             continue
-        found = value(x)
+        result = value(x)
         if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
-                found = builder.select(good, found, simd.number(float("nan")))
-        builder.store(found, _element(builder, dy, index), align=8)
+                result = builder.select(good, result, simd.number(float("nan")))
+        builder.store(result, _element(builder, dy, index), align=8)
     branch(builder, OF_GAUGE, of_gauge, end)
 
     builder.position_at_end(of_gauge)

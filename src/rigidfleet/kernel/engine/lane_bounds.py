@@ -261,7 +261,7 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
     at the ends of steps; the first step of a trail has no neighbour, and the last one has none yet.
     """
     limits, margins = empty((DISTANCES + FORCES,)), empty((2,))
-    found = np.empty((WIDTH, 2, steps.stop), dtype=np.int64)
+    listed = np.empty((WIDTH, 2, steps.stop), dtype=np.int64)
     count = np.zeros((WIDTH, 2), dtype=np.int64)
     nearest = unpack(s.nearest)[0].tolist()
     unpack(s.nearest)[:] = _FAR
@@ -271,13 +271,13 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
     landed = [near <= x.pad + _MARGIN or _landing(x) for near, x in pairs]
     every = np.array([np.logical_or(landed, directed), directed]).T
     _list(
-        s, first, steps.start, steps.stop, every, limits, margins, unpack(margins), found, count,
+        s, first, steps.start, steps.stop, every, limits, margins, unpack(margins), listed, count,
         unpack(s.points), unpack(s.gauge),
     )  # fmt: skip
     for lane, monitor in enumerate(monitors):
         distances, forces = count[lane].tolist()
-        monitor.listed[0, :distances] = found[lane, 0, :distances]
-        monitor.listed[1, :forces] = found[lane, 1, :forces]
+        monitor.listed[0, :distances] = listed[lane, 0, :distances]
+        monitor.listed[1, :forces] = listed[lane, 1, :forces]
         monitor.count[LISTED_DISTANCES:] = distances, forces
 
 
@@ -290,14 +290,14 @@ def _landing(monitor: Monitor) -> bool:
 
 
 @compiled
-def _hand_over(s, points, gauge, first, stop, found, count):
+def _hand_over(s, points, gauge, first, stop, listed, count):
     """Write into each flight's trail its listed steps, and what a search for forces asks of their neighbours."""
     rows, states, forces = s.bounds.shape[0], points.shape[2], gauge.shape[1]
-    for lane in range(found.shape[0]):
+    for lane in range(listed.shape[0]):
         trail = s.trails[:, lane]
         for kind in range(2):
             for k in range(count[lane, kind]):
-                step = found[lane, kind, k]
+                step = listed[lane, kind, k]
                 for near in range(max(step - kind, 0), min(step + kind + 1, stop)):
                     row = (first + near) % rows
                     for q in range(2):
@@ -312,8 +312,8 @@ def _hand_over(s, points, gauge, first, stop, found, count):
 
 
 @compiled
-def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count, points, gauge):
-    """Write the steps to search, for distances and for forces, into ``found`` (8, 2, S), their number into ``count``.
+def _list(s, first, start, stop, every, limits, margins, of_lanes, listed, count, points, gauge):
+    """Write the steps to search, for distances and for forces, into ``listed`` (8, 2, S), their number into ``count``.
 
     Of flights with ``every`` (8, 2), all steps, for distances and for forces. ``limits`` (11,) and ``margins`` (2,) are
     lanes to work with; ``of_lanes`` (2, 8) is a view of the latter, ``points`` (rows, 5, n, 8) and ``gauge`` (rows,
@@ -328,8 +328,8 @@ def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count,
         greatest = s.greatest[c]
         limits[DISTANCES + c] = where_positive(-0.5 * _FAR - greatest, filled(0.0), greatest)
     if start > 0:  # the step that has stayed
-        for lane in range(found.shape[0]):
-            found[lane, 1, 0], count[lane, 1] = 0, 1
+        for lane in range(listed.shape[0]):
+            listed[lane, 1, 0], count[lane, 1] = 0, 1
     row = (first + start) % rows
     for step in range(start, stop):
         bounds = s.bounds[row]
@@ -341,12 +341,12 @@ def _list(s, first, start, stop, every, limits, margins, of_lanes, found, count,
         for c in range(1, FORCES):
             margin = min(margin, limits[DISTANCES + c] - bounds[FIRST_FORCE + c])
         margins[1] = margin
-        for lane in range(found.shape[0]):
+        for lane in range(listed.shape[0]):
             if every[lane, 0] or not of_lanes[0, lane] > 0.0:
-                found[lane, 0, count[lane, 0]] = step
+                listed[lane, 0, count[lane, 0]] = step
                 count[lane, 0] += 1
             if every[lane, 1] or not of_lanes[1, lane] > 0.0 or step in (0, stop - 1):
-                found[lane, 1, count[lane, 1]] = step
+                listed[lane, 1, count[lane, 1]] = step
                 count[lane, 1] += 1
         row = row + 1 if row + 1 < rows else 0
-    _hand_over(s, points, gauge, first, stop, found, count)
+    _hand_over(s, points, gauge, first, stop, listed, count)

@@ -172,7 +172,7 @@ def advance(k, stage, _a, h, p):
 
 
 @inlined
-def _scaled(k, q, e, rtol):
+def _squared_error(k, q, e, rtol):
     """Square of an error over its tolerance."""
     size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
     e *= rough_inverse(k[ATOL, q] + rtol * size)
@@ -187,10 +187,10 @@ def squared_errors(k, h, rtol, p):
     v, r = _weights(E, h), _weights(_EA, h * h)
     for q in range(coordinates):
         i = coordinates + q
-        squares += _scaled(k, q, _sum(k, i, r, 3, STAGES - 1), rtol)
-        squares += _scaled(k, i, _sum(k, i, v, 3, STAGES), rtol)
+        squares += _squared_error(k, q, _sum(k, i, r, 3, STAGES - 1), rtol)
+        squares += _squared_error(k, i, _sum(k, i, v, 3, STAGES), rtol)
     for q in range(2 * coordinates, k.shape[1]):
-        squares += _scaled(k, q, _sum(k, q, v, 3, STAGES), rtol)
+        squares += _squared_error(k, q, _sum(k, q, v, 3, STAGES), rtol)
     return squares
 
 
@@ -234,31 +234,33 @@ def keep_step(t, h, p, w, state):
 
     The halves of the step are kept as two.
     """
-    k, found, rows = state.K, p.search, state.trail.clock.shape[0]
+    k, search, rows = state.K, p.search, state.trail.clock.shape[0]
     coordinates = _coordinates(k, p)
+    # The first half goes to the next row of the trail, the second to the one after it. The forces of the end are there
+    # already, as those of the last stage; the code for the middle overwrites them, so they are stored first.
     row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
     before, after = (row + rows - 1) % rows, (row + 1) % rows
-    for g in range(found.gauge.shape[1]):
-        found.gauge[after, g] = p.gauge[g]
+    for g in range(search.gauge.shape[1]):
+        search.gauge[after, g] = p.gauge[g]
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
     _to_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
     state.count[EVALUATIONS] += 1
-    for g in range(found.gauge.shape[1]):
-        found.gauge[row, g] = p.gauge[g]
-    found.clock[row, 0], found.clock[row, 1] = t, 0.5 * h
-    found.clock[after, 0], found.clock[after, 1] = t + 0.5 * h, 0.5 * h
-    early, late = found.points[row], found.points[after]
+    for g in range(search.gauge.shape[1]):
+        search.gauge[row, g] = p.gauge[g]
+    search.clock[row, 0], search.clock[row, 1] = t, 0.5 * h
+    search.clock[after, 0], search.clock[after, 1] = t + 0.5 * h, 0.5 * h
+    early, late = search.points[row], search.points[after]
     for q in range(coordinates):
         i = coordinates + q
         _put_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
     for q in range(coordinates, k.shape[1]):
         _put_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
-    bound_step(found, row)
-    bound_forces(t + 0.5 * h, found, row, before)
-    bound_step(found, after)
-    bound_forces(t + h, found, after, row)
+    bound_step(search, row)
+    bound_forces(t + 0.5 * h, search, row, before)
+    bound_step(search, after)
+    bound_forces(t + h, search, after, row)
     state.count[TRAILED] += 2
 
 
@@ -273,12 +275,13 @@ def keep_start(p, w, state):
 @compiled
 def keep_samples(t, h, t_new, times, samples, p, state):
     """As `dopri5.keep_samples`, for each flight into its own samples, from the rows of a step that is kept."""
-    found, count = p.search, state.count
+    search, count = p.search, state.count
     n, rows = state.K.shape[1], state.trail.clock.shape[0]
     while count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
+        # By the halves that were just written, which `keep_step` has counted.
         x = 2.0 * (times[count[SAMPLES]] - t) / h
         half = 1 if x > 1.0 else 0
-        points = found.points[(count[FIRST_ROW] + count[TRAILED] - 2 + half) % rows]
+        points = search.points[(count[FIRST_ROW] + count[TRAILED] - 2 + half) % rows]
         x -= half
         z = 1.0 - x
         for q in range(n):

@@ -16,24 +16,24 @@ import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import llvmlite.binding as llvm
 import numpy as np
 
 from rigidfleet._common.files import replacing
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, opened, told
+from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, open_safely, warned
 from rigidfleet.kernel.engine.objects import (
-    AVOIDANCE_ENTRY,
     ELSEWHERE,
     ENTRIES,
-    SAMPLED_ENTRIES,
     build_process,
-    concatenated,
-    separated,
+    concatenate,
+    separate,
+    symbol,
     target_machine,
 )
-from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, packed, use
+from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, pack_anew, use
 from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
 from rigidfleet.kernel.problem import (
     Problem,
@@ -62,9 +62,13 @@ def integrate(
     max_steps: int,
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
-    segment = pack(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
+    segment = pack_anew(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
     return _call(
-        _integrator(problem, workspace), packed(problem), packed(workspace), packed(state), segment
+        _integrator(problem, workspace),
+        pack(problem),
+        pack(workspace),
+        pack(state),
+        segment,
     )
 
 
@@ -80,8 +84,8 @@ class Integration:
         times: Floats,
         samples: Floats,
     ) -> None:
-        self._segment = pack(Segment(t_end, False, 0, times, samples, NOTHING))
-        self._kept = packed(problem), packed(workspace), packed(state), self._segment
+        self._segment = pack_anew(Segment(t_end, False, 0, times, samples, NOTHING))
+        self._kept = pack(problem), pack(workspace), pack(state), self._segment
         self._addresses = [x.address for x in self._kept]
         self._integrate = _integrator(problem, workspace)
 
@@ -100,7 +104,7 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    record_into(pack(out), 0, packed(problem), workspace, times, samples)
+    record_into(pack_anew(out), 0, pack(problem), workspace, times, samples)
     return out
 
 
@@ -109,7 +113,7 @@ def record_into(
 ) -> None:
     """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(_code().record, problem, packed(workspace), pack(segment), out)
+    _call(_code().record, problem, pack(workspace), pack_anew(segment), out)
 
 
 class Watch:
@@ -119,38 +123,41 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = pack(segment), pack(UNRECORDED)
+        self._kept = pack_anew(segment), pack_anew(UNRECORDED)
         self.monitor = monitor._replace(
-            recorder=_code().recorder, segment=self._kept[0].address, record=self._kept[1].address
+            recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
-        self._packed = pack(self.monitor)
+        self._packed = pack_anew(self.monitor)
+        self.address = self._packed.address
 
     def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
-        _call(_code().bound_moves, packed(problem), packed(state), self._packed)
+        _code().bound_moves(pack(problem).address, pack(state).address, self.address)
 
     def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
-        of = packed(problem).address, packed(state).address, self._packed.address
+        of = pack(problem).address, pack(state).address, self.address
         _code().watch_distances(first, end, *of)
 
     def forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
     ) -> None:
         """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
-        of = [packed(x).address for x in (problem, workspace, state)]
-        _code().watch_forces(int(last), *of, self._packed.address)
+        of = [pack(x).address for x in (problem, workspace, state)]
+        _code().watch_forces(int(last), *of, self.address)
 
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    found = _own.segment
-    if found is None or len(found.of.dy) != len(y):
-        found = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
-        _own.segment = found
-    segment: Segment = found.of
+    call = _own.segment
+    if call is None or len(call.of.dy) != len(y):
+        call = pack_anew(
+            Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y)))
+        )
+        _own.segment = call
+    segment: Segment = call.of
     segment.times[0], segment.samples[0] = t, y
-    _call(_code().record, packed(problem), packed(workspace), found, packed(UNRECORDED))
+    _call(_code().record, pack(problem), pack(workspace), call, pack(UNRECORDED))
     dy[:] = segment.dy
 
 
@@ -167,91 +174,68 @@ def _call(function: Any, *arguments: Packed) -> int:
     return function(*[a.address for a in arguments])
 
 
-def measure(found: Measured) -> None:
+def measure(measured: Measured) -> None:
     """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
-    _call(_code().measure, pack(found))
+    _call(_code().measure, pack_anew(measured))
 
 
 def least_singular_values(r: Floats, edges: Ints) -> Floats:
     """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
-    found = spectrum_of(r, edges)
-    _call(_code().spectrum, pack(found))
-    return found.found
+    spectrum = spectrum_of(r, edges)
+    _call(_code().spectrum, pack_anew(spectrum))
+    return spectrum.values
 
 
 def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
     """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
-    found = nearest_of(r, radius, boxes)
-    _call(_code().nearest, pack(found))
-    return found.least, found.nearest
+    nearest = nearest_of(r, radius, boxes)
+    _call(_code().nearest, pack_anew(nearest))
+    return nearest.least, nearest.nearest
 
 
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
-    _call(_code().follow, pack(Recursion(x, a, backward)))
+    _call(_code().follow, pack_anew(Recursion(x, a, backward)))
 
 
 def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
     """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
-    _call(_code().follow, pack(Recursion(x, a, False, y, first, b)))
+    _call(_code().follow, pack_anew(Recursion(x, a, False, y, first, b)))
 
 
-class _Code(NamedTuple):
-    integrate: Any
-    record: Any
-    bound_moves: Any
-    watch_distances: Any
-    watch_forces: Any
-    measure: Any
-    spectrum: Any
-    nearest: Any
-    follow: Any
-    integrate_three: Any  # integrate, for three agents with three edges
-    recorder: int  # address of record
-    engine: Any  # keeps the code alive
-    unkept: list[bytes] | None  # objects that could not be stored in the cache
+class Library(SimpleNamespace):
+    """Machine code that is loaded: its functions by name (`objects.ENTRIES`), and their ``addresses``.
 
-
-class Sampled(NamedTuple):
-    """The second library: sampled flights. Flights of points do not load it."""
-
-    fly_ticks: Any
-    evaluate: Any
-    recorder: int  # address of record
-    engine: Any
-    unkept: list[bytes] | None
-
-
-class Avoiding(NamedTuple):
-    """The third library: avoidance in flight, loaded by missions with [avoidance] alone."""
-
-    avoid: Any
-    address: int
-    engine: Any
-    unkept: list[bytes] | None
+    The ``engine`` keeps the code alive; ``unkept`` are its objects if they could not be stored in the cache.
+    """
 
 
 _loading = threading.RLock()
 #: The libraries that are loaded, by part.
-_loaded: dict[str, Any] = {}
+_loaded: dict[str, Library] = {}
 
 
-def _code() -> _Code:
+def _code() -> Library:
     """The kernel's machine code: from the cache, or compiled."""
     return _library("flight")
 
 
-def sampled() -> Sampled:
+def sampled_library() -> Library:
     """The machine code of sampled flights: from the cache, or compiled."""
     return _library("sampled")
 
 
-def avoiding() -> Avoiding:
+def avoidance_library() -> Library:
     """The machine code of avoidance in flight: from the cache, or compiled."""
     return _library("avoidance")
 
 
-def _library(part: str) -> Any:
+def recorder_address() -> int:
+    """Address of the recorder, which other libraries and the monitor call."""
+    return _code().addresses["record"]
+
+
+def _library(part: str) -> Library:
     if part not in _loaded:
         with _loading:
             if part not in _loaded:
@@ -259,42 +243,25 @@ def _library(part: str) -> Any:
     return _loaded[part]
 
 
-def _load(part: str) -> Any:
+def _load(part: str) -> Library:
     if (parts := _read(part)) is not None:
-        return _LINKED[part](parts)
+        return _link(part, parts)
     parts = _compile(part)
-    return _LINKED[part](parts, None if _write(parts, part) else parts)
+    return _link(part, parts, None if _write(parts, part) else parts)
 
 
-def _linked(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> _Code:
-    engine = _engine(parts)
-    *calls, gather, three = [_function(engine, *entry) for entry in ENTRIES.items()]
-    use(gather, engine)
-    distance.use(nearest_boxes)
-    recorder = engine.get_function_address("rigidfleet_record")
-    return _Code(*calls, three, recorder, engine, unkept)
-
-
-def _linked_sampled(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Sampled:
-    engine = _engine(parts)
-    calls = [_function(engine, *entry) for entry in SAMPLED_ENTRIES.items()]
-    return Sampled(*calls, _code().recorder, engine, unkept)
-
-
-def _linked_avoiding(parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Avoiding:
-    engine = _engine(parts)
-    address = engine.get_function_address(AVOIDANCE_ENTRY)
-    return Avoiding(_function(engine, AVOIDANCE_ENTRY, 4), address, engine, unkept)
-
-
-#: What makes a library of the objects of each part.
-_LINKED = {"flight": _linked, "sampled": _linked_sampled, "avoidance": _linked_avoiding}
-
-
-def _function(engine: Any, name: str, words: int) -> Any:
-    """A function of machine code that takes this number of words and returns one."""
-    word = ctypes.c_int64
-    return ctypes.CFUNCTYPE(word, *(word,) * words)(engine.get_function_address(name))
+def _link(part: str, parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Library:
+    """Make a library of the objects of a part."""
+    engine, word = _engine(parts), ctypes.c_int64
+    addresses = {name: engine.get_function_address(symbol(name)) for name in ENTRIES[part]}
+    calls = {
+        name: ctypes.CFUNCTYPE(word, *(word,) * words)(addresses[name])
+        for name, words in ENTRIES[part].items()
+    }
+    if part == "flight":
+        use(calls["gather"], engine)
+        distance.use(nearest_boxes)
+    return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 
 def _engine(parts: Sequence[bytes]) -> Any:
@@ -312,21 +279,21 @@ class Inheritance(NamedTuple):
     """Code by part that a child process need not compile again, and whether it need not repeat a warning."""
 
     code: dict[str, list[bytes]]
-    told: bool
+    warned: bool
 
 
 def bequeath() -> Inheritance:
     """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
     unkept = {part: library.unkept for part, library in _loaded.items()}
-    return Inheritance({part: code for part, code in unkept.items() if code}, told.is_set())
+    return Inheritance({part: code for part, code in unkept.items() if code}, warned.is_set())
 
 
-def inherit(given: Inheritance) -> None:
+def inherit(inheritance: Inheritance) -> None:
     """Take over the code and warnings of the parent process."""
-    if given.told:
-        told.set()
-    for part, code in given.code.items():
-        _loaded[part] = _LINKED[part](code, code)
+    if inheritance.warned:
+        warned.set()
+    for part, code in inheritance.code.items():
+        _loaded[part] = _link(part, code, code)
 
 
 def _compile(part: str) -> list[bytes]:
@@ -342,7 +309,7 @@ def _compile(part: str) -> list[bytes]:
             done = subprocess.run(
                 build_process(part), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
-            if done.returncode == 0 and (parts := separated(done.stdout)) is not None:
+            if done.returncode == 0 and (parts := separate(done.stdout)) is not None:
                 return parts
     from rigidfleet.kernel.engine import build
 
@@ -364,8 +331,8 @@ def _file(part: str) -> Path:
 def _read(part: str) -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
-        with opened(_file(part)) as stream:
-            return separated(stream.read())
+        with open_safely(_file(part)) as stream:
+            return separate(stream.read())
     except OSError:
         return None
 
@@ -374,7 +341,7 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
         with replacing(_file(part), private=True) as stream:
-            stream.write(concatenated(parts))
+            stream.write(concatenate(parts))
     except OSError as error:
         not_kept(error)
         return False
@@ -384,7 +351,7 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
 def is_compiled() -> bool:
     """Return whether the machine code is in the cache, so that nothing has to be compiled."""
     try:
-        with opened(_file("flight")):
+        with open_safely(_file("flight")):
             return True
     except OSError:
         return False

@@ -11,28 +11,31 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-#: The machine code's functions, by name, with how many words they take: integers, or addresses of named tuples. Each
-#: is in its own object, and returns a word. The last one is the first for three agents with three edges.
+#: The functions of each library of machine code, by name, with how many words they take: integers, or addresses of
+#: named tuples. They return a word. Flights of points load the first library, those of vehicles the second, too, and
+#: those with avoidance the third. Each function is in its own object.
 ENTRIES = {
-    "rigidfleet_integrate": 4,  # problem, workspace, integrator, segment
-    "rigidfleet_record": 4,  # problem, workspace, segment, record
-    "rigidfleet_bound_moves": 3,  # problem, integrator, monitor
-    "rigidfleet_watch_distances": 5,  # first, end, problem, integrator, monitor
-    "rigidfleet_watch_forces": 5,  # last, problem, workspace, integrator, monitor
-    "rigidfleet_measure": 1,
-    "rigidfleet_spectrum": 1,
-    "rigidfleet_nearest": 1,
-    "rigidfleet_follow": 1,
-    "rigidfleet_gather": 4,  # objects, count, asked, words
-    "rigidfleet_integrate_three": 4,
+    "flight": {
+        "integrate": 4,  # problem, workspace, integrator, segment
+        "record": 4,  # problem, workspace, segment, record
+        "bound_moves": 3,  # problem, integrator, monitor
+        "watch_distances": 5,  # first, end, problem, integrator, monitor
+        "watch_forces": 5,  # last, problem, workspace, integrator, monitor
+        "measure": 1,
+        "spectrum": 1,
+        "nearest": 1,
+        "follow": 1,
+        "gather": 4,  # objects, count, asked, words
+        "integrate_three": 4,  # the first, for three agents with three edges
+    },
+    "sampled": {"fly_ticks": 5, "evaluate": 2},
+    "avoidance": {"avoid": 4},  # flight, state, avoidance, 0
 }
-#: Those of the second library.
-SAMPLED_ENTRIES = {
-    "rigidfleet_fly_ticks": 5,  # problem, workspace, flight, state, segment
-    "rigidfleet_evaluate": 2,  # flight, evaluation
-}
-#: That of the third library, avoidance in flight: int64(flight, state, avoidance, 0).
-AVOIDANCE_ENTRY = "rigidfleet_avoid"
+
+
+def symbol(name: str) -> str:
+    """Name of a function in machine code."""
+    return f"rigidfleet_{name}"
 
 
 #: Working folder of the compiling processes, as Numba reads settings from a file in its working folder.
@@ -65,14 +68,14 @@ def target_machine() -> Any:
     )  # fmt: skip
 
 
-def concatenated(parts: Sequence[bytes]) -> bytes:
+def concatenate(parts: Sequence[bytes]) -> bytes:
     """Join objects, each after its length, with a digest, so that an incomplete file is never used."""
     code = b"".join(len(part).to_bytes(8, "little") + part for part in parts)
     return code + hashlib.sha256(code).digest()
 
 
-def separated(data: bytes) -> list[bytes] | None:
-    """Objects that were `concatenated`; None if they are not whole."""
+def separate(data: bytes) -> list[bytes] | None:
+    """Objects that were `concatenate`; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:
         return None

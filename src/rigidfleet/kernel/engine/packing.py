@@ -18,7 +18,7 @@ from rigidfleet.kernel.measured import (
     Measured,
     Nearest,
     Spectrum,
-    measured,
+    measurement_of,
     nearest_of,
     spectrum_of,
 )
@@ -60,7 +60,7 @@ class Packed(NamedTuple):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy has words of its own: the arrays of the tuple lie elsewhere."""
-        return pack, (self.of,)
+        return pack_anew, (self.of,)
 
 
 #: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded, and what keeps its code.
@@ -107,16 +107,16 @@ class _Layout:
         self.after, self.count = 8 * size, len(arrays)
         kinds = [id(x.dtype) for x in self.of_arrays(example)]
         #: (arrays, 3) first word, dimensions, address of the type of the numbers.
-        self.asked = np.array(
+        self.expected = np.array(
             [[k, n, kind] for (_, k), (_, n), kind in zip(arrays, self.arrays, kinds, strict=True)], dtype=np.int64
         ).reshape(-1, 3)  # fmt: skip
-        self.asked_at = self.asked.__array_interface__["data"][0]
-        #: Whether `gathered` finds what `_flatten` finds: else arrays are not laid out as expected there.
-        self.known = (found := self.gathered(example)) is not None and (
-            bytes(found.words)[: 8 * size] == self.code.pack(*words)
+        self.expected_at = self.expected.__array_interface__["data"][0]
+        #: Whether `gather` finds what `_flatten` finds: else arrays are not laid out as expected there.
+        self.known = (words_gathered := self.gather(example)) is not None and (
+            bytes(words_gathered.words)[: 8 * size] == self.code.pack(*words)
         )
 
-    def gathered(self, x: Any) -> Packed | None:
+    def gather(self, x: Any) -> Packed | None:
         """The words of a named tuple; None if a number or array is not as in the example."""
         arrays, numbers = self.of_arrays(x), self.of_numbers(x)
         kinds = tuple(map(type, numbers))
@@ -130,7 +130,7 @@ class _Layout:
         at = ctypes.addressof(words)
         self.numbers.pack_into(words, 0, *numbers)
         self.objects.pack_into(words, self.after, *map(id, arrays))
-        if _gather[0](at + self.after, self.count, self.asked_at, at):
+        if _gather[0](at + self.after, self.count, self.expected_at, at):
             return None
         return Packed(x, words, at)
 
@@ -173,7 +173,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
             words.append(int(value))
 
 
-def pack(x: Any) -> Packed:
+def pack_anew(x: Any) -> Packed:
     """Convert a named tuple to words.
 
     Raises
@@ -182,8 +182,8 @@ def pack(x: Any) -> Packed:
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
     layout = _layout(type(x))
-    if layout.known and (found := layout.gathered(x)) is not None:
-        return found
+    if layout.known and (words := layout.gather(x)) is not None:
+        return words
     code: list[str] = []
     values: list[Any] = []
     arrays: list[tuple[str, int]] = []
@@ -208,16 +208,16 @@ _last = _Last()
 _KEPT = 32
 
 
-def packed(x: Any) -> Packed:
-    """`pack`, unless the named tuple is among the last ones that the thread has used."""
+def pack(x: Any) -> Packed:
+    """`pack_anew`, unless the named tuple is among the last ones that the thread has used."""
     kept = _last.packed
-    found = kept.pop(id(x), None)
-    if found is None or found.of is not x:
-        found = pack(x)
+    last = kept.pop(id(x), None)
+    if last is None or last.of is not x:
+        last = pack_anew(x)
         if len(kept) >= _KEPT:
             del kept[next(iter(kept))]
-    kept[id(x)] = found
-    return found
+    kept[id(x)] = last
+    return last
 
 
 def forget() -> None:
@@ -277,7 +277,7 @@ def examples() -> tuple[
         problem, work, state, segment, UNRECORDED, watching, flight, fleet.begin(flight, S, work),
         fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
         avoidance(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
-        measured(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
+        measurement_of(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
                  r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
         spectrum_of(rows, np.zeros((0, 2), dtype=np.int64)), nearest_of(rows, one, nowhere),

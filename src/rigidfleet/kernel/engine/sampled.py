@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.kernel.avoidance import Avoidance
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, packed
+from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_anew
 from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
@@ -30,24 +30,26 @@ def fly_ticks(
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
     flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
-    given = problem, workspace, flight, state, segment, avoidance
-    if not _last.given or any(a is not b for a, b in zip(given, _last.given, strict=True)):
-        _last.packed, _last.given = _packed(*given), given
-    return native.sampled().fly_ticks(*(a.address for a in _last.packed[:5]))
+    arguments = problem, workspace, flight, state, segment, avoidance
+    if not _last.arguments or any(
+        a is not b for a, b in zip(arguments, _last.arguments, strict=True)
+    ):
+        _last.packed, _last.arguments = _pack(*arguments), arguments
+    return native.sampled_library().fly_ticks(*(a.address for a in _last.packed[:5]))
 
 
 class _Last(threading.local):
     """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
 
     def __init__(self) -> None:
-        self.given: tuple[Any, ...] = ()
+        self.arguments: tuple[Any, ...] = ()
         self.packed: tuple[Packed, ...] = ()
 
 
 _last = _Last()
 
 
-def _packed(
+def _pack(
     problem: Problem,
     workspace: Workspace,
     flight: Flight,
@@ -62,17 +64,19 @@ def _packed(
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
-    law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
-    recorded = packed(UNRECORDED)
+    law = pack_anew(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
+    recorded = pack(UNRECORDED)
     call = segment._replace(
-        recorder=native.sampled().recorder, segment=law.address, record=recorded.address
+        recorder=native.recorder_address(), segment=law.address, record=recorded.address
     )
-    states = packed(problem), packed(workspace), packed(flight), packed(state)
+    states = pack(problem), pack(workspace), pack(flight), pack(state)
     if avoidance is None:
-        return *states, pack(call), law, recorded
+        return *states, pack_anew(call), law, recorded
     kept = _of(avoidance, problem, workspace)
-    call = call._replace(guard=native.avoiding().address, avoidance=kept.address)
-    return *states, pack(call), law, recorded, kept
+    call = call._replace(
+        guard=native.avoidance_library().addresses["avoid"], avoidance=kept.address
+    )
+    return *states, pack_anew(call), law, recorded, kept
 
 
 def avoid(
@@ -84,13 +88,15 @@ def avoid(
 ) -> int:
     """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
     kept = _of(avoidance, problem, workspace)
-    return native.avoiding().avoid(packed(flight).address, packed(state).address, kept.address, 0)
+    return native.avoidance_library().avoid(
+        pack(flight).address, pack(state).address, kept.address, 0
+    )
 
 
 def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
     """Avoidance that knows the law whose forces it changes."""
-    avoidance.law[:] = packed(problem).address, packed(workspace).address
-    return packed(avoidance)
+    avoidance.law[:] = pack(problem).address, pack(workspace).address
+    return pack(avoidance)
 
 
 def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
@@ -117,7 +123,8 @@ def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
     views = n if sensing.linked else 0
     if len(state.history) <= depth or sizes != (n, (views or 1, m), 6 * n + m + 4, views):
         raise ValueError(
-            "the state is of another flight or problem: begin a flight by `fleet.begin`, and a phase by `fleet.renewed`"
+            "the state is of another flight or problem: begin a flight by `fleet.begin`, and a phase by"
+            " `fleet.under_problem`"
         )
 
 
@@ -134,10 +141,10 @@ def derivatives(
     """
     none = np.zeros((len(S), 3))
     out = np.empty_like(S)
-    call = pack(
+    call = pack_anew(
         Evaluation(
             S, command, none if air is None else air, none if push is None else push, np.eye(3), out
         )
     )
-    native.sampled().evaluate(packed(flight).address, call.address)
+    native.sampled_library().evaluate(pack(flight).address, call.address)
     return out

@@ -49,8 +49,8 @@ class Symbol:
     def __init__(self, trace: Trace, operation: str, arguments: tuple[Any, ...]) -> None:
         self.trace, self.operation, self.arguments = trace, operation, arguments
         self.serial = len(trace.made)
-        given = [x.known for x in arguments if isinstance(x, Symbol)]
-        self.known = SOURCES[operation] if operation in SOURCES else max(given, default=UNIFORM)
+        knowledge = [x.known for x in arguments if isinstance(x, Symbol)]
+        self.known = SOURCES[operation] if operation in SOURCES else max(knowledge, default=UNIFORM)
 
     def __add__(self, other: Any) -> Any:
         return self.trace.add(self, other)
@@ -134,7 +134,7 @@ class Trace:
         dy = np.full(len(y), 0.0, dtype=object)
         p = self._with_symbols(problem)
         reference = p.reference._replace(d0=p.reference.d0[order], d1=p.reference.d1[order])
-        p = p._replace(graph=_ordered(p.graph, order), reference=reference)
+        p = p._replace(graph=_reorder(p.graph, order), reference=reference)
         self._plain(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
         self.coordinates = 3 * n
@@ -146,7 +146,7 @@ class Trace:
         """The problem with symbols in place of its numbers."""
         _, self._values, which = structure(problem)
         self._numbers = iter(which.tolist())
-        p = _used(problem)
+        p = _parts_in_use(problem)
         p = p._replace(**{name: self._symbolic(getattr(p, name)) for name in _PARTS})
         before = [self.symbol("before", k) for k in range(len(problem.graph.edges))]
         return p._replace(reference=p.reference._replace(d0=np.array(before, dtype=object)))
@@ -349,8 +349,8 @@ class FlightTrace(Trace):
             zero = not there.get(name, True)
             made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))]
             part, field = name.split(".")
-            found = np.array(made, dtype=object).reshape(np.shape(x))
-            parts.setdefault(part, {})[field] = found if np.ndim(x) else found.item()
+            array = np.array(made, dtype=object).reshape(np.shape(x))
+            parts.setdefault(part, {})[field] = array if np.ndim(x) else array.item()
         motion = self._table(MOTION, (1, 6, 6))
         motion[:, [not moving for moving in self._moves]] = 0.0
         parts["motion"]["coefficients"] = motion
@@ -379,8 +379,8 @@ class FlightTrace(Trace):
 def _places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
     """Name, place among `numbers` and value of each number, and of each array of numbers."""
     index = 0
-    given = (*_numbers_of(problem), *_arrays_of(problem))
-    for name, x in zip((*_NUMBERS, *_ARRAYS), given, strict=True):
+    values = (*_numbers_of(problem), *_arrays_of(problem))
+    for name, x in zip((*_NUMBERS, *_ARRAYS), values, strict=True):
         yield name, index, x
         index += np.size(x)
 
@@ -409,13 +409,18 @@ def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) ->
     UnfitError
         Some of the problems damp deformations, others do not, which is a branch of the law.
     """
-    graph, law, control, given = problem.graph, problem.law, problem.control, problem.disturbance
+    graph, law, control, disturbance = (
+        problem.graph,
+        problem.law,
+        problem.control,
+        problem.disturbance,
+    )
     damps = values[_NUMBERS.index("law.k_def")].astype(bool)
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
     there = [*_there(problem, values).values(), *moves]
-    kinds = law.solver, law.iterations, problem.reference.kind, control.kind, given.active
-    tables = [len(x) > 0 for x in (given.gust, given.noise_r, given.noise_v)]
+    kinds = law.solver, law.iterations, problem.reference.kind, control.kind, disturbance.active
+    tables = [len(x) > 0 for x in (disturbance.gust, disturbance.noise_r, disturbance.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
     saturates = bool(problem.vehicles.saturate)
     return repr(
@@ -447,21 +452,21 @@ class Code:
         self.gauge = trace.gauge
         self.positive = [x for x in trace.positive if x.known > UNIFORM]
         self._seen: set[int] = set()
-        needed = self._needed([*self.positive, *self.outputs])
-        last = self._needed(self.gauge)
+        needed = self._collect([*self.positive, *self.outputs])
+        last = self._collect(self.gauge)
         self.before = [x for x in needed + last if x.known == UNIFORM]
-        self.moment = _computed(x for x in needed + last if UNIFORM < x.known < STATE)
-        self.lines = _computed(x for x in needed if x.known == STATE)
-        self.last = _computed(x for x in last if x.known == STATE)
+        self.moment = _in_order(x for x in needed + last if UNIFORM < x.known < STATE)
+        self.lines = _in_order(x for x in needed if x.known == STATE)
+        self.last = _in_order(x for x in last if x.known == STATE)
         of_state = [x for line in self.lines + self.last for x in line.arguments]
         of_state += self.outputs + self.gauge + self.positive
         self.known = _distinct(of_state, range(FLIGHT, STATE))
         used = of_state + [x for line in self.moment for x in line.arguments]
         self.inputs = _distinct(used, range(UNIFORM, FLIGHT))
 
-    def _needed(self, wanted: Sequence[Any]) -> list[Symbol]:
+    def _collect(self, wanted: Sequence[Any]) -> list[Symbol]:
         """Everything new that symbols need, each after its arguments; without recursion, because chains are long."""
-        found, stack = [], list(wanted[::-1])
+        symbols, stack = [], list(wanted[::-1])
         while stack:
             x = stack.pop()
             if not isinstance(x, Symbol) or x.serial in self._seen:
@@ -473,19 +478,19 @@ class Code:
                 stack += [x, *missing]
                 continue
             self._seen.add(x.serial)
-            found.append(x)
-        return found
+            symbols.append(x)
+        return symbols
 
 
-def _computed(symbols: Iterable[Symbol]) -> list[Symbol]:
+def _in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
     """Those that are no sources, in the order in which the kernel computes them."""
     return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
 
 
 def _distinct(values: Iterable[Any], known: range) -> list[Symbol]:
     """The different symbols among values of which so much is known."""
-    found = (x for x in values if isinstance(x, Symbol) and x.known in known)
-    return list({x.serial: x for x in found}.values())
+    symbols = (x for x in values if isinstance(x, Symbol) and x.known in known)
+    return list({x.serial: x for x in symbols}.values())
 
 
 def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
@@ -496,7 +501,7 @@ def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
     """
     numbers: list[Floats] = []
     others: list[Any] = [problem.has_frame, problem.body_formulation, problem.external]
-    used = _used(problem)
+    used = _parts_in_use(problem)
     for name in _PARTS:
         _sort_out(getattr(used, name), numbers, others)
     # By a dictionary: for some hundred numbers, sorting arrays takes several times as long.
@@ -524,7 +529,7 @@ def elimination_order(edges: NDArray[np.integer]) -> Ints:
     return np.array(order, dtype=np.int64)
 
 
-def _ordered(graph: Graph, order: Ints) -> Graph:
+def _reorder(graph: Graph, order: Ints) -> Graph:
     pairs = np.sort(np.argsort(order)[graph.pairs.astype(np.int64)], axis=1)[:, ::-1]
     return graph._replace(edges=graph.edges[order], pairs=pairs, diagonal=graph.diagonal[order])
 
@@ -533,7 +538,7 @@ def _ordered(graph: Graph, order: Ints) -> Graph:
 _PARTS = ("vehicles", "graph", "law", "reference", "control", "disturbance")
 
 
-def _used(problem: Problem) -> Problem:
+def _parts_in_use(problem: Problem) -> Problem:
     """The problem without the parts that such flights do not use, which the tracer could not handle."""
     none: Any = None
     slots = ("t0", "T_b", "d0", "p0", "dp", "turn", "knots", "ways")

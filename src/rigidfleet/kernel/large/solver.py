@@ -288,10 +288,10 @@ class LargeSolver:
 
 def _callable(method: Callable[[], None]) -> Any:
     """A C function that calls a method. It does not keep the object alive, so that nothing but its users does."""
-    found = weakref.WeakMethod(method)
+    reference = weakref.WeakMethod(method)
 
     def call() -> None:
-        bound = found()
+        bound = reference()
         if bound is not None:
             bound()
 

@@ -180,7 +180,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
         # Seen obliquely from behind, if the formation moves.
         "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,
     }
-    if not any(o.kind == "ground" for o in result.mission.obstacles):
+    if not np.isfinite(result.mission.ground):
         # A grid to see motion against; high above the ground, it moves along with the flight.
         lowest = float(low[2])
         story["ground"] = 0.0 if 0.0 <= lowest <= 4 * (extent + reach) else lowest - reach

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import agent_colours
-from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits, tracking_error
+from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits
+from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.solids.distance import displacement
 from rigidfleet.solids.outline import outline
@@ -33,7 +34,6 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
 
     Full colour of an edge stands for ``tension`` [N].
     """
-    ground = [o.height for o in mission.obstacles if o.kind == "ground"]
     boxes = [(o.name, o.corners) for o in mission.obstacles if is_plain_box(o) and o.corners]
     fence = mission.limits.geofence
     return {
@@ -45,12 +45,10 @@ def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
         "edges": edges,
         "tension": tension,
         "boxes": [{"name": name, "min": ends[:3], "max": ends[3:]} for name, ends in boxes],
-        "solids": [
-            _solid(o) for o in mission.obstacles if o.kind != "ground" and not is_plain_box(o)
-        ],
+        "solids": [_solid(o) for o in mission.solids if not is_plain_box(o)],
         "fence": None if fence is None else {"min": fence.min, "max": fence.max},
-        "ground": max(ground, default=0.0),
-        "solid": bool(ground),
+        "ground": mission.ground if np.isfinite(mission.ground) else 0.0,
+        "solid": bool(np.isfinite(mission.ground)),
         "plots": _plots(mission),
     }
 
@@ -160,16 +158,15 @@ def sight(
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
     seen = []
-    for box in mission.obstacles:  # of a height map only what is drawn
-        if box.kind != "ground":
-            ends = extent(box.solid)
-            if box.kind == "heights":
-                ends[0, 2] = box.solid.heights.min()
-            far = reach
-            if box.solid.moves:
-                ends, far = _passing(box.solid, low, high, begin, end), _BESIDE * reach
-            near = np.maximum(ends[0], low - far), np.minimum(ends[1], high + far)
-            seen += [near] if (near[0] <= near[1]).all() else []
+    for box in mission.solids:  # of a height map only what is drawn
+        ends = extent(box.solid)
+        if box.kind == "heights":
+            ends[0, 2] = box.solid.heights.min()
+        far = reach
+        if box.solid.moves:
+            ends, far = _passing(box.solid, low, high, begin, end), _BESIDE * reach
+        near = np.maximum(ends[0], low - far), np.minimum(ends[1], high + far)
+        seen += [near] if (near[0] <= near[1]).all() else []
     if len(seen) > _BOXES:
         seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]
     ends = np.array([(low, high), *seen])  # (1 + boxes, 2, 3)
@@ -307,6 +304,6 @@ def _plotted(result: Result) -> dict[str, PackedColumn]:
     }
     if np.isfinite(rotor_limits(result.mission)).any():
         samples["rotor plot"] = PackedColumn(_rotor_lines(result), 0.1)
-        off = np.fmax.reduce(tracking_error(result), axis=1)
+        off = quantities.samples(result, "tracking_error").worst
         samples["off plot"] = PackedColumn(off, 1e-4)
     return {plot["column"]: samples[plot["column"]] for plot in _plots(result.mission)}

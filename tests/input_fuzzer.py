@@ -1,6 +1,6 @@
 """Missions and results with anything wrong in them, and what the command makes of each.
 
-`python tests/mutations.py KIND SEED COUNT` tries so many cases, each by a seed of its own, in one process: within so
+`python tests/input_fuzzer.py KIND SEED COUNT` tries so many cases, each by a seed of its own, in one process: within so
 much memory, and each within so much time. A line of JSON says what came of each; what is none of a good end
 (exit code 0, 1 or 2, or an error with a remedy) is its "fault". `attack` starts such processes and goes on
 behind a case that hangs or dies.
@@ -98,9 +98,9 @@ class Dice:
 
 def a_mission(dice: Dice) -> bytes:
     """A shipped mission, changed in structure, in values, in sizes or in bytes."""
-    names = sorted(path.name for path in SHIPPED.glob("*.toml"))
-    name = dice.one([n for n in names if n != "show-1000.toml"] * 5 + ["show-1000.toml"])
-    text = (SHIPPED / name).read_text()
+    paths = sorted(SHIPPED.glob("*/*.toml"), key=lambda path: path.name)
+    small = [path for path in paths if path.stem != "show-1000"]
+    text = dice.one(small * 5 + [path for path in paths if path not in small]).read_text()
     how = dice.upto(14)
     if how >= 10:
         data = tomllib.loads(text)

@@ -1,0 +1,174 @@
+"""A phase of points, flown by an integrator with steps of variable length."""
+
+from __future__ import annotations
+
+import math
+import time as clock
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.errors import FlightError, StoppedError
+from rigidfleet.kernel import records
+from rigidfleet.kernel.engine import native, packing
+from rigidfleet.kernel.problem import Problem
+from rigidfleet.planning.tolerances import most_steps
+from rigidfleet.simulation.active_phase import ActivePhase, Stepper
+from rigidfleet.simulation.callbacks import Command, named
+from rigidfleet.simulation.diagnosis import diagnose
+from rigidfleet.simulation.recording import Unevaluated
+from rigidfleet.simulation.solver_setup import first_step, give_back, solved_by
+from rigidfleet.typing import Floats
+
+#: Greatest number of steps, and greatest wall time [s], after which the integrator returns to Python. For any
+#: size of formation, this is often enough for Ctrl-C and progress.
+_STEPS, _PAUSE = 2000, 0.05
+#: Least number of steps at the start of a phase: they may take a thousand times as long as those of the phase before.
+#: Without a user's force, steps of this many numbers in all take less than a tenth of `_PAUSE`.
+_FIRST_STEPS, _FIRST_NUMBERS = 10, 3000
+
+
+class Stretch(NamedTuple):
+    """What is integrated at a time: a problem, the times (K,) [s] to record, and the states (K, n) there."""
+
+    problem: Problem
+    times: Floats
+    samples: Floats
+    fresh: bool  # whether the derivative at the start is not known
+    first: float  # the first time after the start [s]
+
+
+class PointPhase(Stepper):
+    """A phase under way that points fly."""
+
+    def __init__(self, phase: ActivePhase) -> None:
+        super().__init__(phase)
+        #: Whether another thread searches the steps for extremes. It must not ask the user's force.
+        self.aside = False
+        #: Steps per call of the integrator; more once their duration is known.
+        self.steps = 0
+
+    def begin(self, y: Floats, t: float) -> None:
+        """Begin to integrate at a state (n,) and time [s]."""
+        phase, plan = self.phase, self.phase.plan
+        self.aside = plan.large and phase.external is None
+        phase.state = phase.extremes.begin(
+            y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances, aside=self.aside
+        )
+        if self.steps:  # after a loss
+            return
+        self.steps = _FIRST_STEPS
+        if phase.external is None:
+            self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(y))
+        if phase.solver is not None:
+            phase.state.clock[records.NEXT_STEP] = first_step(plan, phase.workspace, phase.state)
+
+    def fly(self, problem: Problem, t_end: float) -> None:
+        """Integrate to ``t_end`` [s] and record the samples on the way."""
+        phase = self.phase
+        stretch = self.prepare(problem, phase.times(t_end))
+        state, fresh = phase.state, stretch.fresh
+        status = records.PAUSED
+        go_on = native.Integration(
+            problem, phase.workspace, state, t_end, stretch.times, stretch.samples
+        )
+        try:
+            while status == records.PAUSED:
+                begun = clock.perf_counter()
+                most = phase.extremes.room(state) if self.aside else self.steps
+                status = go_on(fresh, min(self.steps, most))
+                took = max(clock.perf_counter() - begun, 1e-6)
+                if status == records.PAUSED:
+                    self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
+                fresh = False
+                if phase.external is not None:
+                    phase.external.check()
+                phase.check()
+                full = state.count[records.TRAILED] == len(state.trail.clock)
+                if self.aside:
+                    full = phase.extremes.room(state) < 1
+                if status == records.PAUSED or full:
+                    self.watch(last=False)
+                phase.pause(phase.t)
+                if status == records.PAUSED and self.stalled():
+                    break
+        finally:
+            self.record(stretch)
+        if status != records.FINISHED:
+            collapsed = status == records.COLLAPSED
+            own_force = phase.external is not None
+            raise StoppedError(diagnose(phase.place, own_force=own_force, collapsed=collapsed))
+
+    def watch(self, *, last: bool) -> None:
+        """Search the steps flown for extremes.
+
+        In a large formation, the search takes as long as the flight: another thread does it meanwhile. The user's
+        force, which may not be ready for two threads, is asked by one.
+        """
+        phase = self.phase
+        phase.extremes.wait()
+        if not phase.state.count[records.TRAILED] or self.flown is None:
+            return
+        work = phase.workspace if phase.solver is None else phase.solver.aside.workspace
+        if last or not self.aside:
+            phase.extremes.take(self.flown, work, phase.state, last=last)
+        else:
+            phase.extremes.hand_over(self.flown, work, phase.state)
+
+    def prepare(self, problem: Problem, times: Floats) -> Stretch:
+        """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
+        phase = self.phase
+        evaluations = phase.state.count[records.EVALUATIONS]
+        fresh = evaluations == 0 or problem is not phase.plan.problem
+        if fresh:
+            self.watch(last=True)
+            self.flown = problem
+            if phase.solver is not None:  # a solver keeps state: the monitor has its own
+                self.flown = solved_by(phase.solver.aside, problem)
+        phase.begun = True
+        samples = np.empty((len(times), len(phase.state.y)))
+        phase.state.count[records.SAMPLES] = 0
+        return Stretch(problem, times, samples, fresh, math.nextafter(phase.t, math.inf))
+
+    def record(self, stretch: Stretch) -> None:
+        """Store the samples of what was integrated since `prepare`."""
+        state, (problem, times, samples, _, first) = self.phase.state, stretch
+        done = int(state.count[records.SAMPLES])
+        tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0
+        if tried and len(times) and times[0] <= first:
+            samples[0], done = state.y, 1  # no step was possible: record the start alone
+        if done:
+            self._record(problem, times[:done], samples[:done])
+
+    def stalled(self) -> bool:
+        """Whether the phase takes far more steps than its duration explains."""
+        state, since = self.phase.state, self.phase.t - self.phase.plan.start
+        steps = int(state.count[records.ACCEPTED] + state.count[records.REJECTED])
+        return steps > most_steps(since)
+
+    def commanded(self, command: Command) -> Problem:
+        """Point masses take no command of vehicles."""
+        raise FlightError(
+            f"the controller returned {named(command)} at t = {self.phase.t:.3f} s, which point masses do not"
+            " take; return forces [N], or give the agents a vehicle"
+        )
+
+    def release(self) -> None:
+        """Give the workspace back."""
+        give_back(self.phase.plan.problem, self.phase.workspace)
+        if self.phase.solver is not None:
+            packing.forget()
+
+    def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
+        """Store the samples; forces and references at them are evaluated when they are asked for."""
+        phase, plan = self.phase, self.phase.plan
+        n, m = len(plan.masses), len(plan.edges)
+        setup = None if phase.solver is None else phase.solver.setup
+        given = Unevaluated(problem, plan.problem, samples, setup)
+        if phase.external is not None:  # a user's function is asked while it is at hand
+            given = given.evaluated(times, phase.workspace)
+        frame = np.full((len(times), 4), np.nan)
+        if plan.frame is not None:
+            q = samples[:, 6 * n + m : 6 * n + m + 4]
+            frame = q / np.linalg.norm(q, axis=1, keepdims=True)
+        phase.keep(times, given, samples[:, 6 * n : 6 * n + m], frame)

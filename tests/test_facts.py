@@ -1,0 +1,357 @@
+"""Facts to show: the same on a console, in a notebook, on a page and as JSON, and whole at any width."""
+
+import html
+import io
+import json
+import re
+import xml.etree.ElementTree as ET
+from collections import Counter
+from functools import cache
+from typing import Any
+
+import pytest
+from rich.console import Console
+from sample_flights import quadrotors, swarm
+from test_report import Page
+from test_sweep import everything
+
+import rigidfleet as rf
+from rigidfleet import plotting
+from rigidfleet._common.facts import Fact, Line, Row, Sheet, Table, value, worst_values
+from rigidfleet.cli import app, console
+from rigidfleet.math.margins import Margins
+from rigidfleet.mission import mission_names
+from rigidfleet.preflight.check import check
+from rigidfleet.reporting import html_page
+from rigidfleet.reporting.contents import contents
+from rigidfleet.sweep.summary import summarise
+from rigidfleet.tuning.outcome import Flown, Tuned
+
+SHOW = """
+schema_version = 1
+name = "lights"
+assignment = "each"
+[agents]
+mass = 0.3
+radius = 0.15
+thrust_limit = 6.5
+position = {shape = "grid", size = 2, count = 16, centre = [0, 0, 0.2]}
+[limits]
+separation = 0.5
+speed = 6.0
+vertical_speed = 3.0
+[formations.pads]
+shape = "grid"
+size = 2.0
+edges = []
+[formations.ball]
+shape = "sphere"
+size = 2.5
+edges = []
+colour = "#ffb000"
+[[obstacles]]
+kind = "ground"
+[[phases]]
+kind = "takeoff"
+height = 10.0
+duration = 8.0
+[[phases]]
+kind = "establish"
+formation = "ball"
+duration = 10.0
+[[phases]]
+kind = "reshape"
+formation = "pads"
+duration = 9.0
+[[phases]]
+kind = "land"
+duration = 8.0
+"""
+
+
+@pytest.fixture(scope="module")
+def flights() -> list[rf.Result]:
+    """A flight of points with edges that breaks limits, and one of quadrotors."""
+    return [swarm(4, 10.0), quadrotors(3, 20.0)]
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Figures of a page in no time."""
+    monkeypatch.setattr(plotting, "rendered", lambda *_: {"svg": b"<svg/>"})
+
+
+@cache
+def checked(name: str) -> Any:
+    """The check of a shipped mission, or of the show."""
+    return check(rf.Mission.from_toml(SHOW) if name == "show" else name)
+
+
+def printed(thing: Any, width: int = 400) -> str:
+    """What a console of some width shows."""
+    out = io.StringIO()
+    Console(width=width, file=out).print(thing)
+    return out.getvalue()
+
+
+def plain(text: str) -> str:
+    """Text with its blanks alike."""
+    return " ".join(text.split())
+
+
+def rows_of(text: str) -> list[str]:
+    """Each row of the tables of some HTML, as text."""
+    root = ET.fromstring(f"<all>{text.replace('<br>', '<br/>')}</all>")
+    rows = [" ".join("".join(cell.itertext()) for cell in row) for row in root.iter("tr")]
+    return [plain(row) for row in rows]
+
+
+def tuned() -> Tuned:
+    """A study that halved an error."""
+    before, after = (
+        Flown({"tracking.Q": q}, 2, 0, 2, {"tracking_error": [e, e]}) for q, e in ((1.0, 0.2), (4.0, 0.1))
+    )  # fmt: skip
+    margins = {"tracking": Margins(True, (0.1, 9.0), 1.0, 0.2)}
+    return Tuned("pair", "tracking", "tracking_error", before, after, (margins, margins), 4, 2, 0)
+
+
+SHOWN = {
+    "mission": lambda _: rf.load_mission("narrow-passage"),
+    "check": lambda _: checked("narrow-passage"),
+    "check of vehicles": lambda _: checked("crazyflies"),
+    "check of a show": lambda _: checked("show"),
+    "result": lambda flights: flights[0],
+    "verdict": lambda flights: rf.assess(flights[0]),
+    "verdict on quadrotors": lambda flights: rf.assess(flights[1]),
+    "summary of a sweep": lambda _: summarise(everything()),
+    "outcome of a study": lambda _: tuned(),
+}
+
+
+@pytest.mark.parametrize("what", SHOWN)
+def test_consoles_notebooks_and_pages_show_the_same_rows(what, flights):
+    """Each row of each table (name, values, units, level) is the same on a console, in a notebook and on a page."""
+    thing = SHOWN[what](flights)
+    sheet = thing.facts()
+    tables = [part for part in sheet.shown if isinstance(part, Table)]
+    notebook = rows_of(thing._repr_html_())
+    page = [row for table in tables for row in rows_of(table.html("kind"))]
+    assert page == notebook
+    lines = [plain(line) for line in printed(thing).splitlines()]
+    for table in tables:
+        rows = rows_of(table.html())
+        # Names of columns may stand in two lines there, and a repeated heading is not repeated.
+        body = rows if table.bare else rows[1:]
+        assert len(body) == len(table.rows) > 0
+        for row, cells in zip(body, table.texts, strict=True):
+            assert row in lines or plain(" ".join(cells[1:])) in lines, row
+    sentences = [part.text for part in sheet.shown if isinstance(part, Line)]
+    words = plain(html.unescape(thing._repr_html_().replace("<br>", " ")))
+    assert all(plain(text) in words for text in sentences)
+    assert all(plain(text) in plain(" ".join(lines)) for text in sentences)
+
+
+def near(text: str, number: float) -> bool:
+    """Whether a shown number is a number, rounded to at least two digits."""
+    return float(text) == pytest.approx(number, rel=0.05, abs=1e-12)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_a_verdict_shows_what_its_json_holds(flights, which):
+    """Name, value, unit and level of each check in JSON stand in a row, and no other rows do."""
+    verdict = rf.assess(flights[which])
+    data = json.loads(verdict.json())
+    head, *rows = rows_of(verdict.facts().shown[-len(verdict.notes) - 2].html())
+    assert head.startswith("check worst limit")
+    checks = [c for c in data["checks"] if c["worst"] is not None or c["when"] is not None]
+    for c, row in zip(checks, rows, strict=True):
+        name = c["check"].replace("_", " ") + ", at samples" * c["at_samples"]
+        level = "FAILED" if not c["passed"] else "ok" * c["judged"]
+        words = row.removeprefix(f"{name} ").split()
+        assert row.startswith(name)
+        if c["worst"] is not None:
+            assert near(words[0], c["worst"]), row
+            assert not c["unit"] or words[1] == c["unit"], row
+        assert words[-1] == level if level else words[-1] not in ("ok", "FAILED"), row
+    for phase, row in zip(
+        data["phases"], rows_of(verdict.facts().shown[0].html())[1:], strict=True
+    ):
+        numbers = row.removeprefix(phase["name"]).split()
+        values = {k: e["value"] for k, e in phase["worst"].items()}
+        wanted = [
+            phase["t_end"], phase["constraint"], values.get("constraint"), phase["shape"],
+            *(values.get(k) for k in ("separation", "clearance", "speed", "thrust")),
+        ]  # fmt: skip
+        wanted = [x for x in wanted if x is not None]
+        assert all(near(x, y) for x, y in zip(numbers, wanted, strict=True)), row
+
+
+@pytest.mark.parametrize("name", ["narrow-passage", "crazyflies", "show"])
+def test_a_check_shows_what_its_json_holds(name):
+    """Worst values of the plan with unit, limit, time and who, and each remark with its level, are those of JSON."""
+    ahead = checked(name)
+    data = json.loads(json.dumps(ahead.data(), allow_nan=False))
+    words = plain(printed(ahead))
+    paths, vehicles = data["paths"], data["vehicles"] or {}
+    worst: list[tuple[str, str, Any, str]] = [
+        ("separation", "m", paths["separation"], "separation_m"),
+        ("speed", "m/s", paths["speed"], "speed_m_s"),
+        ("vertical speed", "m/s", paths["vertical_speed"], "speed_m_s"),
+        ("thrust", "N", paths["thrust"], "thrust_n"),
+        ("rotor force", "N", vehicles.get("rotor_force"), "force_n"),
+        ("tilt", "deg", vehicles.get("tilt"), "tilt_deg"),
+        *(("clearance", "m", c, "clearance_m") for c in paths["clearance"]),
+    ]  # fmt: skip
+    tables = [part for part in ahead.facts().shown if isinstance(part, Table)]
+    rows = rows_of(next(table for table in tables if table.heads[0] == "planned").html())
+    rows = [row for row in rows[1:] if not row.startswith("spacing")]
+    wanted = [x for x in worst if x[2] is not None]
+    assert len(rows) == len(wanted)
+    for row, (what, unit, entry, key) in zip(rows, wanted, strict=True):
+        match = re.match(
+            rf"{what} (\S+) {re.escape(unit)} (?:[<>]=? (\S+) {re.escape(unit)} )?(\S+) (.*)$", row
+        )
+        assert match, row
+        assert near(match[1], entry[key])
+        assert float(match[3]) == pytest.approx(entry["time_s"], abs=0.006)
+        assert match[4].startswith(entry["who"])
+        if entry.get("limit_n") is not None:
+            assert near(match[2], entry["limit_n"])
+    assert all(
+        f"{r['level']} {plain(r['text'])}" in words or plain(r["text"]) in words
+        for r in data["remarks"]
+    )
+    for form, judged in data["formations"].items():
+        if (r := judged["rigidity"]) is not None and name != "show":
+            assert f"{form} {r['rigidity_class']}" in words
+            assert f"{r['edges']} edges, rank {r['rank']} of {r['needed']}" in words
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_page_has_the_tables_of_its_objects(flights):
+    """The report of a flight has the phases of its mission and the tables of its verdict, row by row."""
+    page = html_page(flights[0])
+    tables = re.findall(r"<table.*?</table>", page, flags=re.DOTALL)
+    rows = [row for table in tables for row in rows_of(table)]
+    for sheet in (flights[0].mission.facts(), rf.assess(flights[0]).facts()):
+        for part in sheet.shown:
+            if isinstance(part, Table):
+                assert all(row in rows for row in rows_of(part.html()))
+
+
+def test_a_show_is_checked_for_what_concerns_it():
+    """Spacing, start, speeds, proof and lights are told of tracked slots without edges; gains and rigidity are not."""
+    ahead = checked("show")
+    words = plain(printed(ahead))
+    assert not re.search(r"gains|overshoot|rigid|edges|distances", words), words
+    assert "spacing, centre to centre 2 m start" in words
+    assert "spacing, centre to centre 2.5 m 'ball'" in words
+    assert re.search(r"speed \S+ m/s <= 6 m/s", words)
+    assert re.search(r"vertical speed \S+ m/s <= 3 m/s", words)
+    assert "ball 1 colour of lights" in words
+    assert "proved no two agents come nearer" in words
+    heights = [planned.velocity[..., 2] for planned in ahead.planned_phases]
+    assert ahead.vertical_speed is not None
+    assert ahead.vertical_speed[0] == max(abs(v).max() for v in heights)
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_report_of_a_show_has_nothing_of_edges():
+    """A flight without edges has no gains of edges, no edges counted, and no row without a value."""
+    result = rf.simulate(rf.Mission.from_toml(SHOW))
+    page = contents([result], None, None)
+    words = Page(html_page(result)).text
+    assert not re.search(r"\(0 edges|no edges|overshoot|constraint f|tension|\|c\|", words), words
+    assert page["response"] is None
+    checks = page["flights"][0]["checks"][-1]
+    assert all(row[1] or row[3] for row in checks.texts)
+    assert "no edges" not in printed(rf.assess(result))
+
+
+def test_what_applies_to_no_row_is_not_shown():
+    """Columns without a value are left out, names of columns with them, and marks where nothing is judged."""
+    facts = [Fact("speed", 3.0, "m/s"), Fact("height", 12345.0, "m")]
+    assert worst_values("what", facts).texts == [["speed", "3 m/s"], ["height", "12345 m"]]
+    assert [name for name, *_ in worst_values("what", facts).columns] == ["what", "worst"]
+    judged = worst_values("what", [*facts, Fact("tilt", 9.0, "deg", 5.0, level="fails")])
+    assert judged.texts[-1] == ["tilt", "9 deg", "<= 5 deg", "FAILED"]
+
+
+@pytest.mark.parametrize(
+    ("x", "text"),
+    [(0.0, "0"), (0.00123, "0.00123"), (2.2e-5, "2.2e-05"), (999.4, "999"), (1234.4, "1234"), (123456.0, "1.2e+05")],
+)  # fmt: skip
+def test_numbers_have_three_digits(x, text):
+    """Numbers have three digits; whole ones below 100,000 all of theirs; others a power of ten."""
+    assert value(x) == text
+
+
+# -- width ---------------------------------------------------------------------------------------------
+
+
+def assert_whole(thing: Any, width: int) -> None:
+    """No line is wider than the console, and no word is cut or torn: they are those of a wide console."""
+    narrow, wide = printed(thing, width), printed(thing, 2000)
+    assert max(map(len, narrow.splitlines())) <= width
+    assert "…" not in narrow
+    missing = Counter(wide.split()) - Counter(narrow.split())
+    assert not missing, missing
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("what", SHOWN)
+def test_tables_fit_eighty_columns(what, width, flights):
+    """On 80 columns, and on more, each word and number is whole."""
+    assert_whole(SHOWN[what](flights), width)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", mission_names())
+def test_checks_of_shipped_missions_fit_eighty_columns(name):
+    """The check and the phases of every shipped mission are whole on 80 columns."""
+    for width in (80, 132):
+        assert_whole(check(name), width)
+        assert_whole(rf.load_mission(name), width)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", [n for n in mission_names() if n != "show-1000"])
+def test_verdicts_on_shipped_missions_fit_eighty_columns(name):
+    """The verdict on every shipped mission but the largest is whole on 80 columns."""
+    verdict = rf.assess(rf.simulate(name))
+    for width in (80, 132):
+        assert_whole(verdict, width)
+
+
+GRAPH = ["design", "shells", "--agents", "40", "--edges", "henneberg-multilevel"]
+
+
+@pytest.mark.parametrize(
+    "line", [["missions"], ["design", "cube"], pytest.param(GRAPH, marks=pytest.mark.long)]
+)
+def test_lists_of_the_command_fit_eighty_columns(line, capsys, monkeypatch):
+    """Tables of other verbs are whole on a terminal of 80 columns: no word of a wide one is missing."""
+    texts = []
+    for width in ("80", "400"):
+        console.console.cache_clear()
+        monkeypatch.setenv("COLUMNS", width)
+        monkeypatch.setenv("FORCE_COLOR", "1")
+        monkeypatch.setenv("NO_COLOR", "1")
+        assert app.main(line) == 0
+        out, err = capsys.readouterr()
+        texts.append(re.sub(r"\x1b\[[\d;]*m", "", out if line == ["missions"] else err))
+    console.console.cache_clear()
+    # A sentence is left to the terminal to wrap, so that it can be copied.
+    rows = [row for row in texts[0].splitlines() if not row.startswith("Look first")]
+    assert max(map(len, rows)) <= 80
+    assert not Counter(texts[1].split()) - Counter(texts[0].split())
+
+
+def test_too_many_columns_stand_in_two_tables():
+    """A table whose numbers do not fit stands as two, each with the first column; nothing is lost."""
+    heads = ["name", *(f"column{k} [m]" for k in range(12))]
+    table = Table(heads, [Row(["first", *(1.5 + k for k in range(12))])])
+    text = printed(Sheet("a", "b", [table]), 60)
+    assert max(map(len, text.splitlines())) <= 60
+    assert all(f"{1.5 + k:g}" in text.split() for k in range(12))
+    assert text.split().count("first") >= 2
