@@ -15,6 +15,7 @@ from rigidfleet.kernel.measured import nearest_of
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import pid, proximity
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.legs import phase_spans
 from rigidfleet.result import VARIABLES, Result
 from rigidfleet.result.result import LATER
 from rigidfleet.simulation.flight import Flight
@@ -225,9 +226,9 @@ def test_only_a_phase_that_settles_needs_the_time_to_settle(monkeypatch):
 
     monkeypatch.setattr(pid, "settling_time", settling_time)
     assert simulate(a_mission()).complete
-    settles = [{"kind": "hold", "settle": {}}]
+    phases = [*a_mission().to_dict()["phases"], {"kind": "hold", "settle": {}}]
     with pytest.raises(AssertionError, match="computed"):
-        simulate(a_mission(phases=[*a_mission().to_dict()["phases"], *settles]))
+        phase_spans(a_mission(phases=phases))
 
 
 def test_what_somebody_sets_is_not_made_later():

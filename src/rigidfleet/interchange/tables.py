@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rigidfleet.interchange.curves import ExportedMotion
-from rigidfleet.setpoints import Setpoints, csv
+from rigidfleet.setpoints import Setpoints, csv_text
 
 
 def write_table(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One table with a row for each time and vehicle."""
-    yield csv(motion.at_rate(rate)).encode()
+    yield csv_text(motion.at_rate(rate)).encode()
 
 
 def write_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
@@ -24,4 +24,4 @@ def write_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
             setpoints.yaw[:, only],
             setpoints.yaw_rate[:, only],
         )
-        yield csv(part, first=i + 1).encode()
+        yield csv_text(part, first=i + 1).encode()
