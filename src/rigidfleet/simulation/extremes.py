@@ -511,7 +511,7 @@ class Extremes(CurveWatch):
         if error.max() > 0.0:
             rows["tracking_error"] = error, state.worst_time[:, fleet.ERROR]
         share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
-        rows["saturation"] = share, np.full(self.n, state.clock[0])
+        rows["saturation"] = share, np.full(self.n, state.clock[fleet.TIME])
         for name, (values, times) in rows.items():
             i = int(values.argmax())
             self.of_vehicles[name] = Extremum(float(values[i]), float(times[i]), i, -1)
