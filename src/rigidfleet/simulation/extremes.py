@@ -356,7 +356,7 @@ class Extremes(CurveWatch):
         self._taking: Future[None] | None = None
         self._touching: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
-        self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
+        self.avoidance: avoidance.AvoidanceArrays | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
 
     def among(self, obstacles: Sequence[Obstacle]) -> None:
