@@ -26,7 +26,7 @@ from rigidfleet.interchange.curves import Deviation, ExportedMotion, deviation, 
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights
-from rigidfleet.setpoints import csv
+from rigidfleet.setpoints import csv_text
 
 __all__ = ["FORMATS", "Export", "Format", "FormatName", "export"]
 
@@ -68,7 +68,7 @@ class Format(NamedTuple):
 
 def _write_table(motion: ExportedMotion, rate: float | None) -> bytes:
     """The table that `Result.to_csv` writes: a row for each time and vehicle."""
-    return csv(motion.at_rate(rate), motion.first + 1).encode()
+    return csv_text(motion.at_rate(rate), motion.first + 1).encode()
 
 
 FORMATS: dict[str, Format] = {

@@ -11,7 +11,7 @@ from rigidfleet.errors import ResultError
 from rigidfleet.math import series
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result
-from rigidfleet.setpoints import Setpoints, at_rate, curve
+from rigidfleet.setpoints import Setpoints, at_rate, curve_of
 from rigidfleet.typing import Floats
 
 #: Tolerance of yaw [rad] of exported curves. Position does not depend on it.
@@ -63,7 +63,7 @@ class ExportedMotion:
 
     def curve(self, agent: int = 0) -> Piecewise:
         """The way of one of the vehicles, from 0: degree 7 (yaw: 3) between samples."""
-        return curve(self.samples, agent)
+        return curve_of(self.samples, agent)
 
 
 def fit_curve(
