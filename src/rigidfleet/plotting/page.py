@@ -73,14 +73,14 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
+    key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     entries = space.legend_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
         bbox_to_anchor=(0.5, 0.058), labelspacing=0.2,
     )  # fmt: skip
     fig.text(
-        0.5, 0.05, "\n".join(key[:3]), ha="center", va="top", fontsize=7.5, color=st.GREY,
+        0.5, 0.05, key, ha="center", va="top", fontsize=7.5, color=st.GREY,
         parse_math=False,
     )  # fmt: skip
     return fig

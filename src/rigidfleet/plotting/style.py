@@ -50,7 +50,6 @@ _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
 _DOT = _DPI / 100  # a hundredth of an inch [pixels]
 _OUTSIDE = 100  # cost of a text that leaves its axes
-_SLANT = 38.0  # slant of phase names that do not fit horizontally [deg]
 _LONGEST = 28  # greatest length of a phase name
 _POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
 #: Number of agents or edges beyond which the spread is drawn instead of each line.
@@ -528,32 +527,50 @@ def clean_name(name: str, longest: int = _LONGEST) -> str:
     return words if len(words) <= longest else words[: longest - 1].rstrip() + "…"
 
 
-def name_phases(axes: Iterable[Axes], result: Result) -> None:
-    """Write the phases' names along the top of axes, without overlaps, before the figure is laid out.
+def name_phases(axes: Sequence[Axes], result: Result) -> None:
+    """Write the phases' names along the top of axes; if one is too long, their numbers, with a key below the figure.
 
-    If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
-    phases are short, with a line to their phase. If even this is too narrow, the shortest phases have no name.
+    This comes before the layout, which makes room for the names: its width of the axes is estimated, with 20 % to spare
+    for a legend beside them.
     """
-    for ax in list(axes)[: 1 if is_narrow() else None]:
-        labels = _upright(ax, result) or _slanting(ax, result)
-        for label in labels:
-            label.set_gid("phase")
+    axes = axes[: 1 if is_narrow() else None]
+    for ax in axes:
+        per_second = 0.8 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
+        for name, start, end in _phase_spans(ax, result):
+            label = _label_phase(ax, clean_name(name, 60), start, end, fontsize=8)
+            if label.get_window_extent().width > per_second * (end - start):
+                break
+        else:
+            continue
+        break
+    else:
+        return
+    for ax in axes:
+        for label in [text for text in ax.texts if text.get_gid() == "phase"]:
+            label.remove()
+    letters = int(14 * figure_width(WIDTH))
+    key = textwrap.fill(number_phases(axes, result), letters, max_lines=5, placeholder=" …")
+    axes[0].figure.supxlabel(key, fontsize=7.5, color=GREY, parse_math=False)
+
+
+def _label_phase(ax: Axes, text: str, start: float, end: float, fontsize: float) -> Text:
+    return ax.text(
+        (start + end) / 2, 1.02, text, fontsize=fontsize, color=GREY, ha="center", va="bottom",
+        transform=ax.get_xaxis_transform(), parse_math=False, gid="phase",
+    )  # fmt: skip
 
 
 def number_phases(axes: Iterable[Axes], result: Result) -> str:
-    """Write the phases' numbers along the top of small axes; return the key to them.
+    """Write the phases' numbers along the top of axes; return the key to them.
 
     A number that does not fit is left out.
     """
     for ax in axes:
         right = -math.inf
         for i, (_, start, end) in enumerate(_phase_spans(ax, result)):
-            label = ax.text(
-                (start + end) / 2, 1.01, str(i + 1), fontsize=6.5, color=GREY, ha="center",
-                va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
-            )  # fmt: skip
+            label = _label_phase(ax, str(i + 1), start, end, fontsize=6.5)
             box = label.get_window_extent()
-            if box.x0 < right + _DOT:
+            if box.x0 < right + 2 * _DOT:
                 label.remove()
             else:
                 right = box.x1
@@ -562,50 +579,7 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
         f"{i + 1} {clean_name(p.kind if p.name == f'{p.kind} {i + 1}' else p.name)}"
         for i, p in enumerate(result.phases)
     )
-    return "  ·  ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
-
-
-def _upright(ax: Axes, result: Result) -> list[Text]:
-    labels = []
-    for name, start, end in _phase_spans(ax, result):
-        label = ax.text(
-            (start + end) / 2, 1.02, clean_name(name, 60), fontsize=8, color=GREY, ha="center",
-            va="bottom", transform=ax.get_xaxis_transform(), parse_math=False,
-        )  # fmt: skip
-        labels.append(label)
-        if label.get_window_extent().width > 0.9 * _per_second(ax) * (end - start):
-            for drawn in labels:
-                drawn.remove()
-            return []
-    return labels
-
-
-def _slanting(ax: Axes, result: Result) -> list[Text]:
-    scale, t0 = _per_second(ax), ax.get_xlim()[0]
-    size = 7.5
-    # Slanted texts need a distance that depends on their height and slant.
-    pitch = 1.25 * size * ax.figure.dpi / 72 / math.sin(math.radians(_SLANT))
-    room = int(scale * np.diff(ax.get_xlim())[0] / pitch)
-    longest = sorted(_phase_spans(ax, result), key=lambda span: span[1] - span[2])[:room]
-    spans = sorted(longest, key=lambda span: span[1])
-    middle = np.array([(start + end) / 2 - t0 for _, start, end in spans]) * scale
-    place = np.maximum(_apart(middle, pitch), pitch * np.arange(len(middle)))
-    above = 6 * ax.figure.dpi / 72 / ax.bbox.height
-    labels = []
-    middle, place = middle / scale + t0, place / scale + t0
-    for (name, *_), at in zip(spans, place.tolist(), strict=True):
-        label = ax.text(
-            at, 1 + above, clean_name(name), fontsize=size, color=GREY, ha="left", va="baseline",
-            rotation=_SLANT, rotation_mode="anchor", transform=ax.get_xaxis_transform(),
-            parse_math=False,
-        )  # fmt: skip
-        labels.append(label)
-    gap = np.full_like(place, np.nan)  # all pointers are one line
-    ax.plot(
-        np.column_stack([middle, place, gap]).ravel(), [1, 1 + 0.8 * above, np.nan] * len(place), color=FAINT,
-        linewidth=0.6, clip_on=False, transform=ax.get_xaxis_transform(),
-    )  # fmt: skip
-    return labels
+    return "Phases:  " + "  ·  ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
 
 
 def _phase_spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
@@ -614,24 +588,3 @@ def _phase_spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
     return [
         (p.name, max(p.t_start, low), min(p.t_end, high)) for p in result.phases if p.t_start < high
     ]
-
-
-def _per_second(ax: Axes) -> float:
-    """Pixels per second, underestimated: the layout comes later, as it needs the names.
-
-    It widens axes beside which nothing stands by up to 20 %, and narrows those beside a legend by up to 9 %.
-    """
-    return 0.9 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
-
-
-def _apart(places: Floats, pitch: float) -> Floats:
-    """Ascending positions, moved as little as possible (least squares) to be at least `pitch` apart."""
-    # Pool adjacent violators on the positions minus their least distances.
-    blocks: list[list[float]] = []
-    for value in places - pitch * np.arange(len(places)):
-        blocks.append([float(value), 1.0])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            (b, n), (a, m) = blocks.pop(), blocks.pop()
-            blocks.append([(a * m + b * n) / (m + n), m + n])
-    level = np.repeat([b[0] for b in blocks], [int(b[1]) for b in blocks])
-    return level + pitch * np.arange(len(places))
