@@ -52,10 +52,6 @@ def _installed_versions() -> dict[str, str]:
     return versions
 
 
-def _versions() -> dict[str, str]:
-    return dict(_installed_versions())
-
-
 def _timestamp() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
@@ -217,7 +213,7 @@ class Result(Shown):
     complete: bool = True
     ending: str = ""
     statistics: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=_versions)
+    versions: dict[str, str] = field(default_factory=lambda: dict(_installed_versions()))
     platform: str = field(default_factory=platform.platform)
     created: str = field(default_factory=_timestamp)
 
@@ -282,14 +278,6 @@ class Result(Shown):
     def _set(self, name: str, array: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims, dtype = _CHECKED[name]
-        if (
-            type(array) is np.ndarray
-            and array.dtype is dtype
-            and array.shape == tuple([sizes.get(dim) for dim in dims])
-            and array.flags.c_contiguous
-        ):
-            self.__dict__[name] = array
-            return
         value = np.ascontiguousarray(array, dtype=dtype)
         expected = tuple(sizes.get(dim, "any") for dim in dims)
         if value.ndim != len(expected) or any(
@@ -586,7 +574,7 @@ _HINTS = get_type_hints(Result, include_extras=True)
 
 def _variable(hint: Any, *, optional: bool) -> Variable:
     """The declaration that stands beside the type of a field: dimensions | unit | meaning."""
-    dims, units, text = hint.__metadata__[0].split(" | ")
+    dims, units, text = hint.__metadata__[0].split(" | ", 2)
     return Variable(
         tuple(dims.split()), units, text, hint.__origin__ in (Ints, Ints | None), optional
     )
