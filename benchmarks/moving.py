@@ -27,7 +27,7 @@ from crowds import PERIOD, THRUST, kernel, on_parabolas
 
 from rigidfleet.kernel.avoidance import candidates, sight
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import Packed, pack_once
+from rigidfleet.kernel.engine.packing import Packed, pack
 from rigidfleet.solids.records import Solids, ball, join, single
 from rigidfleet.typing import Floats
 
@@ -159,9 +159,9 @@ def prepared(given: Scene, method: str) -> tuple[Any, list[Packed]]:
         len(given.slots), radius=RADIUS, solids=things, separation=0.1, clearance=0.05,
         seen=sight(things, RANGE, NOISE, SWERVE), **METHODS[method],
     )  # fmt: skip
-    law = [pack_once(problem), pack_once(work)]
+    law = [pack(problem), pack(work)]
     a.law[:] = [each.address for each in law]
-    return state, [pack_once(flight), pack_once(state), pack_once(a), *law]
+    return state, [pack(flight), pack(state), pack(a), *law]
 
 
 def take_least(least: Floats, x: Floats, w: Floats, rise: Floats) -> None:

@@ -239,7 +239,7 @@ def test_an_access_list(base, monkeypatch):
 def test_owners_without_a_number(which, base, monkeypatch):
     """In a container of an ordinary user the machine's root shows as nobody, who may own what leads to the cache where
     not everyone can make a folder, but neither the cache nor what is in it."""
-    monkeypatch.setattr(cache, "_unnamed", lambda: SOMEONE)
+    monkeypatch.setattr(cache, "_overflow_user", lambda: SOMEONE)
     chosen = {"last": place(base), "file": planted(base)}.get(which, base)
     os.chown(chosen, SOMEONE, -1)
     if which == "shared":

@@ -341,7 +341,9 @@ def test_lists_of_the_command_fit_eighty_columns(line, capsys, monkeypatch):
         out, err = capsys.readouterr()
         texts.append(re.sub(r"\x1b\[[\d;]*m", "", out if line == ["missions"] else err))
     console.console.cache_clear()
-    assert max(len(row) for row in texts[0].splitlines()) <= 80
+    # A sentence is left to the terminal to wrap, so that it can be copied.
+    rows = [row for row in texts[0].splitlines() if not row.startswith("Look first")]
+    assert max(map(len, rows)) <= 80
     assert not Counter(texts[1].split()) - Counter(texts[0].split())
 
 

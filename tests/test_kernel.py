@@ -921,9 +921,9 @@ def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkey
         seen.add(type(x).__name__)
         return real(x)
 
-    real = packing.pack
-    monkeypatch.setattr(packing, "pack", pack)
-    monkeypatch.setattr(native, "pack", pack)
+    real = packing.pack_anew
+    monkeypatch.setattr(packing, "pack_anew", pack)
+    monkeypatch.setattr(native, "pack_anew", pack)
     packing._last.packed.clear()
     simulate(mission).evaluate()
     assert {"Problem", "Workspace", "IntegratorState", "Monitor", "Record", "Segment"} <= seen

@@ -100,6 +100,7 @@ class Draw:
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
         self.smooth = self.likely(0.7)
+        self.body = not self.smooth and self.likely(0.2)
         self.place, self.shape = np.array([1.5, 0.0, 6.0]), "frame"
         self.formed = True  # whether vehicles are in the shape: each may have gone a way of its own
         self.phases: list[dict[str, Any]] = []
@@ -177,6 +178,8 @@ class Draw:
         self.add(kind="hold", duration=3.0)
 
     def reshape(self) -> None:
+        if self.body:  # by distances alone, it might flip
+            return
         names = [name for name in SHAPES if name != self.shape]
         self.shape = str(self.rng.choice(names))
         table: dict[str, Any] = {"kind": "reshape", "formation": self.shape} | self.lasting(8.0)
@@ -186,7 +189,7 @@ class Draw:
             table["transition"] = str(self.rng.choice(ways))
         elif self.likely(0.3):
             table["alignment"] = "none"
-        if table.get("transition", "straight") == "straight" and self.likely(0.2):
+        if self.smooth and "transition" not in table and self.likely(0.3):
             self.place = self.place + [0.5, 0.0, 0.5]
             table["position"] = self.place.tolist()
         self.add(**table)
@@ -234,9 +237,9 @@ class Draw:
         }  # fmt: skip
         if self.smooth:
             data["smoothness"] = "jerk"
-        elif self.likely(0.2):
+        elif self.body:
             data["architecture"] = "body"
-        if self.likely(0.3):
+        if self.likely(0.4) and not (self.body or self.open or lossless):
             lost = {
                 "agent": int(self.rng.integers(1, 5)),
                 "time": round(self.rng.uniform(10, 40), 2),

@@ -1072,6 +1072,19 @@ def test_reading_missions_waits_for_no_compiler():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+def test_a_mission_builds_the_models_that_it_has():
+    """Models of what it lacks are not built, and what reads files of others is not imported."""
+    code = (
+        "import sys; from rigidfleet.mission import load_mission, kinds, obstacles, schema; load_mission('square'); "
+        "unused = [schema.Vehicle, schema.Autopilot, schema.Constraint, schema.Tracking, schema.Disturbances, "
+        "kinds.Go, kinds.Follow, obstacles.Heights]; "
+        "print(*(m.__name__ for m in unused if m.__pydantic_complete__)); "
+        "print(*(m for m in ('difflib', 'rigidfleet.foreign.files', 'rigidfleet._common.tables') if m in sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.split() == []
+
+
 @pytest.mark.parametrize("value", [REMOVED, 0, []])
 def test_a_formation_with_errors_in_a_plane_is_a_finding(value):
     """Where a formation of dimension 2 has no distances, or wrong ones, the check says so and computes no slots."""

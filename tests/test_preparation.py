@@ -15,6 +15,7 @@ from rigidfleet.kernel.measured import nearest_of
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import pid, proximity
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.legs import phase_spans
 from rigidfleet.result import VARIABLES, Result
 from rigidfleet.result.result import LATER
 from rigidfleet.simulation.flight import Flight
@@ -100,7 +101,7 @@ def test_words_are_those_of_a_walk_through_the_tuple(k):
     packing._flatten(x, code, words, arrays)
     layout = packing._layout(type(x))
     assert layout.known
-    packed = packing.pack(x)
+    packed = packing.pack_anew(x)
     assert bytes(packed.words)[: 8 * len("".join(code))] == layout.code.pack(*words)
 
 
@@ -119,9 +120,9 @@ def test_arguments_of_other_types_are_refused(wrong):
     """Machine code gets nothing that it would misread."""
     native._code()
     segment = examples()[4]
-    packing.pack(segment)
+    packing.pack_anew(segment)
     with pytest.raises(TypeError):
-        packing.pack(segment._replace(**wrong))
+        packing.pack_anew(segment._replace(**wrong))
 
 
 def test_singular_values_come_when_they_are_asked_for(tmp_path):
@@ -225,9 +226,9 @@ def test_only_a_phase_that_settles_needs_the_time_to_settle(monkeypatch):
 
     monkeypatch.setattr(pid, "settling_time", settling_time)
     assert simulate(a_mission()).complete
-    settles = [{"kind": "hold", "settle": {}}]
+    phases = [*a_mission().to_dict()["phases"], {"kind": "hold", "settle": {}}]
     with pytest.raises(AssertionError, match="computed"):
-        simulate(a_mission(phases=[*a_mission().to_dict()["phases"], *settles]))
+        phase_spans(a_mission(phases=phases))
 
 
 def test_what_somebody_sets_is_not_made_later():
@@ -323,10 +324,10 @@ def test_distances_taken_over_are_those_computed():
 def test_a_copy_of_what_is_packed_has_the_addresses_of_its_own_arrays():
     """A deep copy of a flight that has not been evaluated keeps nothing of the original."""
     times = np.linspace(0.0, 2.5, 7)
-    given = packing.pack(records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)))
+    given = packing.pack_anew(records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)))
     for other in (copy.deepcopy(given), pickle.loads(pickle.dumps(given))):
         assert other.of.times is not times
-        assert bytes(other.words) == bytes(packing.pack(other.of).words)
+        assert bytes(other.words) == bytes(packing.pack_anew(other.of).words)
     result = simulate(load_mission("square"))
     other = copy.deepcopy(result)
     np.testing.assert_array_equal(

@@ -1,6 +1,8 @@
 """A quantity with its limit is one entry: whoever reads limits finds each one that a flight fails by."""
 
 import math
+import sqlite3
+from contextlib import closing
 from functools import cache
 from typing import Any
 
@@ -19,8 +21,10 @@ from rigidfleet.preflight.findings import Preflight
 from rigidfleet.reporting import html_page
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
-from rigidfleet.sweep import METRICS
+from rigidfleet.sweep import METRICS, Sweep, read
 from rigidfleet.sweep.metrics import measure
+from rigidfleet.sweep.record import RunRecord
+from rigidfleet.sweep.store import FILE, Store
 
 FLY = {"kind": "fly", "position": [8.0, 4.0, 9.0], "duration": 4.0}
 POINTS = three_points({"blend": 3.0, "until": 3.5}, FLY)
@@ -214,3 +218,28 @@ def test_metrics_of_a_calm_flight_are_those_of_its_checks():
     assert values["speed"] >= np.linalg.norm(result.velocity, axis=2).max()
     assert math.isnan(values["jerk"])
     assert set(values) == set(METRICS)
+
+
+def test_a_store_of_an_earlier_version_is_read_and_goes_on(tmp_path):
+    """A metric that it lacks is not known of its runs; more runs have it, and keep what was there."""
+    sweep = Sweep.of(rf.Mission.from_dict(POINTS), ["agents.radius.* *= uniform(0.1, 1)"], runs=2)
+    codes = [
+        tuple(c.variation.code(v) for c, v in zip(sweep.columns, sweep.values(k), strict=True))
+        for k in (0, 1)
+    ]
+    rows = [
+        RunRecord(k, True, "", "", codes[k], {name: float(k + 1) for name in METRICS}, 0.1)
+        for k in (0, 1)
+    ]
+    with Store(tmp_path, sweep) as store:
+        store.add(rows[:1])
+    with closing(sqlite3.connect(tmp_path / FILE)) as db:
+        db.execute("ALTER TABLE runs DROP COLUMN vertical_jerk")
+    table = read(tmp_path)
+    assert np.isnan(table.metrics["vertical_jerk"]).tolist() == [True]
+    assert table.metrics["speed"].tolist() == [1.0]
+    with Store(tmp_path, sweep) as store:
+        store.add(rows[1:])
+    table = read(tmp_path)
+    np.testing.assert_array_equal(table.metrics["vertical_jerk"], [np.nan, 2.0])
+    assert table.metrics["steps"].tolist() == [1.0, 2.0]

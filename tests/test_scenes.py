@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import rigidfleet as rf
+from rigidfleet import plotting
 from rigidfleet.mission import json_schema, mission_names
 from rigidfleet.mission.text import FIRST, GROUPS
 
@@ -137,3 +138,9 @@ def test_groups_hold_every_mission_once():
     assert all(GROUPS.values())
     assert sorted(name for names in GROUPS.values() for name in names) == mission_names()
     assert set(FIRST) <= set(mission_names())
+
+
+def test_waypoints_above_each_other_have_one_label():
+    """Five vehicles that land one by one move the formation's middle straight down in five parts, with one label."""
+    space, *_ = plotting.trajectory(rf.simulate("hill-search")).axes
+    assert [text.get_text().strip() for text in space.texts].count("land 4") == 1

@@ -212,7 +212,7 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
     assert batch.fit_together(problems)
     begin, end = plans[0][0].start, plans[0][0].t_end
     tables = codegen.Tables([p.disturbance for p in problems]).between(begin, end)
-    ready = codegen.unroll_together(problems, tables)
+    ready = codegen.unrolled_together(problems, tables)
     random = np.random.default_rng(0)
     middle = 0.7 * begin + 0.3 * end
     # The last stage of a step is at the moment of the one before.
@@ -241,13 +241,13 @@ def test_problems_that_branch_differently_share_no_code():
         problems.append(p._replace(law=p.law._replace(k_def=0.0)) if k == 3 else p)
     assert batch.fit_together(problems)
     with pytest.raises(UnfitError):
-        codegen.unroll_together(problems, {})
+        codegen.unrolled_together(problems, {})
 
 
 def test_arrays_of_eight_flights_become_lanes():
     """Lane k holds the numbers of array k."""
     parts = [np.arange(6.0).reshape(2, 3) + 10 * k for k in range(8)]
-    made = codegen.interleave(parts, (6,))
+    made = codegen.interleaved(parts, (6,))
     for k, part in enumerate(parts):
         np.testing.assert_array_equal(unpack(made)[:, k], part.ravel())
     assert empty((3, 2)).ctypes.data % 64 == 0

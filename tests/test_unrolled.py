@@ -75,7 +75,7 @@ def call(p, y, dy, t):
 
 def in_lanes(p: Problem, y: np.ndarray, t: float) -> np.ndarray:
     """dy/dt (8, n) of states y (8, n); the code leaves out positions, whose derivatives are velocities."""
-    ready = codegen.unroll(p)
+    ready = codegen.unrolled(p)
     before = pack(np.repeat(p.reference.d0[:, None], 8, axis=1))
     dy = pack(np.zeros_like(y.T))
     call(ready._replace(before=before), pack(y.T), dy, t)

@@ -7,6 +7,7 @@ data (`to_dict`) from which the sheet is made.
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -178,12 +179,11 @@ class Table:
         rows = [*self.texts] if self.bare else [heads, *self.texts]
         lines = [[x for row in rows for x in row[k].split("\n")] for k in range(len(heads))]
         widths = [max(map(cell_len, column), default=0) for column in lines]
-        long = [
-            max((cell_len(x) for s in column for x in s.split()), default=0) for column in lines
-        ]
-        least = [
-            x if words else w for x, w, (*_, words) in zip(long, widths, self.columns, strict=True)
-        ]
+        least = []
+        for column, width, (*_, words) in zip(lines, widths, self.columns, strict=True):
+            # An indentation belongs to the first word.
+            parts = (cell_len(x) for s in column for x in re.findall(r"^ *\S+|\S+", s))
+            least.append(max(parts, default=0) if words else width)
         while sum(widths) > room:
             k = max(range(len(widths)), key=lambda k: (widths[k] > least[k], widths[k]))
             if widths[k] <= least[k] and len(heads) > 3:

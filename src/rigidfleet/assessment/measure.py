@@ -339,14 +339,22 @@ class Measurements:
             fit.limit = self.mission.formations[name].greatest_error(fit.shortest)
         return fits
 
+    @cached_property
+    def turns(self) -> dict[int, Floats]:
+        """Matrices (2, 3, 3) from the slots' axes to how they should lie at the end of each phase flown.
+
+        A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+        """
+        last = [self.samples[k].stop - 1 for k in self.flown]
+        q = np.stack([self.result.attitude_reference[last], self.result.frame[last]], axis=1)
+        return dict(zip(self.flown, att.dcm_from_quaternion(q).swapaxes(2, 3), strict=True))
+
     def flip(self, index: int) -> float | None:
         """Angle [deg] of a line or plane from its intended direction at the end of a phase that has one."""
-        fit, k = self.fits.get(index), self.samples[index].stop - 1
+        fit = self.fits.get(index)
         if fit is None or fit.dimension not in (1, 2):
             return None
-        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        q = np.array([self.result.attitude_reference[k], self.result.frame[k]])
-        aims = (att.dcm_from_quaternion(q).swapaxes(1, 2) @ fit.axis).tolist()
+        aims = (self.turns[index] @ fit.axis).tolist()
         if fit.dimension == 1:
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             aims = aims[:1] if self.result.phases[index].control == "tracking" else []

@@ -149,13 +149,14 @@ def list_barriers(r, v, lost, a):
             gap = L - a.room[i] - a.room[j] - a.spare[i] - a.spare[j]
             soft = a.share * (a.soft[i] + a.soft[j])
             across = (X * X + Y * Y + Z * Z - s * s) * inverse
+            # A point with a lag flies on for it; of a quadrotor, the point led knows its lags.
             if soft == 0.0:
                 gap -= max(0.0, -s) * max(a.lag[i], a.lag[j])
                 needed = needed_rate(gap, s, across, a.share * both, a.rate)
             else:
                 needed = needed_rate(gap, s, across, a.share * both, a.rate, soft)
             have = n[0] * (c[0] - d[0]) + n[1] * (c[1] - d[1]) + n[2] * (c[2] - d[2])
-            if needed > have - both:
+            if needed > have - both:  # one that others may yet push into it is listed, too
                 violated = violated or needed > have
                 count = add_row(count, i, j, e, n, needed - have, both, a)
         for o in range(a.solids.kind.shape[0]):
@@ -221,6 +222,7 @@ def relax(k, a):
     """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
     i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
     rest = a.missing[k] - relative(i, j, n, a.shift)
+    # Over-relaxed, then back between its bounds: projected Gauss-Seidel converges for any factor below 2.
     push = min(max(a.push[k] + _BEYOND * rest * a.reduced[k], 0.0), a.most[k])
     more = push - a.push[k]
     if more == 0.0:
@@ -302,42 +304,44 @@ def finish(count, p, w, a):
     whole = size + m
     if whole == 0:
         return False
-    for x in range(whole):
-        barrier = x < size
-        k = a.active[x] if barrier else x - size
-        i = a.rows[k, 0] if barrier else p.graph.edges[k, 0]
-        j = a.rows[k, 1] if barrier else p.graph.edges[k, 1]
-        n = a.normals[k] if barrier else w.u[k]
-        for y in range(x + 1):
-            other = y < size
-            l = a.active[y] if other else y - size
-            c = a.rows[l, 0] if other else p.graph.edges[l, 0]
-            d = a.rows[l, 1] if other else p.graph.edges[l, 1]
-            a.system[x, y] = entry(i, j, n, c, d, a.normals[l] if other else w.u[l], a)
-        if not barrier:
-            a.system[x, x] += softness(k, p, a)
-        # What is left by the pushes found and by those at their bounds
-        a.right[x] = -relative(i, j, n, a.shift)
-        if barrier:
-            a.right[x] += a.missing[k]
+    # The unknowns are corrections of pushes, then of pulls. A push at a bound stays: the sweeps have chosen it.
+    for row in range(whole):
+        i, j, n = line(row, size, p, w, a)
+        for column in range(row + 1):
+            k, l, other = line(column, size, p, w, a)
+            a.system[row, column] = entry(i, j, n, k, l, other, a)
+        # What is left by the pushes so far and by those at their bounds
+        a.right[row] = -relative(i, j, n, a.shift)
+        if row < size:
+            a.right[row] += a.missing[a.active[row]]
         else:
-            a.right[x] -= softness(k, p, a) * a.pull[k]
+            soft = softness(row - size, p, a)
+            a.system[row, row] += soft
+            a.right[row] -= soft * a.pull[row - size]
     if not cholesky(a.system[:whole, :whole]):
         return False
     cholesky_solve(a.system[:whole, :whole], a.right[:whole])
-    for x in range(size):
-        push = a.push[a.active[x]] + a.right[x]
-        if not 0.0 <= push <= a.most[a.active[x]]:
+    for row in range(size):
+        push = a.push[a.active[row]] + a.right[row]
+        if not 0.0 <= push <= a.most[a.active[row]]:
             return False
-    for x in range(whole):
-        k = a.active[x] if x < size else x - size
-        if x < size:
-            a.push[k] += a.right[x]
-            shove(a.rows[k, 0], a.rows[k, 1], a.normals[k], a.right[x], a)
+    for row in range(whole):
+        i, j, n = line(row, size, p, w, a)
+        shove(i, j, n, a.right[row], a)
+        if row < size:
+            a.push[a.active[row]] += a.right[row]
         else:
-            a.pull[k] += a.right[x]
-            shove(p.graph.edges[k, 0], p.graph.edges[k, 1], w.u[k], a.right[x], a)
+            a.pull[row - size] += a.right[row]
     return True
+
+
+@compiled
+def line(row, size, p, w, a):
+    """Vehicles and unit vector of a row of the system: of one of ``size`` barriers, or after these of an edge."""
+    if row < size:
+        k = a.active[row]
+        return a.rows[k, 0], a.rows[k, 1], a.normals[k]
+    return p.graph.edges[row - size, 0], p.graph.edges[row - size, 1], w.u[row - size]
 
 
 @compiled
@@ -400,6 +404,7 @@ def filter_accelerations(t, r, v, lost, p, w, a):
         if pushed > 0.0:
             a.acted[BARRIER, i] += 1
             a.first[BARRIER, i] = min(a.first[BARRIER, i], t)
+        # Edges let go and take hold gradually, over `release`: forces do not jump.
         aim = 1.0 - min(1.0, pushed / (_FULL * a.weight[i] * a.b[i]))
         a.hold[i] += (aim - a.hold[i]) * min(1.0, a.period / a.release)
         if a.hold[i] > 1.0 - 1e-6:

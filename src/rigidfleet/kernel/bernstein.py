@@ -54,6 +54,7 @@ def lowest(work, degree, floor):
                 best, at = value, piece[start] + piece[width]
         elif value < best:
             best, at = value, piece[start]
+        # Of a square s, an error e of its root is an error 2 e sqrt(s) + e^2 of s.
         close = CLOSE
         if degree == 8:
             close = CLOSE * (2.0 * math.sqrt(min(abs(best), size)) + CLOSE)
@@ -63,6 +64,7 @@ def lowest(work, degree, floor):
         if not bound < best - close or piece[width] <= _SHORTEST:
             top -= 1
             continue
+        # De Casteljau: the first numbers of all levels are the left half, what is left of the last one the right.
         left = work[top + 1]
         half = 0.5 * piece[width]
         left[start], left[width] = piece[start], half
@@ -171,6 +173,7 @@ def shortest(curve, floor, work, pieces):
                 far += piece[3 * k + q] * piece[3 * k + q]
             along, size = min(along, dot), max(size, far)
         top -= 1
+        # All control points lie beyond a plane across the middle one that is farther than the best length.
         if middle > 0.0 and not along < best * math.sqrt(middle):
             continue
         start = length_at(piece, 0.0)

@@ -125,18 +125,20 @@ def keeps(i, v, j, s, floor, a):
     the nearest point of the chord.
     """
     mine, other, rise = a.trial, a.ways[j], a.rise[j]
-    if a.soft[i] + a.soft[j] > 0.0:
+    if a.soft[i] + a.soft[j] > 0.0:  # quadrotors, by their hulls
         return between_hulls(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
+    # After the tick: from then on both may brake, and their stop segments only shrink.
     if between_segments(mine[1], mine[2], other[1], other[2]) < floor:
         return False
+    # During the tick: the chord of the relative path, and how far the path may be from it.
     x, y, z = mine[0, 0] - other[0, 0], mine[0, 1] - other[0, 1], mine[0, 2] - other[0, 2]
-    u = mine[1, 0] - other[1, 0] - x
-    w = mine[1, 1] - other[1, 1] - y
-    k = mine[1, 2] - other[1, 2] - z
-    length, share = u * u + w * w + k * k, 0.0
+    chord_x = mine[1, 0] - other[1, 0] - x
+    chord_y = mine[1, 1] - other[1, 1] - y
+    chord_z = mine[1, 2] - other[1, 2] - z
+    length, share = chord_x * chord_x + chord_y * chord_y + chord_z * chord_z, 0.0
     if length > 0.0:
-        share = min(max(-(x * u + y * w + z * k) / length, 0.0), 1.0)
-    n0, n1, n2 = x + share * u, y + share * w, z + share * k
+        share = min(max(-(x * chord_x + y * chord_y + z * chord_z) / length, 0.0), 1.0)
+    n0, n1, n2 = x + share * chord_x, y + share * chord_y, z + share * chord_z
     size = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
     if size < floor or size == 0.0:
         return size >= floor
@@ -158,8 +160,10 @@ def clears(i, v, far, a):
         if a.sight.moves[o] != 0:
             continue
         floor = a.walls[i, o]
+        # Farther away than it can come: most obstacles take one distance.
         if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
+        # Its stop segment after the tick, then its path over the tick as in `keeps`: a parabola beyond the chord.
         after = a.ways[i, 4] if a.soft[i] > 0.0 else way[1]
         bound, _, _ = from_obstacle(after, way[2], o, a.solids, floor, normal)
         if bound < floor:
@@ -207,6 +211,7 @@ def interaction_range(u, c, a):
 @compiled
 def list_neighbours(r, lost, way, a):
     """List for each vehicle those within a distance ``way`` [m]; returns False if the list is too short."""
+    # By sweep and prune: along the axis in which the fleet is widest, only those within ``way`` are compared.
     n, order = a.b.shape[0], a.order
     axis, widest = 0, -1.0
     for q in range(3):
@@ -223,6 +228,7 @@ def list_neighbours(r, lost, way, a):
         order[at] = i
     for i in range(n + 1):
         a.start[i] = 0
+    # First to count, so that each list begins where the one before ends; then to write.
     for fill in range(2):
         for k in range(n):
             i = order[k]
@@ -264,17 +270,18 @@ def greatest(x):
 @compiled
 def moved_apart(r, a):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
+    # What all have gone together changes no distance: a fleet that travels keeps its lists.
     n, farthest = a.b.shape[0], 0.0
-    x, y, z = 0.0, 0.0, 0.0
+    mean_x, mean_y, mean_z = 0.0, 0.0, 0.0
     for i in range(n):
-        x += (r[i, 0] - a.listed[i, 0]) / n
-        y += (r[i, 1] - a.listed[i, 1]) / n
-        z += (r[i, 2] - a.listed[i, 2]) / n
+        mean_x += (r[i, 0] - a.listed[i, 0]) / n
+        mean_y += (r[i, 1] - a.listed[i, 1]) / n
+        mean_z += (r[i, 2] - a.listed[i, 2]) / n
     for i in range(n):
-        u = r[i, 0] - a.listed[i, 0] - x
-        v = r[i, 1] - a.listed[i, 1] - y
-        w = r[i, 2] - a.listed[i, 2] - z
-        farthest = max(farthest, u * u + v * v + w * w)
+        x = r[i, 0] - a.listed[i, 0] - mean_x
+        y = r[i, 1] - a.listed[i, 1] - mean_y
+        z = r[i, 2] - a.listed[i, 2] - mean_z
+        farthest = max(farthest, x * x + y * y + z * z)
     return math.sqrt(farthest)
 
 
@@ -356,6 +363,7 @@ def set_floors(t, r, v, lost, a):
             a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
         take(i, max(predict(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+    # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
             continue
@@ -452,7 +460,7 @@ def choose(i, r, v, a):
         away = 0.0
         for q in range(3):
             away += (c[q] - wanted[q]) ** 2
-        if away >= best:
+        if away >= best:  # before it is tried: distances cost far more
             continue
         far = predict(i, r[i], v[i], c, a, a.trial)
         if not safe(i, r, v, far, a):
@@ -585,6 +593,7 @@ def avoid(p, w, flight, state, a):
         if lost[i]:
             continue
         free = alone(i, a) or not a.guarded
+        # Its choice counts for those that come after it, who keep their distances from it: the order makes the proof.
         how = 0 if free else choose(i, r, v, a)
         if free:
             for q in range(3):

@@ -306,6 +306,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
     axes, curve = 2 if below else 3, monitor.curve
     for k in range(pairs.shape[0]):
         i, j = pairs[k, 0], pairs[k, 1]
+        # Surfaces that overlap count by how deep, so that the floor may be below the sum of the radii.
         radii = monitor.radius[i] + monitor.radius[j]
         floor = monitor.worst[kind] + radii
         if apart(i, j, axes, radii if below else floor, monitor):
@@ -362,6 +363,7 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
 @compiled
 def clearance_of_interest(i, monitor):
     """Clearance of agent i from which on it is worse than what is stored."""
+    # A clearance is stored under three names, and is of no interest only if it is worse than none of them.
     own = monitor.worst[FLYING]
     if monitor.standing[i] != 0:
         own = max(own, monitor.worst[STANDING])
@@ -584,6 +586,7 @@ def promise(c, a, b, v, ta, tb, tc, p, monitor):
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
     not positive if there is nothing to expect.
     """
+    # Newton's divided differences: slopes of the two chords, and half the second derivative.
     left, right = (b - a) / (tb - ta), (v - b) / (tc - tb)
     bend = (right - left) / (tc - ta)
     if not (left >= 0.0 and right <= 0.0 and bend < 0.0):
@@ -628,9 +631,11 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
         values[0, c], values[1, c], values[2, c] = before[c], middle[c], after[c]
     for k in range(3):
         at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
+    # Entries peak at different times: the most promising one is looked at first, and all are judged there.
     for count in range(3, at.shape[0]):
         in_step = step if top <= end_of(step, state) else step + 1
         evaluate(top, in_step, p, w, state, monitor, values[count])
+        # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
         while at[rank[k - 1]] > top:
             rank[k] = rank[k - 1]

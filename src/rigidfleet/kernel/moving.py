@@ -43,7 +43,7 @@ _FLOW_RATE, _WIDER, _WEAK = 4.0, 1.2, 1e-3
 def expect(o, T, sight):
     """Predict the track of obstacle o by T [s]: constant velocity, with white noise of its acceleration."""
     x, P = sight.track[o], sight.spread[o]
-    q = sight.swerve * sight.swerve * _LASTS
+    q = sight.swerve * sight.swerve * _LASTS  # density of the noise [m^2/s^3]
     for axis in range(3):
         x[axis] += T * x[3 + axis]
     P[0] += T * (2.0 * P[1] + T * (P[2] + q * T / 3.0))
@@ -174,6 +174,7 @@ def brake_beside(i, o, v, a, out):
 def way_to_rest(u, b, lag, T):
     """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
     change = b * T
+    # A command holds for a whole period, so that the last one brakes by less: the way is a little more than u^2 / 2b.
     n = math.floor(u / change)
     rest = u - n * change
     return T * (n * (u - 0.5 * n * change) + 0.5 * rest) + lag * u
@@ -227,6 +228,7 @@ def room_beside(i, v, a):
         far = T * (before + 0.5 * T * math.sqrt(rise)) + stop
         if from_solid(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
             continue
+        # Three distances: of the stop segment after the tick, of the chord of the tick, and of the parabola beyond it.
         for q in range(3):
             out[2, q] = out[1, q] + stop / max(after, 1e-12) * out[2, q]
         bound, value, _ = from_obstacle(out[1], out[2], o, a.solids, floor, normal)

@@ -277,7 +277,7 @@ def workspace(
     return w
 
 
-def clear(w: Workspace) -> Workspace:
+def cleared(w: Workspace) -> Workspace:
     """The workspace as it was made; all its arrays lie in one memory."""
     memory = w.r.base
     assert memory is not None
@@ -287,7 +287,7 @@ def clear(w: Workspace) -> Workspace:
     return w
 
 
-def padded_size(count: int) -> int:
+def padded(count: int) -> int:
     """``count`` rounded up to a multiple of 8: the numbers in a cache line, and the lanes of a `lanes` value."""
     return -(-count // 8) * 8
 
@@ -295,10 +295,10 @@ def padded_size(count: int) -> int:
 def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
     """Arrays of zeros, each aligned to a cache line."""
     sizes = [math.prod(shape) for shape in shapes.values()]
-    ends = list(accumulate(map(padded_size, sizes)))
+    ends = list(accumulate(map(padded, sizes)))
     memory = zeros(ends[-1])
     return {
-        name: memory[end - padded_size(size) :][:size].reshape(shape)
+        name: memory[end - padded(size) :][:size].reshape(shape)
         for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
     }
 

@@ -9,15 +9,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.problem import (
-    Extents,
-    PerAgent,
-    Places,
-    PlacesInTime,
-    Vector,
-    padded_size,
-    zeros,
-)
+from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, padded, zeros
 from rigidfleet.typing import Bools, Floats, Ints
 
 PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
@@ -149,7 +141,7 @@ class Monitor(NamedTuple):
 def monitor(
     radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **changes: Any
 ) -> Monitor:
-    """A new monitor without values; pairs are listed only if ``changes`` among the fields."""
+    """A new monitor without values; pairs are listed only if they are among the ``changes`` of fields."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
     fields: dict[str, Any] = {
         "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
@@ -197,7 +189,7 @@ def integrator(
     """
     n = len(y)
     count = np.empty(FIRST_ROW + 1, dtype=np.int64)
-    state = IntegratorState(np.empty(n), zeros(10, padded_size(n)), np.empty(3), count, rtol, trail)
+    state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
     return integrator_in(state, y, t, rtol=rtol, atol=atol, step=step)
 
 
@@ -256,17 +248,8 @@ def recorder(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
 
     Unless ``disturbed``, there are no rows of what disturbances alone give.
     """
-    agent, edge, when_disturbed = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
-    shapes = (
-        *(agent,) * 7,
-        *(edge,) * 5,
-        agent,
-        (k, 6),
-        (k, 3),
-        (k, 3, 3),
-        (k, 6),
-        *(when_disturbed,) * 3,
-    )
+    agent, edge, seen = (k, n, 3), (k, m), (k if disturbed else 0, n, 3)
+    shapes = *(agent,) * 7, *(edge,) * 5, agent, (k, 6), (k, 3), (k, 3, 3), (k, 6), *(seen,) * 3
     return Record._make([np.empty(shape) for shape in shapes])
 
 

@@ -8,7 +8,7 @@ from rigidfleet.mission.kinds import Go, Phase
 from rigidfleet.mission.schema import Formation
 
 
-def told_apart(
+def with_own_names(
     formations: Mapping[str, Formation], phases: Sequence[Phase]
 ) -> tuple[dict[str, Formation], tuple[Phase, ...]]:
     """Formations and phases in which no formation is taken on two ways that need different slots.
@@ -17,7 +17,7 @@ def told_apart(
     its slots, on the way back from a formation that was reached from it, and wherever it comes from the same one as
     before: there the same slots are as good. After a take-off, or a landing one by one, there is no formation.
     """
-    known, told = dict(formations), []
+    known, renamed = dict(formations), []
     ways: set[tuple[str | None, str]] = set()
     before: str | None = None
     latest: dict[str, str] = {}  # by written name, the name in use
@@ -27,7 +27,7 @@ def told_apart(
             if phase.vertical is not None and phase.vertical.each:
                 before = None
                 ways = {way for way in ways if way[0] is not None}
-            told.append(phase)
+            renamed.append(phase)
             continue
         written = shaping.formation
         name = latest.get(written, written)
@@ -40,18 +40,17 @@ def told_apart(
         ways.add((before, name))
         if before is not None:
             ways.add((name, before))
-        told.append(phase if name == written else phase.model_copy(update={"formation": name}))
+        renamed.append(phase if name == written else phase.model_copy(update={"formation": name}))
         before = name
-    return known, tuple(told)
+    return known, tuple(renamed)
 
 
-def scaled(
+def with_scales(
     formations: Mapping[str, Formation], phases: Sequence[Phase], n: int
 ) -> dict[str, Formation]:
     """Formations with those added that phases of kind "go" may shrink: "NAME x 0.8"."""
     known = dict(formations)
-    asked = [phase for phase in phases if isinstance(phase, Go)]
-    for phase in asked:
+    for phase in (phase for phase in phases if isinstance(phase, Go)):  # alone has keys for this
         for scale in phase.scales:
             for name, form in formations.items():
                 slots = form.slot_array(n)

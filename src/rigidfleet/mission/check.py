@@ -133,14 +133,14 @@ def _tables(m: Draft) -> None:
         if key in m.data:
             data = m.data[key]
             if key == "agents":
-                data = vehicles.equipped(m, _placed(m, data))
+                data = vehicles.fleet_table(m, _with_points(m, data))
             part = None if data is None else m.validate(kind, data, (key,))
             m.parts |= {} if part is None else {key: part}
     if "agents" not in m.data:
         m.add(("agents",), "is missing", "add a table [agents] with mass and position")
 
 
-def _placed(m: Draft, agents: Any) -> Any:
+def _with_points(m: Draft, agents: Any) -> Any:
     """Return [agents] with a shape of `position` replaced by its points; None if the shape has errors."""
     path, position = ("agents", "position"), look_up(agents, ("position",))
     if isinstance(position, str):
@@ -288,10 +288,10 @@ def _regulators(m: Draft) -> Breaches:
                 yield Breach((*below, "S"), problem, remedy, weights.S)
         if m.right(("lqr",), "R") and m.right(path, "R"):
             inherited = look_up(m.data, (*path, "R")) is None
-            yield from _unbounded(weights, () if inherited else below, ".".join(path))
+            yield from _bounded_gains(weights, () if inherited else below, ".".join(path))
 
 
-def _unbounded(weights: Regulator | Tracking, below: Keys, name: str) -> Breaches:
+def _bounded_gains(weights: Regulator | Tracking, below: Keys, name: str) -> Breaches:
     """R is large enough beside the other weights."""
     most = max(*weights.Q, *getattr(weights, "S", ()))
     if _FREE * most > weights.R:
@@ -305,7 +305,7 @@ def _tracking(m: Draft) -> Breaches:
         problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
         yield Breach("Q", problem, "for example, give Q = [4.0, 4.0]")
     if m.right(("tracking",), "Q"):
-        yield from _unbounded(m.tracking, (), "tracking")
+        yield from _bounded_gains(m.tracking, (), "tracking")
 
 
 def _allocation(m: Draft) -> Breaches:
@@ -321,7 +321,7 @@ def _limits(m: Draft) -> Breaches:
     """Limits have an effect."""
     limits = m.limits
     if limits.geofence is not None:
-        yield from _ordered(limits.geofence, ("geofence",))
+        yield from _corners(limits.geofence, ("geofence",))
     if limits.separation_altitude is not None and limits.separation is None:
         problem = "has no effect without separation"
         yield Breach("separation_altitude", problem, "remove it or add separation")
@@ -348,7 +348,7 @@ def _yaw(m: Draft) -> Breaches:
             yield Breach(key, problem, f"remove it or use kind = '{kind}'")
 
 
-def _ordered(box: Any, below: Keys) -> Breaches:
+def _corners(box: Any, below: Keys) -> Breaches:
     """The lowest corner of a box is below the highest."""
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
         if low >= high:
@@ -367,6 +367,6 @@ def _obstacles(m: Draft) -> Breaches:
         if (thing := m.validate(kind, data, path, {"name": name})) is not None:
             m.keep(path, obstacles.rules(m, thing, path))
             if isinstance(thing, obstacles.Box):
-                yield from _ordered(thing, path)
+                yield from _corners(thing, path)
             things.append(thing)
     m.parts["obstacles"] = tuple(things)

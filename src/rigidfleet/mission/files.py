@@ -74,17 +74,17 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
         name = named.table[named.key]
         content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
         rows, colours, notes = named.read(content, str(path.parent / name))
-        told = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
+        origin = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         if notes:
-            told += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
-        digests.append(f"# {named.where}: {told}\n")
+            origin += f"{_DOUBTS}{' '.join('; '.join(notes).split())}"
+        digests.append(f"# {named.where}: {origin}\n")
         del named.table[named.key]
         if named.becomes == "trajectories":
             named.table.pop("units", None), named.table.pop("axes", None)
         named.table[named.becomes] = rows
         written = "".join(f"  {row!r},\n" for row in rows)
         line = re.compile(rf"^([ \t]*){named.key}\s*=\s*([\"']){re.escape(name)}\2", re.MULTILINE)
-        put = f"# {told}\n{named.becomes} = [\n{written}]"
+        put = f"# {origin}\n{named.becomes} = [\n{written}]"
         if colours is not None and named.becomes == "slots" and "colour" not in named.table:
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"

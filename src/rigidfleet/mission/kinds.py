@@ -1,7 +1,5 @@
 """The kinds of phases: their keys with unit and meaning, and the properties by which other modules tell them apart."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -87,17 +85,17 @@ class AnyPhase(Part):
     )
 
     @property
-    def shaping(self) -> Shaping | None:
+    def shaping(self) -> "Shaping | None":
         """The phase if it takes a formation, else None."""
         return self if isinstance(self, Shaping) else None
 
     @property
-    def establishing(self) -> Establish | None:
+    def establishing(self) -> "Establish | None":
         """The phase if it also attaches the body frame to its formation, else None."""
         return self if isinstance(self, Establish) else None
 
     @property
-    def steering(self) -> Steering | None:
+    def steering(self) -> "Steering | None":
         """The phase if the regulators of [lqr] steer it to a goal of its own, else None."""
         return self if isinstance(self, Steering) else None
 
@@ -136,12 +134,12 @@ class AnyPhase(Part):
         return None
 
     @property
-    def points(self) -> tuple[Through, ...]:
+    def points(self) -> "tuple[Through, ...]":
         """Points to pass on the way."""
         return ()
 
     @property
-    def vertical(self) -> Vertical | None:
+    def vertical(self) -> "Vertical | None":
         """The phase if it leads vehicles straight up or down, else None."""
         return self if isinstance(self, Vertical) else None
 
@@ -151,8 +149,8 @@ class AnyPhase(Part):
         return True
 
     @property
-    def bends(self) -> bool:
-        """Whether bent ways of its vehicles are to be found before the flight."""
+    def bent(self) -> bool:
+        """Whether the phase leads its vehicles on bent ways to a formation."""
         return False
 
     @property
@@ -302,9 +300,9 @@ class Reshape(Shaping):
         return self.transition == "straight"
 
     @property
-    def bends(self) -> bool:
-        """Whether ways are to be found."""
-        return self.transition == "ways"
+    def bent(self) -> bool:
+        """Whether ways have been found, or given."""
+        return self.control_points is not None
 
 
 class Steering(Attitude, AnyPhase):

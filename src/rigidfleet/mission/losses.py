@@ -70,7 +70,7 @@ def _vehicles(m: Draft, d: Disturbances) -> Breaches:
     for k, one in enumerate(d.lost):
         path = (_TABLE, "lost", k)
         again = "is lost twice" if one.agent in lost[:k] else ""
-        yield from _lost(m, (*path, "agent"), (one.agent,), again)
+        yield from _loss(m, (*path, "agent"), (one.agent,), again)
         yield from _in_time(m, one.time, path)
     if m.n is not None and len(set(lost)) >= m.n:
         yield Breach((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
@@ -91,11 +91,11 @@ def _links(m: Draft, d: Disturbances) -> Breaches:
     pairs = [tuple(sorted(one.between)) for one in links]
     for k, one in enumerate(links):
         path, pair = (_TABLE, "links", "lost", k), pairs[k]
-        if pair[0] == pair[1] and _known(m, pair):
+        if pair[0] == pair[1] and _exist(m, pair):
             problem = "joins an agent to itself"
             yield Breach((*path, "between"), problem, "give two agents")
         else:
-            yield from _lost(
+            yield from _loss(
                 m, (*path, "between"), pair, "is lost twice" if pair in pairs[:k] else ""
             )
         yield from _in_time(m, one.time, path)
@@ -111,13 +111,13 @@ def _links(m: Draft, d: Disturbances) -> Breaches:
             yield Breach(("phases", k, "control"), problem, "use control = 'tracking'", p.control)
 
 
-def _known(m: Draft, agents: Sequence[int]) -> bool:
+def _exist(m: Draft, agents: Sequence[int]) -> bool:
     return m.n is None or all(1 <= agent <= m.n for agent in agents)
 
 
-def _lost(m: Draft, where: Keys, agents: Sequence[int], again: str) -> Breaches:
+def _loss(m: Draft, where: Keys, agents: Sequence[int], again: str) -> Breaches:
     """Agents exist, and are not lost again."""
-    if not _known(m, agents):
+    if not _exist(m, agents):
         yield Breach(where, "there is no such agent", f"agents are numbered from 1 to {m.n}")
     elif again:
         yield Breach(where, again, "remove one of the two")

@@ -21,7 +21,7 @@ from rigidfleet.math import constraint_jacobian
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
-from rigidfleet.mission.changes import scaled, told_apart
+from rigidfleet.mission.changes import with_own_names, with_scales
 from rigidfleet.mission.check import check, defaults
 from rigidfleet.mission.describe import counted, ending, goal
 from rigidfleet.mission.files import digests
@@ -129,9 +129,11 @@ class Mission(Contents, Shown):
         """
         parts = check(data, origin)
         if parts["assignment"] == "each":
-            parts["formations"], parts["phases"] = told_apart(parts["formations"], parts["phases"])
+            parts["formations"], parts["phases"] = with_own_names(
+                parts["formations"], parts["phases"]
+            )
         n = len(parts["agents"].position)
-        parts["formations"] = scaled(parts["formations"], parts["phases"], n)
+        parts["formations"] = with_scales(parts["formations"], parts["phases"], n)
         mission = cls.model_construct(set(parts), **defaults() | parts)
         mission._data, mission._text, mission._origin = data, text, origin
         return mission

@@ -276,7 +276,7 @@ def _orbit(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
         yield Breach("rate_deg_s", problem, "use a lower rate or several phases")
 
 
-def _ended(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
+def _tracked_way(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
     """A phase with a way of its own has tracked slots and a time of arrival."""
     if p.control == "body":
         problem = f"kind '{p.kind}' cannot be flown by a wrench on the virtual body"
@@ -288,7 +288,7 @@ def _ended(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
 
 def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
     """A take-off or a landing has what its groups need, and agents that exist."""
-    yield from _ended(m, p, k, longest)
+    yield from _tracked_way(m, p, k, longest)
     if p.stagger is None:
         if "by" in p.model_fields_set:
             yield Breach("by", "has no effect without stagger", "remove it")
@@ -304,7 +304,7 @@ def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
 
 def _go(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
     """A way can be found and flown: tracked slots, an end, and formations that exist."""
-    yield from _ended(m, p, k, longest)
+    yield from _tracked_way(m, p, k, longest)
     for name in p.formations or ():
         yield from _exists(m, name, "formations")
 
@@ -315,7 +315,7 @@ _JUMPS = ((0.01, "m"), (0.1, "m/s"))
 
 def _follow(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
     """There are trajectories, without jumps, one for the virtual body or one for each vehicle, and an end."""
-    yield from _ended(m, p, k, longest)
+    yield from _tracked_way(m, p, k, longest)
     if p.trajectories is None:
         problem, remedy = "is missing", "give the name of a file with trajectories"
         if p.file is not None:
@@ -389,7 +389,7 @@ def _reshape(m: Draft, p: Reshape, k: int, _: float | None) -> Breaches:
 
 
 _OWN: dict[str, Callable[[Draft, Any, int, float | None], Breaches]] = {
-    "brake": _ended,
+    "brake": _tracked_way,
     "establish": _establish,
     "follow": _follow,
     "land": _vertical,

@@ -1,7 +1,5 @@
 """Values of a mission file: numbers within bounds, vectors, lists; and `Part`, the base of all its tables."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from pydantic import (

@@ -241,7 +241,7 @@ def _model(vehicle: Vehicle) -> Breaches:
         yield Breach("attitude_gains", problem, remedy, list(x.attitude_gains))
 
 
-def equipped(m: Draft, agents: Any) -> Any:
+def fleet_table(m: Draft, agents: Any) -> Any:
     """The table [agents], with masses and thrust limits of its vehicles; None if they cannot be known."""
     if not isinstance(agents, dict) or "vehicle" not in agents:
         if m.vehicles and isinstance(agents, dict):

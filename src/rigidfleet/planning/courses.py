@@ -94,7 +94,7 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
 def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
     """Stay, or go to the phase's own place; slots may go on bent ways."""
     rest = _stay(mission, phase, now, t_end)
-    if phase.control_points is None:
+    if not phase.bent:
         return rest
     control, blend = np.array(phase.control_points), seconds(phase.blend)
     knots, ways = Piecewise.b_spline(control, blend)
@@ -230,9 +230,9 @@ def misled(phase: Phase, now: PhaseState) -> str:
 
 def _misled_slots(phase: Reshape, now: PhaseState) -> str:
     """What keeps a change of shape from following its bent ways, if it has any."""
-    if phase.control_points is None:
+    if not phase.bent:
         return ""
-    first = np.array(phase.control_points[0])
+    first = np.array(phase.control_points)[0]
     far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
     return "" if far < _LED[0] else "begins in other slots than the phase before has led to"
 

@@ -16,7 +16,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
 from rigidfleet.planning.courses import height
-from rigidfleet.planning.legs import depart, leg_from, leg_of, phase_spans
+from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import limits_of, reached
 from rigidfleet.planning.reference import PhaseState
 
@@ -34,8 +34,8 @@ _KEPT = 1.01
 _LEVEL = 1e-3
 
 
-def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
-    """The phases that follow the loss of a vehicle or link, from the state at that moment.
+def after_loss(mission: Mission, now: PhaseState) -> list[Leg]:
+    """The legs of the phases that follow the loss of a vehicle or link, from the state at that moment.
 
     Parameters
     ----------
@@ -44,19 +44,19 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
     d = mission.disturbances
     assert d is not None
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
-    phases: list[Phase] = []
+    legs: list[Leg] = []
 
     def then(make: Callable[[float], Phase], least: float = _SHORTEST) -> None:
         nonlocal now
-        phases.append(make(_shortest(mission, now, make, least)))
-        now = leg_of(mission, phases[-1], now).after
+        legs.append(_shortest(mission, now, make, least))
+        now = legs[-1].after
 
     then(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
         if until > now.t:
-            phases.append(Hold(kind="hold", name="hold (loss)", until=until))
-        return phases
+            legs.append(leg_of(mission, Hold(kind="hold", name="hold (loss)", until=until), now))
+        return legs
     name = d.landing_formation
     if name is not None and name != now.formation:
         spread = partial(Reshape, kind="reshape", name="spread (loss)", formation=name)
@@ -74,13 +74,13 @@ def after_loss(mission: Mission, now: PhaseState) -> list[Phase]:
         )
         land = partial(Land, kind="land", name="land (loss)")
         then(lambda t: land(duration=t), max(least, _SHORTEST))
-    return phases
+    return legs
 
 
 def _shortest(
     mission: Mission, now: PhaseState, make: Callable[[float], Phase], least: float
-) -> float:
-    """The time [s] from ``least`` on, to within a tenth, in which a phase keeps the limits.
+) -> Leg:
+    """The leg of a phase of the shortest time from ``least`` [s] on, to within a tenth, that keeps the limits.
 
     Where the state at the start is beyond a limit, that counts as the limit. If no time keeps them, the best one tried.
     """
@@ -92,7 +92,7 @@ def _shortest(
     def shares(reference: Reference, motion: Motion, end: float) -> np.ndarray:
         return np.array([x.share for x in reached(limits, reference, motion, now.t, end)])
 
-    best, time = (math.inf, least), least
+    best, least_worst, time = None, math.inf, least
     departure = depart(mission, make(time), now)
     allowed: np.ndarray | None = None
     for _ in range(_TRIES):
@@ -101,8 +101,10 @@ def _shortest(
             begun = shares(leg.reference, leg.motion, now.t + 1e-9 * max(1.0, now.t))
             allowed = np.maximum(begun, 1.0)
         worst = float((shares(leg.reference, leg.motion, leg.end) / allowed).max())
+        if best is None or worst < least_worst:
+            best, least_worst = leg, worst
         if worst <= _KEPT:
-            return time
-        best = min(best, (worst, time))
+            break
         time *= _LONGER
-    return best[1]
+    assert best is not None
+    return best

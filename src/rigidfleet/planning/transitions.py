@@ -60,13 +60,10 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
-        if phase.bends:
+        if not phase.spelled:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
-            report(f"looking for ways of the agents in '{phase.name}'")
-            room = _room(mission.rewritten(so_far) if tables else mission, len(tables), timed)
-            parts = [_bent(mission, k, table, phase, before, room)]
-        elif not phase.spelled:
-            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before)
+            room = partial(_room, mission, so_far, timed)
+            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, room)
             forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
@@ -76,12 +73,17 @@ def expanded(mission: Mission, timed: Timed) -> Mission:
 
 #: Phases as tables, and the formations that they take on the way.
 _Parts = tuple[list[dict[str, Any]], dict[str, Any]]
+#: Corners (2, 3) [m] of the room for bent ways (`_room`).
+_Room = Callable[[], Floats]
 
 
-def _layered(
-    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None
-) -> _Parts:
-    """The phases of a transition by layers; the phase alone if its straight ways will do."""
+def _transition(
+    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, room: _Room
+) -> _Parts:  # fmt: skip
+    """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do."""
+    if phase.transition == "ways":
+        report(f"looking for ways of the agents in '{phase.name}'")
+        return [_bent(mission, number, table, phase, before, room())], {}
     stops = _stops(mission, number, phase, before)
     if stops is None:
         return [table], {}
@@ -91,8 +93,8 @@ def _layered(
 
 
 def _staggered(
-    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None
-) -> _Parts:
+    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, _: _Room
+) -> _Parts:  # fmt: skip
     """The phases of a staggered take-off or landing, one for each group.
 
     Raises
@@ -132,22 +134,24 @@ def _staggered(
 
 
 #: What takes the place of each kind of phase that may not be flown as it is written.
-_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None], _Parts]] = {
+_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None, _Room], _Parts]] = {
     "land": _staggered,
-    "reshape": _layered,
+    "reshape": _transition,
     "takeoff": _staggered,
 }
 
 
-def _room(mission: Mission, phases: int, timed: Timed) -> Floats:
-    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly after some phases.
+def _room(mission: Mission, so_far: dict[str, Any], timed: Timed) -> Floats:
+    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly after phases ``so_far``.
 
     These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides
     if its axes are along the world's. Infinite where that, or the place of the formation, is not known.
     """
     box = np.array([[-np.inf] * 3, [np.inf] * 3])
-    now = at_start(mission)
-    for number, phase in enumerate(mission.phases[:phases]):
+    now, tables = at_start(mission), so_far["phases"]
+    if tables:
+        mission = mission.rewritten(so_far)
+    for number, phase in enumerate(mission.phases[: len(tables)]):
         if phase.replaced:
             return box
         leg = timed(mission, phase, now, number)
@@ -175,7 +179,7 @@ def _bent(
     mission: Mission,
     number: int,
     table: dict[str, Any],
-    phase: Any,
+    phase: Reshape,
     before: str | None,
     within: Floats,
 ) -> dict[str, Any]:

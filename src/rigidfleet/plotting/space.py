@@ -254,7 +254,8 @@ def draw_space(
     if 0 < len(edges) <= _LINES:
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
-    for name, (x, y, z) in view.waypoints:
+    labels = {(name, x, y): z for name, (x, y, z) in view.waypoints}  # once above each other
+    for (name, x, y), z in labels.items():
         ax.text(
             x, y, z, f"  {name}", fontsize=7.5, zorder=8, va="bottom", parse_math=False,
             path_effects=st.halo(),

@@ -64,7 +64,7 @@ def check(
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
     planned, known = preview(mission)
-    found = Preflight(formations, check_gains(mission, formations), planned, mission)
+    found = Preflight(mission, formations, check_gains(mission, formations), planned)
     found.speed = greatest_speed(planned, slice(3))
     found.vertical_speed = greatest_speed(planned, slice(2, 3))
     if not known:

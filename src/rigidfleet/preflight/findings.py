@@ -35,6 +35,16 @@ MANY = 12
 #: A limit is exceeded only by more than this rounding error.
 SLACK = 1e-9
 
+#: Worst values of the planned paths: the key of each in JSON, and its unit.
+_WORST = {
+    "separation": ("separation_m", "m"), "speed": ("speed_m_s", "m/s"), "vertical_speed": ("speed_m_s", "m/s"),
+    "thrust": ("thrust_n", "N"),
+}  # fmt: skip
+#: Forces of disturbances in words.
+_FORCES = {
+    "air": "steady wind", "gusts": "gusts (3 sigma)", "weight": "weight error", "noise": "noise (3 sigma)",
+}  # fmt: skip
+
 Level = Literal["fails", "note"]
 
 
@@ -216,13 +226,6 @@ class VehicleCheck:
     jump: tuple[float, float, float, str] | None
     beyond: tuple[float, str, str, str] | None = None
 
-    @property
-    def worst(self) -> Iterator[Fact]:
-        """What is nearest to a limit, or greatest."""
-        force, t, who, limit, _ = self.rotor_force
-        yield Fact("rotor force", force, "N", limit, when=t, who=who)
-        yield Fact("tilt", self.tilt[0], "deg", when=self.tilt[1], who=self.tilt[2])
-
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
@@ -241,9 +244,9 @@ class Preflight(Shown):
 
     Attributes
     ----------
+    mission : with its times known
     formations, gains : checks of the formations and of the constraint law
     planned_phases : planned paths of each phase
-    mission : with its times known
     separation : minimum separation [m], its time [s] and the agents
     speed, vertical_speed : greatest planned ones [m/s], their times [s] and agents
     thrust : maximum planned thrust [N], its time [s], the agent and its limit [N]
@@ -265,10 +268,10 @@ class Preflight(Shown):
     ...     print(heading, fact)
     """
 
+    mission: Mission
     formations: list[FormationCheck]
     gains: GainsCheck
     planned_phases: list[PlannedPhase]
-    mission: Mission | None = None
     separation: tuple[float, float, str] | None = None
     speed: tuple[float, float, str] | None = None
     vertical_speed: tuple[float, float, str] | None = None
@@ -291,13 +294,9 @@ class Preflight(Shown):
     @property
     def is_show(self) -> bool:
         """Whether slots alone concern the user: all phases track them, of many agents, or without edges."""
-        mission = self.mission
-        return (
-            mission is not None
-            and mission.n_agents > 1
-            and (mission.n_agents > MANY or not len(mission.edges))
-            and all(phase.control == "tracking" for phase in mission.phases)
-        )
+        many = self.mission.n_agents > MANY or not len(self.mission.edges)
+        tracked = all(phase.control == "tracking" for phase in self.mission.phases)
+        return self.mission.n_agents > 1 and many and tracked
 
     def __repr__(self) -> str:
         fails = sum(remark.level == "fails" for remark in self.remarks)
@@ -306,19 +305,18 @@ class Preflight(Shown):
         return f"<Preflight: {verdict}, {notes} note{'s' * (notes != 1)}>"
 
     def facts(self) -> Sheet:
-        """The phases, the facts, and the remarks; of a mission without edges, nothing that concerns edges."""
-        about = ("about", "result")
-        parts = [] if self.mission is None else [self.mission.phase_table]
-        parts += [
-            Table(about, [*map(Row, self._rows())], ("result",), bare=True),
-            worst_values("planned", self._worst()),
-            Table(about, [Row((r.level, r.text), r.level) for r in self.remarks], ("result",), bare=True),
-        ]  # fmt: skip
+        """The phases, the facts, and the remarks; of a show, nothing that concerns edges."""
+        name, heads = self.mission.name, ("about", "result")
+        remarks = [Row((r.level, r.text), r.level) for r in self.remarks]
         verdict = "no problems found" if self.passed else "the flight will fail"
-        name = "Check" if self.mission is None else self.mission.name
-        line = Line(f"{name}: {verdict}", "ok" if self.passed else "fails")
-        size = "" if self.mission is None else f"valid: {self.mission.size_in_words}"
-        return Sheet(name, size, [*parts, line])
+        parts = [
+            self.mission.phase_table,
+            Table(heads, [*map(Row, self._rows())], heads, bare=True),
+            worst_values("planned", self._worst()),
+            Table(heads, remarks, heads, bare=True),
+            Line(f"{name}: {verdict}", "ok" if self.passed else "fails"),
+        ]
+        return Sheet(name, f"valid: {self.mission.size_in_words}", parts)
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
@@ -328,29 +326,22 @@ class Preflight(Shown):
 
     def _worst(self) -> Iterator[Fact]:
         """Worst values of the planned paths, with their limits."""
-        mission = self.mission
-        limits = None if mission is None else mission.limits
-        if mission is not None and self.is_show:
-            pads = float(proximity.nearest(mission.fleet.position).min())
-            for where, apart in (
-                ("start", pads),
-                *((f"'{f.name}'", f.spacing) for f in self.formations),
-            ):
+        if self.is_show:
+            places = {"start": float(proximity.nearest(self.mission.fleet.position).min())}
+            places |= {f"'{f.name}'": f.spacing for f in self.formations}
+            for where, apart in places.items():
                 yield Fact("spacing, centre to centre", apart, "m", who=where)
-        for name, unit, worst in (
-            ("separation", "m", self.separation),
-            ("speed", "m/s", self.speed),
-            ("vertical_speed", "m/s", self.vertical_speed),
-        ):
-            if worst is not None:
-                least, t, who = worst
-                limit = getattr(limits, name, None)
-                yield Fact(name.replace("_", " "), least, unit, limit, name == "separation", t, who)
-        if self.thrust is not None:
-            force, t, who, most = self.thrust
-            yield Fact("thrust", force, "N", most if math.isfinite(most) else None, when=t, who=who)
+        for name, (_, unit) in _WORST.items():
+            if (worst := getattr(self, name)) is not None:
+                value, t, who, *own = worst
+                limit = own[0] if own else getattr(self.mission.limits, name)
+                limit = None if limit is None or not math.isfinite(limit) else limit
+                yield Fact(name.replace("_", " "), value, unit, limit, name == "separation", t, who)
         if self.vehicles is not None:
-            yield from self.vehicles.worst
+            force, t, who, limit, _ = self.vehicles.rotor_force
+            yield Fact("rotor force", force, "N", limit, when=t, who=who)
+            tilt, t, who, _ = self.vehicles.tilt
+            yield Fact("tilt", tilt, "deg", when=t, who=who)
         for name, least, t, who in self.clearance:
             yield Fact("clearance", least, "m", when=t, who=f"{who}, '{name}'")
 
@@ -375,21 +366,16 @@ class Preflight(Shown):
             text = f"{between}: {wide:.2f} m wide, the formation needs {takes:.2f} m at {t:.2f} s"
             yield "gap", text
         if len(self.assignments) > 1:
-            told = [
-                f"{name} {a.path_length:.1f} m, {a.min_clearance:.2f} m"
-                for name, a in self.assignments.items()
-            ]
-            yield (
-                "assignment",
-                f"total path length, minimum clearance: {'; '.join(told)}",
+            ways = (
+                f"{x} {a.path_length:.1f} m, {a.min_clearance:.2f} m"
+                for x, a in self.assignments.items()
             )
+            yield "assignment", f"total path length, minimum clearance: {'; '.join(ways)}"
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)
-            yield (
-                "guessed",
-                f"straight paths are assumed in {names}, where only distances guide the agents",
-            )
+            text = f"straight paths are assumed in {names}, where only distances guide the agents"
+            yield "guessed", text
 
     def _proved(self) -> Iterator[tuple[str, str]]:
         """The least of the certificates, and the phases that have none."""
@@ -446,10 +432,7 @@ class Preflight(Shown):
             "disturbances": None
             if (d := self.disturbed) is None
             else {
-                "air_n": d.air,
-                "gusts_n": d.gusts,
-                "weight_n": d.weight,
-                "noise_n": d.noise,
+                **{f"{name}_n": getattr(d, name) for name in _FORCES},
                 "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), d.thrust),
                 "offset": _named(("offset_m", "who"), d.offset),
                 "lost": [_named(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
@@ -459,7 +442,10 @@ class Preflight(Shown):
                 "guessed_phases": [
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
-                "separation": _named(("separation_m", "time_s", "who"), self.separation),
+                **{
+                    name: _named((key, "time_s", "who", "limit_n"), getattr(self, name))
+                    for name, (key, _) in _WORST.items()
+                },
                 "certificates": [
                     {
                         "phase": phase,
@@ -470,9 +456,6 @@ class Preflight(Shown):
                     }
                     for phase, c in self.certificates.items()
                 ],
-                "speed": _named(("speed_m_s", "time_s", "who"), self.speed),
-                "vertical_speed": _named(("speed_m_s", "time_s", "who"), self.vertical_speed),
-                "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), self.thrust),
                 "clearance": [
                     _named(("obstacle", "clearance_m", "time_s", "who"), c) for c in self.clearance
                 ],
@@ -491,14 +474,8 @@ class Preflight(Shown):
 
 
 def _disturbed_words(d: Disturbed) -> str:
-    parts = [
-        f"{what} up to {force:.2g} N"
-        for what, force in (
-            ("steady wind", d.air), ("gusts (3 sigma)", d.gusts), ("weight error", d.weight),
-            ("noise (3 sigma)", d.noise),
-        )
-        if force > 0
-    ]  # fmt: skip
+    forces = {what: getattr(d, name) for name, what in _FORCES.items()}
+    parts = [f"{what} up to {force:.2g} N" for what, force in forces.items() if force > 0]
     force, t, who, limit = d.thrust
     of = f" (limit {limit:g} N)" if math.isfinite(limit) else ""
     parts.append(f"maximum thrust with them {force:.1f} N{of}, {who} at {t:.2f} s")
@@ -518,24 +495,21 @@ def _scene_words(f: FormationCheck) -> str:
 
 def _formation_words(f: FormationCheck) -> str:
     r = f.rigidity
-    held = {
-        "tracking": "held by tracking",
-        "distances": "held by distances",
-        "nothing": "not used in any phase",
-    }[f.held_by]
+    held = "not used in any phase" if f.held_by == "nothing" else f"held by {f.held_by}"
+    solved = f"{held}; solved by {solvers.WORDS[f.method]}"
+    if f.spectrum is not None and f.spectrum.free:
+        return f"{solved}; flexible to first order, at least {f.spectrum.free} free motions"
     if f.spectrum is not None:
-        text = f"{held}; solved by {solvers.WORDS[f.method]}"
-        if f.spectrum.free:
-            return f"{text}; flexible to first order, at least {f.spectrum.free} free motions"
-        return f"{text}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
+        return (
+            f"{solved}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
+        )
     if f.skipped:
-        return f"{held}; solved by {solvers.WORDS[f.method]}; skipped, rigidity not checked"
+        return f"{solved}; skipped, rigidity not checked"
     if r is None and f.method != "dense":
-        return f"{held}; solved by {solvers.WORDS[f.method]}; too large to check its rigidity"
+        return f"{solved}; too large to check its rigidity"
     if r is None:
         return f"{held}; its distances do not determine positions, so its rigidity is not checked"
-    if f.method != "dense":
-        held += f", solved by {solvers.WORDS[f.method]}"
+    held = held if f.method == "dense" else solved.replace("; ", ", ")
     parts = [f"{r.rigidity_class}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
     if r.reachable < r.needed:
         parts[0] += f" ({r.reachable} reachable on a {WHERE[r.dimension]})"
@@ -607,4 +581,4 @@ def some(names: Sequence[str]) -> str:
 
 
 def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
-    return None if values is None else dict(zip(names, values, strict=True))
+    return None if values is None else dict(zip(names, values, strict=False))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet.mission import Mission
-from rigidfleet.planning.legs import Leg, leg_of
+from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import changed
@@ -45,7 +45,7 @@ def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
-    part = Preflight(found.formations, found.gains, [planned_phase(x, most) for x in way])
+    part = Preflight(mission, found.formations, found.gains, [planned_phase(x, most) for x in way])
     judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
     for judge in judges:
         yield from judge(mission, part)
@@ -55,12 +55,7 @@ def planned_way(mission: Mission, at: Leg) -> list[Leg]:
     """The planned legs after the first loss, which happens in the leg ``at``."""
     first = mission.first_loss
     lost = mission.lost_at <= first
-    now = changed(at.state_at(first), lost=lost if lost.any() else None)
-    way = []
-    for phase in after_loss(mission, now):
-        way.append(leg_of(mission, phase, now))
-        now = way[-1].after
-    return way
+    return after_loss(mission, changed(at.state_at(first), lost=lost if lost.any() else None))
 
 
 def _links(mission: Mission) -> Iterator[Remark]:

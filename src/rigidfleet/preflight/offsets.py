@@ -135,7 +135,8 @@ def _broken(
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
     masses, r, far = mission.fleet.mass, planned.position + off, np.linalg.norm(off, axis=2)
-    there = Preflight(found.formations, found.gains, [replace(planned, position=r, path_ends=None)])
+    moved = [replace(planned, position=r, path_ends=None)]
+    there = Preflight(mission, found.formations, found.gains, moved)
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
     remarks += geofence_remarks(mission, there.planned_phases[0])
     if not phase.lands:  # that ends where vehicles stand

@@ -593,7 +593,8 @@ class Flight:
         if lost.any():
             self._extremes.lose(lost)
             self._now.lost = lost
-        self._route = [*self._asked, *after_loss(self.mission, self._now)]
+        legs = after_loss(self.mission, self._now)
+        self._route = [*self._asked, *(leg.phase for leg in legs)]
         self._following = len(self._asked)
 
     def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:

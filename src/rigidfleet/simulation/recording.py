@@ -103,7 +103,7 @@ class Unevaluated(NamedTuple):
     def evaluated(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
         out = recorder(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
-        self.evaluate_into(native.pack(out), 0, times, work, native.pack_once(self.problem))
+        self.evaluate_into(native.pack_anew(out), 0, times, work, native.pack(self.problem))
         return out
 
     def evaluate_into(
@@ -148,7 +148,7 @@ class Piece:
 
     def __post_init__(self) -> None:
         if isinstance(self.given, Unevaluated) and self.given.setup is None:
-            self._problem = native.pack_once(self.given.problem)
+            self._problem = native.pack(self.given.problem)
 
     @cached_property
     def record(self) -> Record:
@@ -157,7 +157,7 @@ class Piece:
             return self.given
         n = len(self.given.problem.vehicles.m)
         out = recorder(len(self.time), n, len(self.edges))
-        self.record_into(native.pack(out), 0)
+        self.record_into(native.pack_anew(out), 0)
         return out
 
     def record_into(self, out: native.Packed, first: int) -> None:
@@ -174,7 +174,7 @@ class Piece:
             problem = planned if own else solved_by(solver, given.problem)
             found, words = (
                 given._replace(problem=problem, planned=planned),
-                native.pack_once(problem),
+                native.pack(problem),
             )
             found.evaluate_into(out, first, self.time, solver.workspace, words)
             solver.check()
@@ -464,7 +464,7 @@ def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) ->
     """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
     count, end = sum(len(p.time) for p in pieces), 0
     out = recorder(count, n, len(edges), disturbed=disturbed)
-    whole = native.pack(out)
+    whole = native.pack_anew(out)
     for piece in pieces:
         begin, end = end, end + len(piece.time)
         places = _columns(piece.edges, edges)
@@ -473,7 +473,7 @@ def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) ->
             continue
         size = count, len(piece.edges)
         own = out._replace(**{name: np.empty(size) for name in _EDGEWISE})
-        piece.record_into(native.pack(own), begin)
+        piece.record_into(native.pack_anew(own), begin)
         for name in _EDGEWISE:
             rows = getattr(out, name)[begin:end]
             rows.fill(np.nan)

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import RIGID, Problem, Workspace, clear, workspace
+from rigidfleet.kernel.problem import RIGID, Problem, Workspace, cleared, workspace
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
@@ -68,7 +68,7 @@ def small_workspace(problem: Problem) -> Workspace:
     size = len(problem.vehicles.m), len(problem.graph.edges)
     with_h, solves = problem.control.allocation != RIGID, problem.law.solver
     with suppress(KeyError, IndexError):  # none is idle
-        return clear(_idle[*size, with_h, solves].pop())
+        return cleared(_idle[*size, with_h, solves].pop())
     return workspace(*size, with_h=with_h, solver=solves)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.math import lqr, pid
-from rigidfleet.math.margins import Feedback, Loop, Margins, margins
+from rigidfleet.math.margins import Loop, LoopGains, Margins, margins
 from rigidfleet.mission import Mission
 from rigidfleet.mission.files import digests
 from rigidfleet.mission.schema import Tracking
@@ -93,7 +93,7 @@ class _Part:
 
     name: str
     loop: Loop
-    law: Feedback
+    law: LoopGains
     growth: float
 
 

@@ -17,9 +17,9 @@ from rigidfleet.kernel.engine import lane_bounds, lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     Tables,
     integrate,
-    lanes_of,
-    unroll,
-    unroll_together,
+    packed,
+    unrolled,
+    unrolled_together,
 )
 from rigidfleet.kernel.problem import (
     EXACT,
@@ -30,7 +30,7 @@ from rigidfleet.kernel.problem import (
     Disturbance,
     Problem,
     Reference,
-    padded_size,
+    padded,
     workspace,
 )
 from rigidfleet.kernel.records import (
@@ -208,7 +208,7 @@ class Vector:
         ):
             self._allocate(problems)
         tables = self._tables.between(float(states[0].clock[TIME]), t_end)
-        ready = unroll_together(problems, tables)
+        ready = unrolled_together(problems, tables)
         lane_bounds.begin(self._search, monitors)
         places = np.array([x.ctypes.data for x in samples])
         self._problem = ready._replace(samples=places, search=self._search)
@@ -217,7 +217,7 @@ class Vector:
         unpack(K)[: lane_steps.STAGES] = 0.0
         unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
         clock = np.array([first.clock[TIME], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
-        y, count = lanes_of([state.y for state in states]), np.zeros_like(first.count)
+        y, count = packed([state.y for state in states]), np.zeros_like(first.count)
         self._state = IntegratorState(y, K, clock, count, first.rtol, self._length)
         self._fresh = True
 
@@ -296,11 +296,11 @@ def fly_all(
     if not fits(problem):
         raise ValueError("flights of this problem cannot share vectors; use vectors=False")
     count, n = starts.shape
-    ready = unroll(problem)
+    ready = unrolled(problem)
 
     def in_lanes(x: Floats) -> LaneArray:
         if count % WIDTH:  # unused lanes of the last vector repeat the last flight
-            x = x[np.minimum(np.arange(padded_size(count)), count - 1)]
+            x = x[np.minimum(np.arange(padded(count)), count - 1)]
         return pack(x.reshape(len(x) // WIDTH, WIDTH, x.shape[1]).swapaxes(1, 2))
 
     def begin() -> Callable[..., None]:

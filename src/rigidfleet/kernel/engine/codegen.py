@@ -73,7 +73,7 @@ class UnrolledProblem(NamedTuple):
     search: Search
 
 
-def unroll(problem: Problem) -> UnrolledProblem:
+def unrolled(problem: Problem) -> UnrolledProblem:
     """Prepare a problem of eight flights for `integrate`; compile its code if it is not yet in the cache.
 
     Raises
@@ -85,7 +85,7 @@ def unroll(problem: Problem) -> UnrolledProblem:
     return _prepare(problem, description, values[:, None], lambda: Trace(problem))
 
 
-def unroll_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
+def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
     """Prepare eight problems, which `batch.fit_together`, of one flight each; with rows of their `Tables`.
 
     Raises
@@ -97,7 +97,7 @@ def unroll_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Unro
     turns = values[TURN].any(axis=0)
     if turns.any():  # slots that do not turn, where others do
         values[TURN, ~turns] = _BARELY
-    motion = interleave(
+    motion = interleaved(
         [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
     )
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
@@ -105,7 +105,7 @@ def unroll_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Unro
     description = flight_structure(first, values, moves)
     ready = _prepare(first, description, values, lambda: FlightTrace(first, values, moves))
     return ready._replace(
-        before=lanes_of([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
+        before=packed([p.reference.d0 for p in problems]), knots=first.motion.knots, motion=motion,
         **tables,
     )  # fmt: skip
 
@@ -157,12 +157,12 @@ class Tables:
 _TABLES = "gust", "noise_r", "noise_v"
 
 
-def lanes_of(parts: Sequence[Floats]) -> LaneArray:
+def packed(parts: Sequence[Floats]) -> LaneArray:
     """Lanes (...) of eight small arrays of one shape (...)."""
     return simd.pack(np.stack(parts, axis=-1))
 
 
-def interleave(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
+def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
     """Lanes of eight large arrays, in C order, as an array of some shape."""
     parts = [np.ascontiguousarray(x) for x in parts]
     made = simd.empty(shape)

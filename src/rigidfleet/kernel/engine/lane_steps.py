@@ -236,6 +236,8 @@ def keep_step(t, h, p, w, state):
     """
     k, search, rows = state.K, p.search, state.trail.clock.shape[0]
     coordinates = _coordinates(k, p)
+    # The first half goes to the next row of the trail, the second to the one after it. The forces of the end are there
+    # already, as those of the last stage; the code for the middle overwrites them, so they are stored first.
     row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
     before, after = (row + rows - 1) % rows, (row + 1) % rows
     for g in range(search.gauge.shape[1]):
@@ -276,6 +278,7 @@ def keep_samples(t, h, t_new, times, samples, p, state):
     search, count = p.search, state.count
     n, rows = state.K.shape[1], state.trail.clock.shape[0]
     while count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
+        # By the halves that were just written, which `keep_step` has counted.
         x = 2.0 * (times[count[SAMPLES]] - t) / h
         half = 1 if x > 1.0 else 0
         points = search.points[(count[FIRST_ROW] + count[TRAILED] - 2 + half) % rows]

@@ -33,7 +33,7 @@ from rigidfleet.kernel.engine.objects import (
     symbol,
     target_machine,
 )
-from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, pack_once, use
+from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, pack_anew, use
 from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
 from rigidfleet.kernel.problem import (
     Problem,
@@ -62,12 +62,12 @@ def integrate(
     max_steps: int,
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
-    segment = pack(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
+    segment = pack_anew(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
     return _call(
         _integrator(problem, workspace),
-        pack_once(problem),
-        pack_once(workspace),
-        pack_once(state),
+        pack(problem),
+        pack(workspace),
+        pack(state),
         segment,
     )
 
@@ -84,8 +84,8 @@ class Integration:
         times: Floats,
         samples: Floats,
     ) -> None:
-        self._segment = pack(Segment(t_end, False, 0, times, samples, NOTHING))
-        self._kept = pack_once(problem), pack_once(workspace), pack_once(state), self._segment
+        self._segment = pack_anew(Segment(t_end, False, 0, times, samples, NOTHING))
+        self._kept = pack(problem), pack(workspace), pack(state), self._segment
         self._addresses = [x.address for x in self._kept]
         self._integrate = _integrator(problem, workspace)
 
@@ -104,7 +104,7 @@ def _integrator(problem: Problem, workspace: Workspace) -> Any:
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
     out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
-    record_into(pack(out), 0, pack_once(problem), workspace, times, samples)
+    record_into(pack_anew(out), 0, pack(problem), workspace, times, samples)
     return out
 
 
@@ -113,7 +113,7 @@ def record_into(
 ) -> None:
     """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(_code().record, problem, pack_once(workspace), pack(segment), out)
+    _call(_code().record, problem, pack(workspace), pack_anew(segment), out)
 
 
 class Watch:
@@ -123,27 +123,27 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = pack(segment), pack(UNRECORDED)
+        self._kept = pack_anew(segment), pack_anew(UNRECORDED)
         self.monitor = monitor._replace(
             recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
-        self._packed = pack(self.monitor)
+        self._packed = pack_anew(self.monitor)
         self.address = self._packed.address
 
     def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
-        _code().bound_moves(pack_once(problem).address, pack_once(state).address, self.address)
+        _code().bound_moves(pack(problem).address, pack(state).address, self.address)
 
     def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
-        of = pack_once(problem).address, pack_once(state).address, self.address
+        of = pack(problem).address, pack(state).address, self.address
         _code().watch_distances(first, end, *of)
 
     def forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
     ) -> None:
         """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
-        of = [pack_once(x).address for x in (problem, workspace, state)]
+        of = [pack(x).address for x in (problem, workspace, state)]
         _code().watch_forces(int(last), *of, self.address)
 
 
@@ -151,11 +151,13 @@ def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Wo
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
     call = _own.segment
     if call is None or len(call.of.dy) != len(y):
-        call = pack(Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y))))
+        call = pack_anew(
+            Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y)))
+        )
         _own.segment = call
     segment: Segment = call.of
     segment.times[0], segment.samples[0] = t, y
-    _call(_code().record, pack_once(problem), pack_once(workspace), call, pack_once(UNRECORDED))
+    _call(_code().record, pack(problem), pack(workspace), call, pack(UNRECORDED))
     dy[:] = segment.dy
 
 
@@ -174,31 +176,31 @@ def _call(function: Any, *arguments: Packed) -> int:
 
 def measure(measured: Measured) -> None:
     """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
-    _call(_code().measure, pack(measured))
+    _call(_code().measure, pack_anew(measured))
 
 
 def least_singular_values(r: Floats, edges: Ints) -> Floats:
     """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
     spectrum = spectrum_of(r, edges)
-    _call(_code().spectrum, pack(spectrum))
+    _call(_code().spectrum, pack_anew(spectrum))
     return spectrum.values
 
 
 def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
     """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
     nearest = nearest_of(r, radius, boxes)
-    _call(_code().nearest, pack(nearest))
+    _call(_code().nearest, pack_anew(nearest))
     return nearest.least, nearest.nearest
 
 
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
-    _call(_code().follow, pack(Recursion(x, a, backward)))
+    _call(_code().follow, pack_anew(Recursion(x, a, backward)))
 
 
 def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
     """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
-    _call(_code().follow, pack(Recursion(x, a, False, y, first, b)))
+    _call(_code().follow, pack_anew(Recursion(x, a, False, y, first, b)))
 
 
 class Library(SimpleNamespace):

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import Avoidance, avoidance
+from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance
 from rigidfleet.kernel.measured import (
     Measured,
     Nearest,
-    Spectrum,
+    SingularValues,
     measurement_of,
     nearest_of,
     spectrum_of,
@@ -60,7 +60,7 @@ class Packed(NamedTuple):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy has words of its own: the arrays of the tuple lie elsewhere."""
-        return pack, (self.of,)
+        return pack_anew, (self.of,)
 
 
 #: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded, and what keeps its code.
@@ -173,7 +173,7 @@ def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, 
             words.append(int(value))
 
 
-def pack(x: Any) -> Packed:
+def pack_anew(x: Any) -> Packed:
     """Convert a named tuple to words.
 
     Raises
@@ -208,12 +208,12 @@ _last = _Last()
 _KEPT = 32
 
 
-def pack_once(x: Any) -> Packed:
-    """`pack`, unless the named tuple is among the last ones that the thread has used."""
+def pack(x: Any) -> Packed:
+    """`pack_anew`, unless the named tuple is among the last ones that the thread has used."""
     kept = _last.packed
     last = kept.pop(id(x), None)
     if last is None or last.of is not x:
-        last = pack(x)
+        last = pack_anew(x)
         if len(kept) >= _KEPT:
             del kept[next(iter(kept))]
     kept[id(x)] = last
@@ -238,13 +238,13 @@ def examples() -> tuple[
     Segment,
     Record,
     Monitor,
-    fleet.Flight,
+    fleet.SampledFlight,
     fleet.SampledState,
     fleet.SampledSegment,
     fleet.Evaluation,
-    Avoidance,
+    AvoidanceArrays,
     Measured,
-    Spectrum,
+    SingularValues,
     Nearest,
     Recursion,
 ]:
@@ -269,7 +269,7 @@ def examples() -> tuple[
     nowhere = np.zeros((0, 6))
     watching = monitor(one, nowhere, nowhere, 6, 3)
     work = kernel_workspace(1, 0)
-    vehicles = fleet.quadrotors([fleet.Vehicle(1.0, point=True)])
+    vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)])
     flight = fleet.flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
     rotors, rows = np.zeros((1, 4)), np.zeros((0, 1, 3))

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.kernel.avoidance import Avoidance
+from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_once
-from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
+from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_anew
+from rigidfleet.kernel.fleet import ENDLESS, Evaluation, SampledFlight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
 from rigidfleet.typing import Floats
@@ -19,10 +19,10 @@ from rigidfleet.typing import Floats
 def fly_ticks(
     problem: Problem,
     workspace: Workspace,
-    flight: Flight,
+    flight: SampledFlight,
     state: SampledState,
     segment: SampledSegment,
-    avoidance: Avoidance | None = None,
+    avoidance: AvoidanceArrays | None = None,
 ) -> int:
     """Fly to the end of the segment, see `rigidfleet.kernel.sampled_flight.fly_ticks`.
 
@@ -38,7 +38,7 @@ def fly_ticks(
     return native.sampled_library().fly_ticks(*(a.address for a in _last.packed[:5]))
 
 
-class _Last(threading.local):
+class _LastCall(threading.local):
     """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
 
     def __init__(self) -> None:
@@ -46,16 +46,16 @@ class _Last(threading.local):
         self.packed: tuple[Packed, ...] = ()
 
 
-_last = _Last()
+_last = _LastCall()
 
 
 def _pack(
     problem: Problem,
     workspace: Workspace,
-    flight: Flight,
+    flight: SampledFlight,
     state: SampledState,
     segment: SampledSegment,
-    avoidance: Avoidance | None,
+    avoidance: AvoidanceArrays | None,
 ) -> tuple[Packed, ...]:
     """The arguments of the machine code, and what they point to."""
     work = state.work
@@ -64,42 +64,42 @@ def _pack(
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
-    law = pack(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
-    recorded = pack_once(UNRECORDED)
+    law = pack_anew(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
+    recorded = pack(UNRECORDED)
     call = segment._replace(
         recorder=native.recorder_address(), segment=law.address, record=recorded.address
     )
-    states = pack_once(problem), pack_once(workspace), pack_once(flight), pack_once(state)
+    states = pack(problem), pack(workspace), pack(flight), pack(state)
     if avoidance is None:
-        return *states, pack(call), law, recorded
+        return *states, pack_anew(call), law, recorded
     kept = _of(avoidance, problem, workspace)
     call = call._replace(
         guard=native.avoidance_library().addresses["avoid"], avoidance=kept.address
     )
-    return *states, pack(call), law, recorded, kept
+    return *states, pack_anew(call), law, recorded, kept
 
 
 def avoid(
     problem: Problem,
     workspace: Workspace,
-    flight: Flight,
+    flight: SampledFlight,
     state: SampledState,
-    avoidance: Avoidance,
+    avoidance: AvoidanceArrays,
 ) -> int:
     """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
     kept = _of(avoidance, problem, workspace)
     return native.avoidance_library().avoid(
-        pack_once(flight).address, pack_once(state).address, kept.address, 0
+        pack(flight).address, pack(state).address, kept.address, 0
     )
 
 
-def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
+def _of(avoidance: AvoidanceArrays, problem: Problem, workspace: Workspace) -> Packed:
     """Avoidance that knows the law whose forces it changes."""
-    avoidance.law[:] = pack_once(problem).address, pack_once(workspace).address
-    return pack_once(avoidance)
+    avoidance.law[:] = pack(problem).address, pack(workspace).address
+    return pack(avoidance)
 
 
-def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
+def _check(flight: SampledFlight, state: SampledState, workspace: Workspace) -> None:
     """Refuse arrays too short for what the machine code reads.
 
     Raises
@@ -129,7 +129,7 @@ def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
 
 
 def derivatives(
-    flight: Flight,
+    flight: SampledFlight,
     S: Floats,
     command: Floats,
     air: Floats | None = None,
@@ -141,10 +141,10 @@ def derivatives(
     """
     none = np.zeros((len(S), 3))
     out = np.empty_like(S)
-    call = pack(
+    call = pack_anew(
         Evaluation(
             S, command, none if air is None else air, none if push is None else push, np.eye(3), out
         )
     )
-    native.sampled_library().evaluate(pack_once(flight).address, call.address)
+    native.sampled_library().evaluate(pack(flight).address, call.address)
     return out

@@ -5,7 +5,7 @@ from numba import typeof
 from rigidfleet.kernel.compiler.jit import compiled
 from rigidfleet.kernel.compiler.pointers import pointer
 from rigidfleet.kernel.engine.native import Watch
-from rigidfleet.kernel.engine.packing import examples, pack_once
+from rigidfleet.kernel.engine.packing import examples, pack
 from rigidfleet.kernel.monitor import row_of
 from rigidfleet.kernel.obstacles import watch_step
 from rigidfleet.kernel.problem import Problem
@@ -28,5 +28,5 @@ def watch_solids(
     watch: Watch, problem: Problem, state: IntegratorState, first: int, end: int, solids: Solids
 ) -> None:
     """Search the steps of a trail from ``first`` to before ``end`` for clearances to all ``solids``."""
-    addresses = pack_once(problem).address, pack_once(state).address, watch.address
+    addresses = pack(problem).address, pack(state).address, watch.address
     _watch_steps(first, end, *addresses, solids)

@@ -147,8 +147,11 @@ def factor(column, row, first, left, block, L, at):
         at[k] = -1
     for k in range(column.shape[0] - 1):
         start, end = column[k], column[k + 1]
+        # ``at`` leads from a row to its block in this column: an update finds its place without a search.
         for q in range(start, end):
             at[row[q]] = q
+        # Left-looking: each column j to the left with a block in row k takes its product from this column. The nine
+        # numbers of that block stay in registers.
         for s in range(first[k], first[k + 1]):
             o, j = block[s], left[s]
             b0, b1, b2, b3, b4, b5, b6, b7, b8 = (
@@ -163,6 +166,7 @@ def factor(column, row, first, left, block, L, at):
                     L[z, c] -= x * b0 + y * b1 + w * b2
                     L[z, c + 1] -= x * b3 + y * b4 + w * b5
                     L[z, c + 2] -= x * b6 + y * b7 + w * b8
+        # The diagonal block by itself: a Cholesky factor of three rows, with the inverses of its pivots.
         d0 = L[start, 0]
         if not d0 > 0.0:
             return False
@@ -179,6 +183,7 @@ def factor(column, row, first, left, block, L, at):
         i8 = 1.0 / math.sqrt(d2)
         L[start, 0], L[start, 3], L[start, 4] = i0, l3, i4
         L[start, 6], L[start, 7], L[start, 8] = l6, l7, i8
+        # The blocks below: each row solved with that factor.
         for q in range(start + 1, end):
             for c in range(0, 9, 3):
                 x = L[q, c] * i0
@@ -195,6 +200,7 @@ def precondition(R, place, column, row, L, r, w, z):
         k = place[i]
         for s in range(3):
             w[k, s] = R[0, s] * r[i, 0] + R[1, s] * r[i, 1] + R[2, s] * r[i, 2]
+    # Forward, column by column: what is known of a column goes at once to the rows below.
     for k in range(r.shape[0]):
         q = column[k]
         a = w[k, 0] * L[q, 0]
@@ -206,6 +212,7 @@ def precondition(R, place, column, row, L, r, w, z):
             w[i, 0] -= L[q, 0] * a + L[q, 1] * b + L[q, 2] * c
             w[i, 1] -= L[q, 3] * a + L[q, 4] * b + L[q, 5] * c
             w[i, 2] -= L[q, 6] * a + L[q, 7] * b + L[q, 8] * c
+    # Backward, with the transposed blocks.
     for k in range(r.shape[0] - 1, -1, -1):
         a, b, c = w[k, 0], w[k, 1], w[k, 2]
         for q in range(column[k] + 1, column[k + 1]):
@@ -277,6 +284,8 @@ def project(u, edges, m, mbar, mu, g, past, G, x):
     Nearest in the norm of K, so that its residual is orthogonal to all of them (Fischer, 1998). Solutions that depend
     on earlier ones are skipped. G (P, P + 2) is scratch.
     """
+    # G becomes the matrix of inner products y_p^T K y_q, whose Cholesky factor gives the weights c. Sums over edges and
+    # agents are taken once for all products, so that ``past`` is read once.
     count = past.shape[0]
     c, scale = G[:, count], G[:, count + 1]
     for p in range(count):
@@ -307,6 +316,7 @@ def project(u, edges, m, mbar, mu, g, past, G, x):
         for q in range(p):
             rest -= G[p, q] * G[p, q]
             c[p] -= G[p, q] * c[q]
+        # One that is nearly a combination of others would divide by rounding.
         scale[p] = 1.0 / math.sqrt(rest) if rest > 1e-12 * G[p, p] else 0.0
         c[p] *= scale[p]
     for p in range(count - 1, -1, -1):
