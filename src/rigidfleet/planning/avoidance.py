@@ -15,7 +15,9 @@ from rigidfleet.mission.avoidance import (
 from rigidfleet.solids.records import join
 
 
-def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avoidance | None:
+def avoidance_in_flight(
+    mission: Mission, flight: fleet.SampledFlight
+) -> avoidance.AvoidanceArrays | None:
     """Avoidance at the ticks of the formation's law; None without [avoidance]."""
     given, models = mission.avoidance, mission.vehicle_models
     if given is None or models is None:
