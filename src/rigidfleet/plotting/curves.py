@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, shown
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import peaks, quadrotors
 from rigidfleet.plotting import style as st
@@ -527,7 +527,7 @@ def motion(result: Result) -> Figure:
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes[:, 0], strict=True):
-        ax.set_ylabel(f"{q.called.replace(' ', chr(10))} [{shown(q.unit)}]")
+        ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
         quadrotors.draw_limited(ax, result, q.name)
     st.draw_agents_legend(axes[0, 0], result.n_agents)
     return fig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, shown
+from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import in_style
@@ -152,7 +152,7 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
         return
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
-    limit, unit = q.limit_of(result.mission), shown(q.unit)
+    limit, unit = q.limit_of(result.mission), display_unit(q.unit)
     if peaks.draw_from_zero(ax, result, values, unit, between=between) and limit is not None:
         top = max(ax.get_ylim()[1], 1.2 * limit)
         ax.set_ylim(-0.04 * top, top)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.processes import safe_path
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.sweep.definition import shared
+from rigidfleet.sweep.definition import sweep_of_json
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import fly_runs
 
@@ -37,7 +37,7 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     RigidfleetError
         The other process has another version of rigidfleet, or of the user's controller.
     """
-    flown = shared(sweep)
+    flown = sweep_of_json(sweep)
     if version != flown.version:
         raise RigidfleetError(
             f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
