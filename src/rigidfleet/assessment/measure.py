@@ -24,6 +24,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
+#: Quantities of which a phase between samples has a worst value.
+_DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geofence")
+
 
 class Measurements:
     """Measures a result phase by phase, at samples (recomputed from positions and forces) and between them."""
@@ -46,14 +49,13 @@ class Measurements:
         self.close = closeness(result)
         self.measured = {q.name: self.sampled(q.name) for q in QUANTITIES.values() if q.by_phase}
         self.thrust = self.measured["thrust"].values
-        #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
-        self.rank = {name: [-math.inf] * len(result.phases) for name in self.measured}
         starts = np.array([self.samples[k].start for k in self.flown])
-        for name, sampled in self.measured.items():
+        ranks = np.full((len(self.measured), len(result.phases)), -np.inf)
+        for row, sampled in zip(ranks, self.measured.values(), strict=True):
             if places := sampled.rank.shape[1]:
-                most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
-                for k, rank in zip(self.flown, most, strict=True):
-                    self.rank[name][k] = rank
+                row[self.flown] = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts)
+        #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
+        self.rank = dict(zip(self.measured, ranks.tolist(), strict=True))
         #: The last sample of each phase flown, and positions (F, N, 3) there.
         self.last = [self.samples[k].stop - 1 for k in self.flown]
         self.ends = result.position[self.last]
@@ -82,14 +84,9 @@ class Measurements:
             return None
         k += part.start or 0
         at = (k,) if values.ndim == 1 else (k, place)
-        phase, who = result.phases[result.phase.item(k)].name, samples.owner(*at)
-        return Extreme(
-            values.item(at),
-            result.time.item(k),
-            owner_name(result, samples.quantity, *who),
-            phase,
-            alone,
-        )
+        who = owner_name(result, samples.quantity, *samples.owner(*at))
+        phase = result.phases[result.phase.item(k)].name
+        return Extreme(values.item(at), result.time.item(k), who, phase, alone)
 
     # -- between samples ------------------------------------------------------------------------------
 
@@ -130,18 +127,17 @@ class Measurements:
     @cached_property
     def worst_of(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
-        found: list[dict[str, Extreme]] = [{} for _ in self.samples]
+        every: list[dict[str, Extreme]] = [{} for _ in self.samples]
+        phases = list(zip(self.result.phases, self.samples, every, strict=True))
         for name, sampled in self.measured.items():
-            ranks, alone = self.rank[name], name not in self.told
-            for k, phase in enumerate(self.result.phases):
-                x, rank, worst = phase.extremes.get(name), ranks[k], None
-                if x is not None and rank < sampled.quantity.rank(x.value):
-                    worst = self.recorded(name, x, phase.name)
-                elif rank != -math.inf:
-                    worst = self.worst_sample(sampled, self.samples[k], alone=alone)
-                if worst is not None:
-                    found[k][name] = worst
-        return found
+            rank_of, alone = sampled.quantity.rank, name not in self.told
+            for rank, (phase, part, worst) in zip(self.rank[name], phases, strict=True):
+                x = phase.extremes.get(name)
+                if x is not None and rank < rank_of(x.value):
+                    worst[name] = self.recorded(name, x, phase.name)
+                elif e := self.worst_sample(sampled, part, alone=alone):
+                    worst[name] = e
+        return every
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -224,33 +220,19 @@ class Measurements:
                     f"its {name} is up to {value(worst, unit)} off the value from its own samples"
                 )
                 yield words, float(time[k])
-        there = [thing.solid.there[0].tolist() for thing in self.mission.obstacles]
-        fenced = self.mission.limits.geofence is not None
         for index, phase in enumerate(result.phases):
             samples, extremes = self.samples[index], phase.extremes
             if samples.stop > samples.start and extremes:
-                due = {
-                    "speed": True,
-                    "lowest": True,
-                    "highest": True,
-                    "thrust": self.rank["thrust"][index] > -math.inf,
-                    "separation": result.n_agents > 1
-                    and (self.whole or np.count_nonzero(self.left[samples.start]) > 1),
-                    "clearance": _meets(there, phase),
-                    "geofence": fenced,
-                }
-                lacking = [name for name, needed in due.items() if needed and name not in extremes]
-                if lacking:
-                    words = (
-                        f"it lacks the worst '{lacking[0]}' of phase '{phase.name}' between samples"
-                    )
+                lacking = (x for x in _DUE if x not in extremes and self.is_due(x, index))
+                if name := next(lacking, ""):
+                    words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[samples.start])
             for name, share in _SLACK.items():
                 x, rank = extremes.get(name), self.rank[name][index]
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
-                if rank > quantity(name).rank(x.value) + slack or not (
+                if rank > self.measured[name].quantity.rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
                     sampled = self.worst_sample(self.measured[name], samples)
@@ -260,6 +242,20 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
+
+    def is_due(self, name: str, index: int) -> bool:
+        """Whether a phase that has samples has a worst value of a quantity between them."""
+        match name:
+            case "thrust":
+                return self.rank[name][index] > -math.inf
+            case "separation":
+                return bool(np.count_nonzero(self.left[self.samples[index].start]) > 1)
+            case "clearance":
+                phase, every = self.result.phases[index], self.mission.obstacles
+                return any(_meets(*thing.solid.there[0].tolist(), phase) for thing in every)
+            case "geofence":
+                return self.mission.limits.geofence is not None
+        return True
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -453,9 +449,9 @@ class Measurements:
             yield Waypoint(float(result.time[k]), miss, off, None, None)
 
 
-def _meets(there: list[list[float]], phase: PhaseRecord) -> bool:
-    """Whether an obstacle is there during a phase, not only at its start or end, of all ``there`` from when to when."""
-    return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
+def _meets(since: float, until: float, phase: PhaseRecord) -> bool:
+    """Whether an obstacle that is there from when to when [s] is there during a phase, not only at its start or end."""
+    return since < phase.t_end - 1e-9 and until > phase.t_start + 1e-9
 
 
 def _greatest(values: Floats) -> list[float | None]:
