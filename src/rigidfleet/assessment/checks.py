@@ -22,6 +22,7 @@ from rigidfleet.assessment.outcome import (
     Extreme,
     PhaseVerdict,
     bounded,
+    holds,
     value,
 )
 from rigidfleet.result import LABELS, PAD, Result
@@ -221,7 +222,7 @@ def _at_end(
 
 
 def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """How well every waypoint is met, in each quantity."""
+    """How far waypoints are missed in each quantity: those that are, or else the one that comes nearest."""
     points = [
         (p, what, at)
         for p in phases
@@ -233,10 +234,11 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
         if at is not None
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
-        unit = UNITS[name]
-        for p, what, at in points:
-            if (miss := getattr(at, name)) is None:
-                continue
+        unit, every = UNITS[name], [x for x in points if getattr(x[2], name) is not None]
+        off = [getattr(at, name) for *_, at in every]
+        missed = [k for k, miss in enumerate(off) if not miss <= limit]
+        for k in missed or ([off.index(max(off))] if off else []):
+            (p, what, at), miss = every[k], off[k]
             passed = miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -323,16 +325,21 @@ def _flying(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
 
 def _as_planned(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
-    allowed, every = q.limit_of(measured.mission), []
-    for record, worst in zip(measured.result.phases, measured.worst_of, strict=True):
-        if record.planned is not None and (e := worst.get("separation")) is not None:
-            planned = record.planned["separation"]
-            words = (
-                f"in phase '{record.name}' {_near(e)};"
-                f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
-            )
-            every.append(bounded(q, replace(e, value=planned - e.value), allowed, words))
-    yield from _failures_or_nearest(every)
+    allowed = q.limit_of(measured.mission)
+    every = [
+        (record.planned["separation"], e, record.name)
+        for record, worst in zip(measured.result.phases, measured.worst_of, strict=True)
+        if record.planned is not None and (e := worst.get("separation")) is not None
+    ]
+    nearer = [planned - e.value for planned, e, _ in every]
+    beyond = [k for k, by in enumerate(nearer) if not holds(q, by, allowed)]
+    for k in beyond or ([nearer.index(max(nearer))] if nearer else []):
+        planned, e, name = every[k]
+        words = (
+            f"in phase '{name}' {_near(e)};"
+            f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
+        )
+        yield bounded(q, replace(e, value=nearer[k]), allowed, words)
 
 
 def _near(e: Extreme) -> str:
