@@ -52,7 +52,7 @@ def check(
     from rigidfleet._common.progress import watched_by
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import load_mission
-    from rigidfleet.planning.timing import spelled_out, timed
+    from rigidfleet.planning.timing import complete_times, spelled_out
 
     keep_existing(expand, force=force, other="give another path")
     watch = console.CheckWatch(mission)
@@ -62,7 +62,7 @@ def check(
             if expand is not None:
                 found = spelled_out(found)
                 write_file(expand, (found.about + to_toml(found.to_dict())).encode())
-            found = timed(found)
+            found = complete_times(found)
     except MissionError as error:
         if not json:
             raise

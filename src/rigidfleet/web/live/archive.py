@@ -145,7 +145,7 @@ def _made(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Pie
     record, vehicles, layers = (
         made([getattr(p, name) for p in pieces]) for name in ("record", "vehicles", "layers")
     )
-    led = tuple(led for p in pieces for led in p.led)
+    led = tuple(led for p in pieces for led in p.followed)
     return Piece(
         first.phase, time, record, integral, frame, first.edges, first.attached, led, vehicles, layers
     )  # fmt: skip
