@@ -445,7 +445,7 @@ class Mission(Contents, Shown):
     def latest_end(self) -> float:
         """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout.
 
-        It is nan while a duration before it is automatic (`rigidfleet.planning.timing.timed`).
+        It is nan while a duration before it is automatic (`rigidfleet.planning.timing.complete_times`).
         """
         return latest_end(self.phases)
 

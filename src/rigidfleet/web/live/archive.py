@@ -142,7 +142,7 @@ def _combine(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> 
     time, record, integral, frame, vehicles, layers = (
         combine([getattr(p, name) for p in pieces]) for name in names
     )
-    first, leading = pieces[0], tuple(step for p in pieces for step in p.led)
+    first, leading = pieces[0], tuple(step for p in pieces for step in p.followed)
     return Piece(
         first.phase, time, record, integral, frame, first.edges, first.attached, leading, vehicles, layers
     )  # fmt: skip
