@@ -97,16 +97,19 @@ class Table:
     @property
     def columns(self) -> list[tuple[str, str, bool]]:
         """Name and unit of each column that is shown, and whether it holds words; the last one is of marks, if any."""
-        names = [self.heads[k].partition(" [") for k in self._used]
+        names = [self.heads[k].partition(" [") for k in self._columns_shown]
         words = [k == 0 or name in self.words for k, (name, *_) in enumerate(names)]
         shown = [(name, unit[:-1], w) for (name, _, unit), w in zip(names, words, strict=True)]
-        return shown + [("", "", True)] * self._judged
+        return shown + [("", "", True)] * self._has_marks
 
     @property
     def cells(self) -> list[list[Cell]]:
         """What stands in each row that is shown."""
         return [
-            [*(_cell(row.cells[k]) for k in self._used), *[Cell(MARKS[row.level])] * self._judged]
+            [
+                *(_cell(row.cells[k]) for k in self._columns_shown),
+                *[Cell(MARKS[row.level])] * self._has_marks,
+            ]
             for row in self.rows
         ]
 
@@ -116,12 +119,12 @@ class Table:
         return [[str(cell) for cell in cells] for cells in self.cells]
 
     @property
-    def _used(self) -> list[int]:
+    def _columns_shown(self) -> list[int]:
         every = range(len(self.heads))
         return [k for k in every if k == 0 or any(str(_cell(r.cells[k])) for r in self.rows)]
 
     @property
-    def _judged(self) -> bool:
+    def _has_marks(self) -> bool:
         return any(row.level for row in self.rows) and not self.bare
 
     def html(self, kind: str = "") -> str:

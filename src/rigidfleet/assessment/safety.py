@@ -77,7 +77,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             limit, worst = q.limit_of(result.mission), measured.worst(q.name)
         if (q.key or q.limit) and (limit is not None or worst is not None):
             limit = None if limit is None or not np.isfinite(limit) else limit
-            row = Safety(q.called, q.text, shown(q.unit), q.at_least, limit, worst, passed)
+            row = Safety(q.in_words, q.text, shown(q.unit), q.at_least, limit, worst, passed)
             beyond = check is None and row.margin is not None and row.margin < -1e-9
             rows.append(replace(row, passed=passed and not beyond))
     return rows

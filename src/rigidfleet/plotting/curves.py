@@ -531,7 +531,7 @@ def motion(result: Result) -> Figure:
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes[:, 0], strict=True):
-        ax.set_ylabel(f"{q.called.replace(' ', chr(10))} [{shown(q.unit)}]")
+        ax.set_ylabel(f"{q.in_words.replace(' ', chr(10))} [{shown(q.unit)}]")
         quadrotors.draw_limited(ax, result, q.name)
     st.agents_legend(axes[0, 0], result.n_agents)
     st.name_phases(axes[0], result)

@@ -344,16 +344,16 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
 def _broken(mission: Mission, planned: PlannedPhase, hopeless: set[str]) -> Iterator[Remark]:
     """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
     over = timing.broken(mission, planned.leg)
-    if not over or over[0].limit.of.called in hopeless:
+    if not over or over[0].limit.of.in_words in hopeless:
         return
     key, least = timing.least_time(mission, planned.leg)
     if least is None:
         remedy = f"no {key} of this phase keeps all limits"
-        hopeless.add(over[0].limit.of.called)
+        hopeless.add(over[0].limit.of.in_words)
     else:
         remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
     yield Remark(
-        "fails", over[0].limit.of.called, f"{timing.said(over[0], planned.leg.phase)}; {remedy}"
+        "fails", over[0].limit.of.in_words, f"{timing.said(over[0], planned.leg.phase)}; {remedy}"
     )
 
 
@@ -365,11 +365,11 @@ def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
         if q not in MOTIONS or q.order > 2:
             continue
         size = limit.values(x, np.arange(mission.n_agents))
-        of = f" of {q.called}" if q.way else ""
+        of = f" of {q.in_words}" if q.way else ""
         k, i = np.unravel_index(int(size.argmax()), size.shape)
         if size[k, i] > most * (1 + 1e-3):
             text = (
                 f"agent {i + 1} reaches {size[k, i]:.3g} {q.unit}{of} at {planned.time[k]:.2f} s in"
                 f" '{planned.phase}' (limit {most:g} {q.unit})"
             )
-            yield Remark("fails" if planned.exact else "note", q.called, text)
+            yield Remark("fails" if planned.exact else "note", q.in_words, text)

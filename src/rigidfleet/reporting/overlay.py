@@ -56,7 +56,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
                 for flight, look in zip(flights, _looks(flights), strict=True)
             ]
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
-            ax.set_title(f"{'least' if q.at_least else 'greatest'} {q.called} [{shown(q.unit)}]")
+            ax.set_title(f"{'least' if q.at_least else 'greatest'} {q.in_words} [{shown(q.unit)}]")
             if not any(known):
                 st.note(ax, "nothing to show")
             elif logarithmic:

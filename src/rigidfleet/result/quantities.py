@@ -84,7 +84,7 @@ def samples(result: Result, name: str, close: proximity.Closeness | None = None)
     return Samples(QUANTITIES[name], *SAMPLED[name](result))
 
 
-def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
+def _motion_sizes(result: Result, q: Quantity) -> tuple[Floats, ...]:
     """Sizes (K, N) of velocity, acceleration or the jerk of slots, in all directions or one."""
     x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
@@ -92,13 +92,13 @@ def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
     return (of_left(result, SIZES[q.way](x) if q.way else length(x)),)
 
 
-def _below(result: Result) -> tuple[Floats, Owner]:
+def _heights_between(result: Result) -> tuple[Floats, Owner]:
     """Least height (K,) [m] between two agents, one below the other."""
     least, pair = proximity.headroom(result.position, result.mission.agents.radius, result.left)
     return least, lambda k: pair[k]
 
 
-def _fallen(result: Result) -> tuple[Floats, Owner]:
+def _distances_to_lost(result: Result) -> tuple[Floats, Owner]:
     """Least distance (K,) [m] between a lost agent and one still flying; NaN if no agent is lost."""
     r, radius = result.position, result.mission.fleet.radius
     least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
@@ -114,7 +114,7 @@ def _fallen(result: Result) -> tuple[Floats, Owner]:
     return least, lambda k: who[k]
 
 
-def _outside(result: Result) -> tuple[Floats, ...]:
+def _distances_outside(result: Result) -> tuple[Floats, ...]:
     """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
     r, fence = result.position, result.mission.limits.geofence
     if fence is None:
@@ -122,11 +122,11 @@ def _outside(result: Result) -> tuple[Floats, ...]:
     return (of_left(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
 
 
-def _altitude(result: Result) -> tuple[Floats, ...]:
+def _altitudes(result: Result) -> tuple[Floats, ...]:
     return (of_left(result, result.position[..., 2]),)
 
 
-def _tilt(result: Result) -> tuple[Floats, ...]:
+def _tilts(result: Result) -> tuple[Floats, ...]:
     """Tilt (K, N) [deg] of each vehicle; of points, of the thrust that the slots they track need."""
     q, wanted = result.vehicle_attitude, result.slot_acceleration
     if q is not None:
@@ -139,7 +139,7 @@ def _tilt(result: Result) -> tuple[Floats, ...]:
     return (of_left(result, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
 
 
-def _thrust(result: Result) -> tuple[Floats, ...]:
+def _thrusts(result: Result) -> tuple[Floats, ...]:
     """Thrust (K, N) [N] of each agent, from forces, or as recorded where that is more."""
     thrust, agents = length(result.input_force, result.constraint_force), result.mission.agents
     if agents.saturate:
@@ -149,24 +149,24 @@ def _thrust(result: Result) -> tuple[Floats, ...]:
     return (of_left(result, np.maximum(thrust, result.thrust)),)
 
 
-def _edges(result: Result, values: Floats) -> tuple[Floats, Owner]:
+def _edge_values(result: Result, values: Floats) -> tuple[Floats, Owner]:
     edges = result.edges
     return values, lambda _k, e: edges[e].tolist()
 
 
 #: Values of quantities at samples, with their owners where these are no single agents.
 SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
-    **{q.name: partial(_motion, q=q) for q in MOTIONS},
-    "separation_below": _below,
-    "lost": _fallen,
-    "geofence": _outside,
-    "lowest": _altitude,
-    "highest": _altitude,
-    "thrust": _thrust,
-    "tilt": _tilt,
+    **{q.name: partial(_motion_sizes, q=q) for q in MOTIONS},
+    "separation_below": _heights_between,
+    "lost": _distances_to_lost,
+    "geofence": _distances_outside,
+    "lowest": _altitudes,
+    "highest": _altitudes,
+    "thrust": _thrusts,
+    "tilt": _tilts,
     "tracking_error": lambda r: (of_left(r, length(r.position - r.slot_position)),),
-    "constraint": lambda r: _edges(r, np.abs(r.constraint)),
-    "tension": lambda r: _edges(r, -r.multiplier),
+    "constraint": lambda r: _edge_values(r, np.abs(r.constraint)),
+    "tension": lambda r: _edge_values(r, -r.multiplier),
     "constraint_force": lambda r: (of_left(r, length(r.constraint_force)),),
     "singular_value": lambda r: (r.singular_value, lambda _k: (0,)),
 }

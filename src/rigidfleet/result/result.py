@@ -403,7 +403,7 @@ class Result(Shown):
         }
         rows = [Row(item) for item in about.items() if item[1] is not None]
         worst = [
-            Fact(f"{q.sense} {q.called}", x.value, q.unit, when=x.time)
+            Fact(f"{q.sense} {q.in_words}", x.value, q.unit, when=x.time)
             for q in map(quantity, _WORST)
             if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
