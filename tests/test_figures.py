@@ -386,19 +386,28 @@ def test_phase_names_do_not_overlap(name, lengths):
 
 @pytest.mark.parametrize("lengths", ["two", "twelve as in the paper", "twelve in a rush"])
 def test_every_phase_is_named(lengths):
-    """Up to a dozen phases all have their names, however short they are, in the order of time."""
+    """Up to a dozen phases all have their names, over the axes or in the key, in the order of time."""
     phases = [(f"leg {k}", x) for k, x in enumerate(LENGTHS[lengths])]
-    labels = by_gid(drawn("distances", a_flight(phases=phases)), "phase")
-    assert [label.get_text() for label in labels] == [name for name, _ in phases]
+    figure = drawn("distances", a_flight(phases=phases))
+    labels = by_gid(figure, "phase")
+    if len(phases) > 2:  # numbers
+        key = " ".join(figure._supxlabel.get_text().split())
+        assert key == "Phases: " + " · ".join(f"{k + 1} leg {k}" for k in range(len(phases)))
+        assert {label.get_text() for label in labels} <= {str(k + 1) for k in range(len(phases))}
+    else:
+        assert [label.get_text() for label in labels] == [name for name, _ in phases]
     places = [label.get_position()[0] for label in labels]
     assert places == sorted(places)
 
 
-def test_names_stand_upright_where_they_fit(triangle):
-    """Long phases have their names level and centred; short ones slanting."""
-    labels = by_gid(drawn("distances", triangle), "phase")
-    assert [label.get_rotation() for label in labels] == [0, 0]
+def test_names_stand_over_their_phases_where_they_fit(triangle):
+    """Long phases have their names level and centred, and no key; of a phase of a second, the number stands there."""
+    figure = drawn("distances", triangle)
+    labels = by_gid(figure, "phase")
     assert [label.get_position()[0] for label in labels] == [3.0, 13.0]
+    assert figure._supxlabel is None
+    short = drawn("distances", a_flight(phases=[("a name of some length", 1.0), ("fly", 19.0)]))
+    assert [label.get_text() for label in by_gid(short, "phase")] == ["1", "2"]
 
 
 def test_the_summary_says_which_phase_has_which_number(triangle):
@@ -660,13 +669,13 @@ def test_thinned_lines_keep_their_peaks():
     t = np.linspace(0, 90, 200_000)
     y = np.sin(t)
     y[[77_777, 123_456]] = 100.0, -100.0
-    x, z = style.thinned(t, y)
+    x, z = style.thin_out(t, y)
     assert len(x) < 4000
     assert (np.diff(x) > 0).all()
     assert (x[0], x[-1]) == (t[0], t[-1])
     assert (z.max(), z.min()) == (100.0, -100.0)
-    assert style.thinned(t[:100], y[:100])[0] is not None
-    np.testing.assert_array_equal(style.thinned(t[:100], y[:100])[1], y[:100])
+    assert style.thin_out(t[:100], y[:100])[0] is not None
+    np.testing.assert_array_equal(style.thin_out(t[:100], y[:100])[1], y[:100])
 
 
 def test_a_flight_that_breaks_down_is_still_readable():
@@ -885,7 +894,7 @@ def test_an_incomplete_flight_says_so_without_titles(tmp_path):
     )
     assert "incomplete, stopped at 20.00 s" in words
     assert "Thrust of each agent" not in words
-    with style.shape(titles=False):
+    with style.figure_options(titles=False):
         figure = drawn("inputs", stopped)
     assert figure._suptitle is not None
     warning = figure._suptitle.get_window_extent().corners()
@@ -949,10 +958,10 @@ def test_words_at_a_point_are_on_the_page(width):
     for k in range(0, len(apart), 4):
         dip = apart.copy()
         dip[k] = -0.228
-        with style.shape(width=width):
+        with style.figure_options(width=width):
             figure, ((ax,),) = style.time_figure(result, "Clearance", 1)
             ax.plot(result.time, dip)
-            at = style.around(result.time[k], dip[k])
+            at = style.places_around(result.time[k], dip[k])
             style.annotate(ax, f"-0.228 m at {result.time[k]:.2f} s, agents 11 and 12", at)
             style.place_words(figure)
         box = ax.texts[-1].get_window_extent()

@@ -27,23 +27,23 @@ def kept(function: Callable[..., R]) -> Callable[..., R]:
     their identity. Arrays in results are read-only, and must not be arguments themselves. Arguments are given without
     their names. Results for large arrays are not kept.
     """
-    found: dict[Any, tuple[R, Any]] = {}
+    results: dict[Any, tuple[R, Any]] = {}
     lock = threading.Lock()
 
     @wraps(function)
     def wrapper(*args: Any) -> R:
         try:
             key = tuple([_KEYS.get(type(x), _of_other)(x) for x in args])
-            return found[key][0]
+            return results[key][0]
         except KeyError:
             result = function(*args)
         except _TooLargeError:
             return function(*args)
         _freeze(result)
         with lock:
-            while len(found) >= _MANY:
-                del found[next(iter(found))]
-            found[key] = result, args  # alive, so that nothing else gets their identities
+            while len(results) >= _MANY:
+                del results[next(iter(results))]
+            results[key] = result, args  # alive, so that nothing else gets their identities
         return result
 
     return wrapper

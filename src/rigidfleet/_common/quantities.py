@@ -57,7 +57,7 @@ class Quantity:
     checked: bool = True
 
     @property
-    def in_words(self) -> str:
+    def name_in_words(self) -> str:
         """Its name in words."""
         return self.name.replace("_", " ")
 
@@ -199,7 +199,7 @@ LIMITS_OF_CURVES = [
 ]
 
 
-def shown(unit: str) -> str:
+def display_unit(unit: str) -> str:
     """A unit as pages and figures show it: m/s² for m/s^2."""
     return unit.replace("^2", "²").replace("^3", "³")
 

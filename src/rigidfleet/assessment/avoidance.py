@@ -106,9 +106,9 @@ def _margins(measured: Measurements, ending: str = "") -> list[Extreme]:
 
 def _doubt(measured: Measurements) -> str:
     """Why the guarantee is not proved; empty if it is."""
-    from rigidfleet.mission.avoidance import unproved
+    from rigidfleet.mission.avoidance import why_unproved
 
     if measured.result.statistics.get("pushed"):
         return "a force from outside acted, which it does not know"
     mission = measured.mission
-    return unproved(mission.vehicle_models or [], mission.disturbances, mission.obstacles)
+    return why_unproved(mission.vehicle_models or [], mission.disturbances, mission.obstacles)

@@ -73,7 +73,7 @@ def _quantity_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     e = measured.worst(q.name)
     if e is None and limit is not None and q in MOTIONS and measured.result.interpolation:
         words = (
-            f"{q.in_words} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none."
+            f"{q.name_in_words} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none."
             " Assume cubics, or give velocities"
         )
         yield CheckResult(q.name, False, words, None, limit, q.unit)

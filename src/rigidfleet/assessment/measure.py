@@ -16,7 +16,14 @@ from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.result import PAD, Extremum, PhaseRecord, Result
-from rigidfleet.result.quantities import SAMPLED, Samples, closeness, of_left, owner_name, samples
+from rigidfleet.result.quantities import (
+    SAMPLED,
+    Samples,
+    closeness,
+    owner_name,
+    samples,
+    without_lost,
+)
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Share by which a sample may be worse than the worst value of its phase; beyond it, the record contradicts itself.
@@ -157,7 +164,7 @@ class Measurements:
         the end.
         """
         time = self.result.time
-        clearance, nearest = of_left(self.result, self.close.each), self.close.nearest
+        clearance, nearest = without_lost(self.result, self.close.each), self.close.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.names_recorded & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.

@@ -157,13 +157,15 @@ def limit_check(
     """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
     at_least = q.at_least and limit is not None
     if e is None:
-        words = words or q.nothing or f"the flight has no {q.in_words} to judge"
+        words = words or q.nothing or f"the flight has no {q.name_in_words} to judge"
         return CheckResult(
             q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
     if not words:
         bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
-        words = q.words or f"greatest {q.in_words} {{worst}}, {{who}}, at {{when:.2f}} s{bound}"
+        words = (
+            q.words or f"greatest {q.name_in_words} {{worst}}, {{who}}, at {{when:.2f}} s{bound}"
+        )
         worst = value(e.value, q.unit)
         words = words.format(worst=worst, who=e.who, when=e.when, limit=limit)
     if e.at_samples:

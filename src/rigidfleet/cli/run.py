@@ -86,11 +86,11 @@ def run(
     check_width(width)
     from rigidfleet.mission import load_mission
 
-    asked = load_mission(mission)
-    files = Files(out or Path("flights", asked.name), asked.name)
+    loaded = load_mission(mission)
+    files = Files(out or Path("flights", loaded.name), loaded.name)
     files.claim(replace=force)
     with watching(None if quiet else console.FlightWatch()) as progress:
-        result, interrupted = fly(asked, progress)
+        result, interrupted = fly(loaded, progress)
 
     from rigidfleet._common.files import make_folder, write_file
     from rigidfleet.assessment import assess

@@ -35,19 +35,14 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     """
     from scipy.spatial import KDTree
 
-    p = np.asarray(points, dtype=np.float64)
-    if len(p) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = KDTree(p).query_pairs(_reach_of_neighbours(p, reach), output_type="ndarray")
+    distance = _reach_of_neighbours(points, reach)
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
 
 
 def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
     """Number of edges that `neighbours` would return, without building them."""
-    p = np.asarray(points, dtype=np.float64)
-    if len(p) < 2:
-        return 0
-    return count_within(p, _reach_of_neighbours(p, reach))
+    return count_within(points, _reach_of_neighbours(points, reach))
 
 
 def count_within(points: ArrayLike, distance: float) -> int:
@@ -58,8 +53,9 @@ def count_within(points: ArrayLike, distance: float) -> int:
     return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
-def _reach_of_neighbours(p: Floats, reach: float) -> float:
-    """Greatest distance [m] between neighbours among points (N, 3)."""
+def _reach_of_neighbours(points: ArrayLike, reach: float) -> float:
+    """Greatest distance [m] between neighbours among points (N, 3); infinite for a single one."""
+    p = np.asarray(points, dtype=np.float64)
     return reach * float(np.median(nearest(p))) * (1 + 1e-9)
 
 
@@ -85,9 +81,8 @@ def henneberg(points: ArrayLike) -> Ints:
 
     p = np.asarray(points, dtype=np.float64)
     n = len(p)
-    order = _put_spanning_points_first(
-        p, np.argsort(((p - p.mean(axis=0)) ** 2).sum(axis=1), kind="stable")
-    )
+    away = ((p - p.mean(axis=0)) ** 2).sum(axis=1)
+    order = _put_spanning_points_first(p, np.argsort(away, kind="stable"))
     rank = np.empty(n, dtype=np.int64)
     rank[order] = np.arange(n)
     tree = KDTree(p)
@@ -217,9 +212,8 @@ def _order_from_coarse_to_fine(p: Floats) -> Ints:
 def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
     """The order (N,) with four points that span space moved to the front, each the earliest possible one."""
     if len(p) < 4:
-        raise ValueError(
-            f"{len(p)} points cannot have three edges each; at least four points are needed"
-        )
+        few = f"{len(p)} points cannot have three edges each"
+        raise ValueError(f"{few}; at least four points are needed")
     x = p[order] - p[order[0]]
     x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
     chosen = [0, 1]
@@ -229,8 +223,7 @@ def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
     ):
         fits = np.flatnonzero(size() > 0.2)
         if not len(fits):
-            raise ValueError(
-                "points in a plane or on a line cannot be held by three edges each; they need slots"
-            )
+            flat = "points in a plane or on a line cannot be held by three edges each"
+            raise ValueError(f"{flat}; they need slots")
         chosen.append(int(fits[0]))
     return np.concatenate([order[chosen], np.delete(order, chosen)])

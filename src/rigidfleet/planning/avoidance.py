@@ -6,11 +6,18 @@ import numpy as np
 
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
-from rigidfleet.mission.avoidance import braking, foresight, reaction_times, widening
+from rigidfleet.mission.avoidance import (
+    braking_accelerations,
+    extra_radii,
+    reaction_lags,
+    reaction_times,
+)
 from rigidfleet.solids.records import join
 
 
-def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avoidance | None:
+def avoidance_in_flight(
+    mission: Mission, flight: fleet.SampledFlight
+) -> avoidance.AvoidanceArrays | None:
     """Avoidance at the ticks of the formation's law; None without [avoidance]."""
     given, models = mission.avoidance, mission.vehicle_models
     if given is None or models is None:
@@ -25,7 +32,7 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance(
         period=flight.every * flight.steps * flight.h,
-        b=braking(models, mission.gravity, mission.disturbances),
+        b=braking_accelerations(models, mission.gravity, mission.disturbances),
         lift=limit / mass,
         mass=mass,
         g=mission.gravity,
@@ -38,11 +45,11 @@ def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avo
         clearance=given.clearance,
         drag=drag,
         lag=reaction_times(models, mission.disturbances),
-        ahead=foresight(models, mission.disturbances, mission.gravity),
+        ahead=reaction_lags(models, mission.disturbances, mission.gravity),
         tilt=np.array(
             [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
         ),
-        spare=widening(given, models, mission.disturbances),
+        spare=extra_radii(given, models, mission.disturbances),
         rate=given.rate,
         share=given.share,
         release=given.release,

@@ -23,15 +23,11 @@ from rigidfleet._common.quantities import quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
-from rigidfleet.setpoints import Setpoints, at_rate, csv, of_motion
+from rigidfleet.setpoints import Setpoints, at_rate, csv_text, states_of_motion
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
-
-
-def _v(dims: str, units: str, text: str) -> Variable:
-    return Variable(tuple(dims.split()), units, text)
 
 
 _LABELLED = {dim: len(names) for dim, names in LABELS.items()}
@@ -46,21 +42,17 @@ Later = Sequence[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]]
 
 
 @cache
-def _versions_found() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+def _installed_versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
     for package in ("rigidfleet", "numpy", "scipy", "numba", "h5netcdf"):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
-def _versions() -> dict[str, str]:
-    return dict(_versions_found())
-
-
-def _now() -> str:
+def _timestamp() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -92,171 +84,128 @@ class Result(Shown):
         An array has the wrong shape, an index is out of range, or time does not increase.
     """
 
-    time: Annotated[Floats, _v("time", "s", "mission time")]
-    phase: Annotated[Ints, _v("time", "1", "index of the phase flown, from 0")]
+    time: Annotated[Floats, "time | s | mission time"]
+    phase: Annotated[Ints, "time | 1 | index of the phase flown, from 0"]
 
-    position: Annotated[Floats, _v("time agent axis", "m", "position, world axes (ENU)")]
-    velocity: Annotated[Floats, _v("time agent axis", "m s-1", "velocity, world axes")]
-    acceleration: Annotated[Floats, _v("time agent axis", "m s-2", "acceleration, world axes")]
-    slot_position: Annotated[Floats, _v("time agent axis", "m", "desired position, world axes")]
+    position: Annotated[Floats, "time agent axis | m | position, world axes (ENU)"]
+    velocity: Annotated[Floats, "time agent axis | m s-1 | velocity, world axes"]
+    acceleration: Annotated[Floats, "time agent axis | m s-2 | acceleration, world axes"]
+    slot_position: Annotated[Floats, "time agent axis | m | desired position, world axes"]
 
-    input_force: Annotated[Floats, _v("time agent axis", "N", "input force f_u, world axes")]
-    constraint_force: Annotated[
-        Floats, _v("time agent axis", "N", "constraint force f_C, world axes")
-    ]
-    external_force: Annotated[
-        Floats, _v("time agent axis", "N", "gravity and disturbances, world axes")
-    ]
+    input_force: Annotated[Floats, "time agent axis | N | input force f_u, world axes"]
+    constraint_force: Annotated[Floats, "time agent axis | N | constraint force f_C, world axes"]
+    external_force: Annotated[Floats, "time agent axis | N | gravity and disturbances, world axes"]
     thrust: Annotated[
-        Floats,
-        _v("time agent", "N", "thrust |f_u + f_C|, clipped at the limit if thrust saturates"),
+        Floats, "time agent | N | thrust |f_u + f_C|, clipped at the limit if thrust saturates"
     ]
 
-    cm: Annotated[Floats, _v("time axis", "m", "centre of mass, world axes")]
-    cm_velocity: Annotated[Floats, _v("time axis", "m s-1", "velocity of the centre of mass")]
-    cm_reference: Annotated[Floats, _v("time axis", "m", "commanded centre of mass")]
+    cm: Annotated[Floats, "time axis | m | centre of mass, world axes"]
+    cm_velocity: Annotated[Floats, "time axis | m s-1 | velocity of the centre of mass"]
+    cm_reference: Annotated[Floats, "time axis | m | commanded centre of mass"]
     cm_velocity_reference: Annotated[
-        Floats, _v("time axis", "m s-1", "commanded velocity of the centre of mass")
+        Floats, "time axis | m s-1 | commanded velocity of the centre of mass"
     ]
 
     attitude: Annotated[
-        Floats, _v("time quaternion", "1", "attitude of the formation, world to body, scalar first")
+        Floats, "time quaternion | 1 | attitude of the formation, world to body, scalar first"
     ]
-    attitude_reference: Annotated[Floats, _v("time quaternion", "1", "commanded attitude")]
-    frame: Annotated[Floats, _v("time quaternion", "1", "integrated mean-axis frame")]
-    rates: Annotated[Floats, _v("time axis", "rad s-1", "angular velocity, body axes (p, q, r)")]
+    attitude_reference: Annotated[Floats, "time quaternion | 1 | commanded attitude"]
+    frame: Annotated[Floats, "time quaternion | 1 | integrated mean-axis frame"]
+    rates: Annotated[Floats, "time axis | rad s-1 | angular velocity, body axes (p, q, r)"]
     rates_reference: Annotated[
-        Floats, _v("time axis", "rad s-1", "commanded angular velocity, body axes")
+        Floats, "time axis | rad s-1 | commanded angular velocity, body axes"
     ]
 
     wrench_asked: Annotated[
-        Floats,
-        _v("time wrench", "N or N m", "commanded wrench: force, torque about the centre of mass"),
+        Floats, "time wrench | N or N m | commanded wrench: force, torque about the centre of mass"
     ]
     wrench_achieved: Annotated[
-        Floats,
-        _v("time wrench", "N or N m", "resulting wrench: force, torque about the centre of mass"),
+        Floats, "time wrench | N or N m | resulting wrench: force, torque about the centre of mass"
     ]
 
-    edges: Annotated[Ints, _v("edge end", "1", "the two agents of each edge, from 0")]
-    distance: Annotated[Floats, _v("time edge", "m", "edge length L")]
-    distance_reference: Annotated[Floats, _v("time edge", "m", "reference d of an edge's length")]
-    distance_rate_reference: Annotated[Floats, _v("time edge", "m s-1", "rate of the reference d")]
-    constraint: Annotated[Floats, _v("time edge", "m", "constraint error c = L - d")]
-    integral: Annotated[Floats, _v("time edge", "m s", "integral of the constraint error")]
-    multiplier: Annotated[Floats, _v("time edge", "N", "multiplier lambda; the tension is -lambda")]
+    edges: Annotated[Ints, "edge end | 1 | the two agents of each edge, from 0"]
+    distance: Annotated[Floats, "time edge | m | edge length L"]
+    distance_reference: Annotated[Floats, "time edge | m | reference d of an edge's length"]
+    distance_rate_reference: Annotated[Floats, "time edge | m s-1 | rate of the reference d"]
+    constraint: Annotated[Floats, "time edge | m | constraint error c = L - d"]
+    integral: Annotated[Floats, "time edge | m s | integral of the constraint error"]
+    multiplier: Annotated[Floats, "time edge | N | multiplier lambda; the tension is -lambda"]
     singular_value: Annotated[
         Floats,
-        _v(
-            "time",
-            "1",
-            "smallest non-zero singular value of the constraint Jacobian J; with many agents, at some samples only",
-        ),
+        "time | 1 | smallest non-zero singular value of the constraint Jacobian J; with many agents, at some "
+        "samples only",
     ]
 
     separation: Annotated[
         Floats,
-        _v(
-            "time",
-            "m",
-            "least separation between two agents: centre distance minus radii; the sample after the minimum of a phase "
-            "has that minimum",
-        ),
+        "time | m | least separation between two agents: centre distance minus radii; the sample after the "
+        "minimum of a phase has that minimum",
     ]
     separation_pair: Annotated[
-        Ints, _v("time end", "1", "the two agents with the least separation, from 0; -1 for none")
+        Ints, "time end | 1 | the two agents with the least separation, from 0; -1 for none"
     ]
     clearance: Annotated[
         Floats,
-        _v(
-            "time",
-            "m",
-            "clearance to the nearest obstacle: distance minus radius; the sample after the minimum of a phase has "
-            "that minimum",
-        ),
+        "time | m | clearance to the nearest obstacle: distance minus radius; the sample after the minimum of a "
+        "phase has that minimum",
     ]
     clearance_agent: Annotated[
-        Ints, _v("time", "1", "the agent with the least clearance, from 0; -1 for none")
+        Ints, "time | 1 | the agent with the least clearance, from 0; -1 for none"
     ]
     clearance_obstacle: Annotated[
-        Ints, _v("time", "1", "the obstacle nearest to an agent, from 0; -1 for none")
+        Ints, "time | 1 | the obstacle nearest to an agent, from 0; -1 for none"
     ]
 
     disturbance_force: Annotated[
         Floats | None,
-        _v(
-            "time agent axis", "N", "force of the air, part of external_force; missing in still air"
-        ),
+        "time agent axis | N | force of the air, part of external_force; missing in still air",
     ] = None
     measured_position: Annotated[
-        Floats | None, _v("time agent axis", "m", "measured position; missing without noise")
+        Floats | None, "time agent axis | m | measured position; missing without noise"
     ] = None
     measured_velocity: Annotated[
-        Floats | None, _v("time agent axis", "m s-1", "measured velocity; missing without noise")
+        Floats | None, "time agent axis | m s-1 | measured velocity; missing without noise"
     ] = None
 
     vehicle_attitude: Annotated[
         Floats | None,
-        _v(
-            "time agent quaternion",
-            "1",
-            "attitude of each vehicle, world to body, scalar first; missing without vehicles",
-        ),
+        "time agent quaternion | 1 | attitude of each vehicle, world to body, scalar first; missing without vehicles",
     ] = None
     vehicle_rates: Annotated[
         Floats | None,
-        _v(
-            "time agent axis",
-            "rad s-1",
-            "angular velocity of each vehicle, body axes; missing without vehicles",
-        ),
+        "time agent axis | rad s-1 | angular velocity of each vehicle, body axes; missing without vehicles",
     ] = None
     rotor_force: Annotated[
-        Floats | None,
-        _v("time agent rotor", "N", "thrust of each rotor; missing without vehicles"),
+        Floats | None, "time agent rotor | N | thrust of each rotor; missing without vehicles"
     ] = None
     saturated: Annotated[
         Ints | None,
-        _v(
-            "time agent",
-            "1",
-            "1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
-        ),
+        "time agent | 1 | 1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
     ] = None
     clock_rate: Annotated[
-        Floats | None,
-        _v("time", "1", "rate of the virtual clock; missing without [avoidance]"),
+        Floats | None, "time | 1 | rate of the virtual clock; missing without [avoidance]"
     ] = None
     body_displacement: Annotated[
         Floats | None,
-        _v(
-            "time axis",
-            "m",
-            "displacement of the reference from the planned path, by the body layer; missing without [avoidance]",
-        ),
+        "time axis | m | displacement of the reference from the planned path, by the body layer; missing without "
+        "[avoidance]",
     ] = None
     avoidance_layers: Annotated[
         Ints | None,
-        _v(
-            "time agent",
-            "1",
-            "sum of the layers that change what an agent is asked for: 1 barriers, 2 guard, 4 guard by braking; "
-            "missing without [avoidance]",
-        ),
+        "time agent | 1 | sum of the layers that change what an agent is asked for: 1 barriers, 2 guard, 4 guard "
+        "by braking; missing without [avoidance]",
     ] = None
     slot_velocity: Annotated[
-        Floats | None, _v("time agent axis", "m s-1", "desired velocity, world axes")
+        Floats | None, "time agent axis | m s-1 | desired velocity, world axes"
     ] = None
     slot_acceleration: Annotated[
-        Floats | None, _v("time agent axis", "m s-2", "desired acceleration, world axes")
+        Floats | None, "time agent axis | m s-2 | desired acceleration, world axes"
     ] = None
-    slot_jerk: Annotated[
-        Floats | None, _v("time agent axis", "m s-3", "desired jerk, world axes")
-    ] = None
+    slot_jerk: Annotated[Floats | None, "time agent axis | m s-3 | desired jerk, world axes"] = None
     yaw: Annotated[
-        Floats | None, _v("time agent", "rad", "desired yaw of each vehicle, from east to north")
+        Floats | None, "time agent | rad | desired yaw of each vehicle, from east to north"
     ] = None
-    yaw_rate: Annotated[Floats | None, _v("time agent", "rad s-1", "desired yaw rate")] = None
+    yaw_rate: Annotated[Floats | None, "time agent | rad s-1 | desired yaw rate"] = None
 
     phases: list[PhaseRecord]
     mission_text: str
@@ -264,25 +213,25 @@ class Result(Shown):
     complete: bool = True
     ending: str = ""
     statistics: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=_versions)
+    versions: dict[str, str] = field(default_factory=lambda: dict(_installed_versions()))
     platform: str = field(default_factory=platform.platform)
-    created: str = field(default_factory=_now)
+    created: str = field(default_factory=_timestamp)
 
     def __post_init__(self, later: Later) -> None:
-        given = self.__dict__
+        values = self.__dict__
         self._later = {name: make for names, make in later for name in names}
         for name in self._later:
-            del given[name]
+            del values[name]
         sizes: dict[str, int] = dict(_LABELLED)
         for key, dims in (
             ("time", ("time",)),
             ("position", ("time", "agent")),
             ("edges", ("edge",)),
         ):
-            if isinstance(given[key], np.ndarray):
-                sizes.update(zip(dims, given[key].shape, strict=False))
-        for name in [name for name in given if name in _CHECKED]:
-            value = given[name]
+            if isinstance(values[key], np.ndarray):
+                sizes.update(zip(dims, values[key].shape, strict=False))
+        for name in [name for name in values if name in _CHECKED]:
+            value = values[name]
             if value is not None or not VARIABLES[name].optional:
                 self._set(name, value, sizes)
         if not later:  # what a flight of this process has made is right
@@ -290,7 +239,7 @@ class Result(Shown):
 
     def _check(self, sizes: dict[str, int]) -> None:
         """Check values: they come from somewhere else."""
-        given = self.__dict__
+        values = self.__dict__
         if sizes["time"] == 0 or sizes["agent"] == 0:
             raise ValueError("a result needs at least one sample and one agent")
         time, phase = self.time, self.phase
@@ -305,7 +254,7 @@ class Result(Shown):
             raise ValueError("phase must not decrease")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
-            who = given.get(name)  # None if it is made later
+            who = values.get(name)  # None if it is made later
             if who is not None and who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         agents, rotors = range(n), range(4)
@@ -320,30 +269,22 @@ class Result(Shown):
                 if alone or x.who not in agents:
                     raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
-            q = given.get(name)  # most have a scalar part, which is found in a fifth of the time
+            q = values.get(name)  # most have a scalar part, which is found in a fifth of the time
             if q is not None and not q[..., 0].all() and not q.any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")
 
-    def _set(self, name: str, given: Any, sizes: dict[str, int]) -> None:
+    def _set(self, name: str, array: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims, dtype = _CHECKED[name]
-        if (
-            type(given) is np.ndarray
-            and given.dtype is dtype
-            and given.shape == tuple([sizes.get(dim) for dim in dims])
-            and given.flags.c_contiguous
-        ):
-            self.__dict__[name] = given
-            return
-        value = np.ascontiguousarray(given, dtype=dtype)
-        asked = tuple(sizes.get(dim, "any") for dim in dims)
-        if value.ndim != len(asked) or any(
+        value = np.ascontiguousarray(array, dtype=dtype)
+        expected = tuple(sizes.get(dim, "any") for dim in dims)
+        if value.ndim != len(expected) or any(
             sizes.setdefault(dim, n) != n for dim, n in zip(dims, value.shape, strict=True)
         ):
             raise ValueError(
-                f"{name} ({', '.join(dims)}) has shape {value.shape}, expected {asked}"
+                f"{name} ({', '.join(dims)}) has shape {value.shape}, expected {expected}"
             )
         setattr(self, name, value)
 
@@ -403,7 +344,7 @@ class Result(Shown):
         }
         rows = [Row(item) for item in about.items() if item[1] is not None]
         worst = [
-            Fact(f"{q.sense} {q.in_words}", x.value, q.unit, when=x.time)
+            Fact(f"{q.sense} {q.name_in_words}", x.value, q.unit, when=x.time)
             for q in map(quantity, _WORST)
             if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
@@ -439,13 +380,13 @@ class Result(Shown):
                 f"the mission in the result cannot be read (written by rigidfleet {made}):\n{error}"
             )
             raise ResultError(message) from error
-        if wrong := self._foreign(mission):
+        if wrong := self._contradiction(mission):
             raise ResultError(
                 f"the mission in the result belongs to another flight: {wrong}. Fly it again or use another copy."
             )
         return mission
 
-    def _foreign(self, mission: Mission) -> str:
+    def _contradiction(self, mission: Mission) -> str:
         """Describe how the arrays contradict a mission; "" if they agree."""
         from rigidfleet.mission import KINDS
 
@@ -474,7 +415,7 @@ class Result(Shown):
     def left(self) -> Bools:
         """Mask (K, N) of the agents that are not lost at the time of each sample, or that a file has then."""
         if spans := self.statistics.get("spans"):
-            return there(self.time, spans, self.n_agents)
+            return presence(self.time, spans, self.n_agents)
         lost_at = self.mission.lost_at
         if self.time[-1] <= lost_at.min():
             return np.ones((len(self.time), len(lost_at)), dtype=np.bool_)
@@ -596,7 +537,7 @@ class Result(Shown):
             ends = [0, *jumps.tolist(), len(self.time)]
             parts = [slice(*pair) for pair in pairwise(ends)]
             state = np.concatenate(
-                [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
+                [states_of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
             )
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
         return Setpoints(self.time, state, *yaw)
@@ -615,7 +556,7 @@ class Result(Shown):
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
-        write_file(as_path(path), csv(self.setpoints(rate, flown=flown)).encode())
+        write_file(as_path(path), csv_text(self.setpoints(rate, flown=flown)).encode())
 
 
 #: Signature that `help` shows first. The forty arrays are left out: their units stand at their declarations.
@@ -631,11 +572,17 @@ vars(Result.__init__)["__signature__"] = Signature(_FIELDS)
 _HINTS = get_type_hints(Result, include_extras=True)
 
 
+def _variable(hint: Any, *, optional: bool) -> Variable:
+    """The declaration that stands beside the type of a field: dimensions | unit | meaning."""
+    dims, units, text = hint.__metadata__[0].split(" | ", 2)
+    return Variable(
+        tuple(dims.split()), units, text, hint.__origin__ in (Ints, Ints | None), optional
+    )
+
+
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
-    f.name: _HINTS[f.name]
-    .__metadata__[0]
-    ._replace(integers=_HINTS[f.name].__origin__ in (Ints, Ints | None), optional=f.default is None)
+    f.name: _variable(_HINTS[f.name], optional=f.default is None)
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }
@@ -665,7 +612,7 @@ _CHECKED = {
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 
 
-def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
+def presence(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
     """Mask (K, N) of n agents that are there at times (K,) [s], each after the begin of its span and up to its end [s].
 
     An agent that is there at the first time counts then, too; without spans, all agents always do.
@@ -674,7 +621,7 @@ def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
     return ((time[:, None] > begin) | (begin <= time[0])) & (time[:, None] <= end)
 
 
-def as_result(given: Result | str | Path) -> Result:
+def as_result(value: Result | str | Path) -> Result:
     """Return the `Result` that was given, or read it from its file.
 
     Raises
@@ -684,11 +631,11 @@ def as_result(given: Result | str | Path) -> Result:
     ResultError
         As `Result.load` does.
     """
-    if isinstance(given, Result):
-        return given
-    if isinstance(given, str | Path):
-        return Result.load(given)
-    raise wrong_type("a flight (a Result or the path of one that was saved)", given)
+    if isinstance(value, Result):
+        return value
+    if isinstance(value, str | Path):
+        return Result.load(value)
+    raise wrong_type("a flight (a Result or the path of one that was saved)", value)
 
 
 def _one_line(error: BaseException) -> str:

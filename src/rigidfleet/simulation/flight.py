@@ -348,7 +348,8 @@ class Flight:
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip
         except MissionError as error:
-            if by_hand:
+            # Only times that nothing keeps are found in flight; other errors are those of the mission.
+            if by_hand or not phase.automatic:
                 raise
             self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
             return False

@@ -13,7 +13,7 @@ import numpy as np
 from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
 from rigidfleet._common.plain import plain
 from rigidfleet.math.margins import Margins
-from rigidfleet.sweep.record import called
+from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.tuning.gains import Gains
 
 _WORDS = {
@@ -179,7 +179,7 @@ class Tuned(Shown):
         rows.append((f"passed, {which} seeds", was, now, ""))
         for reason in {**before.reasons, **after.reasons}:
             was, now = (str(x.reasons.get(reason, 0)) for x in (before, after))
-            rows.append((f"failed '{called(reason)}', {which} seeds", was, now, ""))
+            rows.append((f"failed '{reason_in_words(reason)}', {which} seeds", was, now, ""))
         return rows
 
 
