@@ -40,7 +40,7 @@ _FLAT = 1e-9
 _JUDGED = 200
 
 
-class Laid:
+class Alignments:
     """Slots fitted to the agents of G formations of equally many agents; what is asked for is found for all at once."""
 
     def __init__(self, p: Floats, slots: Floats) -> None:
@@ -48,7 +48,7 @@ class Laid:
         self.p, self.slots = (x - x.sum(axis=1, keepdims=True) / x.shape[1] for x in (p, slots))
         few = 1 < p.shape[1] <= _FEW
         #: The pair with the worst distance (G, 5): error [m], both, flown, of slots [m]; None of many agents.
-        self.worst = _worst_of_few(p, slots).tolist() if few else None
+        self.worst = _worst_pairs_of_few(p, slots).tolist() if few else None
 
     @cached_property
     def across(self) -> Floats:
@@ -56,7 +56,7 @@ class Laid:
         return self.p.swapaxes(1, 2) @ self.slots
 
     @cached_property
-    def off(self) -> Floats:
+    def distances_off(self) -> Floats:
         """Distance (G, N) of each agent from its slot, mirrored if that fits better."""
         U, _, Vt = np.linalg.svd(self.across)
         return length(self.p - self.slots @ (U @ Vt).swapaxes(1, 2))
@@ -67,12 +67,12 @@ class Laid:
         return np.abs(self.slots).max(axis=(1, 2))
 
     @cached_property
-    def mirrored(self) -> list[bool]:
+    def are_mirrored(self) -> list[bool]:
         """Whether the slots fit better if they are mirrored (G,)."""
         return (~(np.linalg.det(self.across) > 0.0)).tolist()
 
     @cached_property
-    def turn(self) -> Floats:
+    def rotation(self) -> Floats:
         """The best-fitting rotation (G, 3, 3), without a reflection."""
         return rigid_body.best_rotation(*np.linalg.svd(self.across))[0]
 
@@ -101,41 +101,41 @@ class Fit:
         p: Floats,
         slots: Floats,
         who: Ints | None = None,
-        laid: Laid | None = None,
+        group: Alignments | None = None,
         k: int = 0,
     ) -> None:
-        """Compare agents p (N, 3) with slots (N, 3), which are the k-th of ``laid``; ``who`` (N,) are their numbers."""
-        self._laid, self._k = Laid(p[None], slots[None]) if laid is None else laid, k
+        """Compare agents p (N, 3) with slots (N, 3), the k-th of ``group``; ``who`` (N,) are their numbers."""
+        self._group, self._k = Alignments(p[None], slots[None]) if group is None else group, k
         shape = _shape if slots.nbytes < _KEPT else _shape_of_many
         self.dimension, self.axis, self._plane, self._order, self.shortest = shape(slots.tobytes())
-        self.error, pair, self.flown, self.intended = _all_pairs(p, slots, self._laid, k)
+        self.error, pair, self.flown, self.intended = _worst_pair(p, slots, self._group, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
 
     @property
-    def mirrored(self) -> bool:
+    def is_mirrored(self) -> bool:
         """Whether a spatial shape is the mirror image of its slots."""
-        return self.dimension == 3 and self._laid.mirrored[self._k]
+        return self.dimension == 3 and self._group.are_mirrored[self._k]
 
     @cached_property
     def points(self) -> list[float]:
         """Where the best-fitting rotation turns the axis in the world: a vector (3,) of any length."""
-        across = self._laid.across[self._k]
+        across = self._group.across[self._k]
         if self.dimension == 1:
-            found = (across @ self.axis).tolist()
-            known = any(found)
+            axis = (across @ self.axis).tolist()
+            unique = any(axis)
         else:
             (x, y, z), (u, v, w) = (self._plane @ across.T).tolist()
-            found = [y * w - z * v, z * u - x * w, x * v - y * u]
-            known = math.hypot(*found) > _FLAT * (x * x + y * y + z * z + u * u + v * v + w * w)
+            axis = [y * w - z * v, z * u - x * w, x * v - y * u]
+            unique = math.hypot(*axis) > _FLAT * (x * x + y * y + z * z + u * u + v * v + w * w)
         # Of agents on a line, or at a point, many rotations fit equally well.
-        return found if known else (self._laid.turn[self._k] @ self.axis).tolist()
+        return axis if unique else (self._group.rotation[self._k] @ self.axis).tolist()
 
     @property
     def in_order(self) -> bool | None:
         """Whether the agents of a line are in order; None for other shapes, and for two agents."""
         if self.dimension != 1 or len(self._order) < 3:
             return None
-        return self._laid.order[self._k] in (self._order, self._order[::-1])
+        return self._group.order[self._k] in (self._order, self._order[::-1])
 
 
 @lru_cache(64)
@@ -154,7 +154,7 @@ def _shape(slots: bytes) -> tuple[int, Floats, Floats, list[int], float]:
 _shape_of_many = lru_cache(1)(_shape.__wrapped__)
 
 
-def _worst_of_few(p: Floats, slots: Floats) -> Floats:
+def _worst_pairs_of_few(p: Floats, slots: Floats) -> Floats:
     """Worst error of a distance of few agents (G, N, 3), see `Laid.worst`; of equal errors the first pair's."""
     i, j = proximity.all_pairs(p.shape[1])
     flown, intended = (length(x.take(i, axis=1) - x.take(j, axis=1)) for x in (p, slots))
@@ -165,20 +165,20 @@ def _worst_of_few(p: Floats, slots: Floats) -> Floats:
     return np.stack([error[k, at], i[at], j[at], flown[k, at], intended[k, at]], axis=1)
 
 
-def _all_pairs(
-    p: Floats, slots: Floats, laid: Laid, k: int
+def _worst_pair(
+    p: Floats, slots: Floats, group: Alignments, k: int
 ) -> tuple[float, tuple[int, int], float, float]:
     """Worst error of a distance among all pairs: error, pair, flown, intended [m].
 
     Of many agents, few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from
     their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
-    if laid.worst is not None:
-        error, i, j, flown, intended = laid.worst[k]
+    if group.worst is not None:
+        error, i, j, flown, intended = group.worst[k]
         return error, (int(i), int(j)), flown, intended
-    off, both = laid.off[k], np.array([p, slots])
+    off, both = group.distances_off[k], np.array([p, slots])
     order = np.argsort(-off, kind="stable")
-    ranked, rounding = -off[order], _ROUNDING * float(laid.size[k])
+    ranked, rounding = -off[order], _ROUNDING * float(group.size[k])
     worst = (-1.0, (0, 0), 0.0, 0.0)
     for first, i in enumerate(order[:-1].tolist(), start=1):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, quantity
-from rigidfleet.assessment.fits import Fit, Laid, angle_between
+from rigidfleet.assessment.fits import Alignments, Fit, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -48,13 +48,13 @@ class Measurements:
         #: Phases that have samples.
         self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
         #: Quantities of which the record tells what happens between samples.
-        self.told = set[str]().union(*(p.extremes for p in result.phases))
+        self.names_recorded = set[str]().union(*(p.extremes for p in result.phases))
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         self._nearest: dict[tuple[float, int], int] = {}
         self._sampled: dict[str, Samples] = {}
         #: Distances to each other and to obstacles at samples.
         self.close = closeness(result)
-        self.measured = {q.name: self.sampled(q.name) for q in QUANTITIES.values() if q.by_phase}
+        self.measured = {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
         self.thrust = self.measured["thrust"].values
         starts = np.array([self.samples[k].start for k in self.flown])
         ranks = np.full((len(self.measured), len(result.phases)), -np.inf)
@@ -67,13 +67,13 @@ class Measurements:
         self.last = [self.samples[k].stop - 1 for k in self.flown]
         self.ends = result.position[self.last]
 
-    def first(self, broken: Bools) -> float:
+    def first_time(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
     # -- at samples -----------------------------------------------------------------------------------
 
-    def sampled(self, name: str) -> Samples:
+    def samples_of(self, name: str) -> Samples:
         """Values of a quantity at samples."""
         if name not in self._sampled:
             self._sampled[name] = samples(self.result, name, self.close)
@@ -97,13 +97,13 @@ class Measurements:
 
     # -- between samples ------------------------------------------------------------------------------
 
-    def between(self, name: str, index: int) -> Extreme | None:
+    def recorded_extreme(self, name: str, index: int) -> Extreme | None:
         """The recorded extreme of a phase in continuous time; None if the record has none."""
         phase = self.result.phases[index]
         x = phase.extremes.get(name)
-        return None if x is None else self.recorded(name, x, phase.name)
+        return None if x is None else self.extreme_of(name, x, phase.name)
 
-    def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
+    def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
         size = abs(x.value) if name == "constraint" else q.scale * x.value
@@ -112,12 +112,12 @@ class Measurements:
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
         if name in self.measured:
-            every = [worst[name] for worst in self.worst_of if name in worst]
+            every = [worst[name] for worst in self.worst_by_phase if name in worst]
             rank = QUANTITIES[name].rank
             return max(every, key=lambda e: rank(e.value), default=None)
-        return self.among(name, self.sampled(name) if name in SAMPLED else None)
+        return self.worst_among(name, self.samples_of(name) if name in SAMPLED else None)
 
-    def among(self, name: str, samples: Samples | None) -> Extreme | None:
+    def worst_among(self, name: str, samples: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``samples``, or between them."""
         rank = quantity(name).rank
         every = {
@@ -125,23 +125,23 @@ class Measurements:
             for k, p in enumerate(self.result.phases)
             if name in p.extremes
         }
-        between = self.between(name, max(every, key=every.__getitem__)) if every else None
+        between = self.recorded_extreme(name, max(every, key=every.__getitem__)) if every else None
         sampled = None if samples is None else self.worst_sample(samples, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
         return between if rank(between.value) > rank(sampled.value) else sampled
 
     @cached_property
-    def worst_of(self) -> list[dict[str, Extreme]]:
+    def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.samples]
         phases = list(zip(self.result.phases, self.samples, every, strict=True))
         for name, sampled in self.measured.items():
-            rank_of, alone = sampled.quantity.rank, name not in self.told
+            rank_of, alone = sampled.quantity.rank, name not in self.names_recorded
             for rank, (phase, part, worst) in zip(self.rank[name], phases, strict=True):
                 x = phase.extremes.get(name)
                 if x is not None and rank < rank_of(x.value):
-                    worst[name] = self.recorded(name, x, phase.name)
+                    worst[name] = self.extreme_of(name, x, phase.name)
                 elif e := self.worst_sample(sampled, part, alone=alone):
                     worst[name] = e
         return every
@@ -152,8 +152,8 @@ class Measurements:
             return None
         every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
         if every:
-            return self.between(f"{name}_first", every[0])
-        sampled = self.sampled(name)
+            return self.recorded_extreme(f"{name}_first", every[0])
+        sampled = self.samples_of(name)
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
 
@@ -166,7 +166,7 @@ class Measurements:
         time = self.result.time
         clearance, nearest = without_lost(self.result, self.close.each), self.close.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
-        if not (stands or self.told & {"clearance_start", "clearance_end"}):
+        if not (stands or self.names_recorded & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst("clearance")}
         off, beside = clearance > PAD, np.zeros(clearance.shape, dtype=np.bool_)
@@ -187,7 +187,7 @@ class Measurements:
             return i, int(nearest[k, i])
 
         return {
-            name: self.among(
+            name: self.worst_among(
                 name, Samples(quantity(name), np.where(part, clearance, np.nan), owner)
             )
             for name, part in parts.items()
@@ -281,15 +281,15 @@ class Measurements:
             settled=record.settled,
             finished=finished,
             constraint=self.constraints.get(index),
-            distances=self.distances.get(index),
+            distances=self.edge_errors.get(index),
             shape=None if fit is None else fit.error,
-            handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
+            handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
             flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
             waypoint=self.misses.get(("target", index)) if finished else None,
             stay=self.misses.get(("stay", index)) if finished else None,
-            through=tuple(self.passed(index)),
-            worst=self.worst_of[index],
+            through=tuple(self.misses_on_way(index)),
+            worst=self.worst_by_phase[index],
         )
 
     @cached_property
@@ -298,20 +298,20 @@ class Measurements:
         return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
 
     @cached_property
-    def distances(self) -> dict[int, float | None]:
+    def edge_errors(self) -> dict[int, float | None]:
         """Greatest error [m] of an edge against its formation at the end of each phase that has one."""
         alike: dict[str, list[int]] = {}
         for i, k in enumerate(self.flown):
             if (name := self.result.phases[k].formation) is not None:
                 alike.setdefault(name, []).append(i)
-        found: dict[int, float | None] = {}
+        errors: dict[int, float | None] = {}
         for name, every in alike.items():
             # Some edges may be lost later
             for group in [every] if self._same_edges else [[i] for i in every]:
                 edges, intended = self.edges(name, self.last[group[0]])
                 off = (proximity.lengths(self.ends[group], edges) - intended[:, None]).T
-                found |= zip([self.flown[i] for i in group], _greatest(off), strict=True)
-        return found
+                errors |= zip([self.flown[i] for i in group], _greatest(off), strict=True)
+        return errors
 
     @property
     def _same_edges(self) -> bool:
@@ -354,9 +354,11 @@ class Measurements:
                 alike.setdefault(len(one[1]), []).append(one)
         fits = {}
         for group in alike.values():
-            laid = Laid(np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group]))
+            alignments = Alignments(
+                np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group])
+            )
             for k, (index, p, slots, left) in enumerate(group):
-                fit = fits[index] = Fit(p, slots, left, laid, k)
+                fit = fits[index] = Fit(p, slots, left, alignments, k)
                 form = self.mission.formations[self.result.phases[index].formation or ""]
                 fit.limit = form.greatest_error(fit.shortest)
         return fits
@@ -372,7 +374,7 @@ class Measurements:
         q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
         axes = np.array([fit.axis for fit in flat.values()])
         aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
-        found = {}
+        angle_by_phase = {}
         for i, (k, fit) in enumerate(flat.items()):
             some = aims[:, i].tolist()
             if fit.dimension == 1:
@@ -381,8 +383,8 @@ class Measurements:
             angles = (angle_between(fit.points, aim) for aim in some)
             angle = next(filter(math.isfinite, angles), None)
             if angle is not None:
-                found[k] = angle
-        return found
+                angle_by_phase[k] = angle
+        return angle_by_phase
 
     def nearest(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
@@ -418,19 +420,19 @@ class Measurements:
         ):  # fmt: skip
             rows = values[at].tolist()
             # Where the quantity is asked for, and known.
-            asked = {
+            wanted_at = {
                 i: wanted for i, ((_, target), row) in enumerate(zip(targets, rows, strict=True))
                 if (wanted := target.get(name)) is not None and all(map(math.isfinite, row))
             }  # fmt: skip
-            rows = [rows[i] for i in asked]
+            rows = [rows[i] for i in wanted_at]
             if name == "attitude" and rows:
-                off = np.degrees(att.angle_between(rows, [*asked.values()])).tolist()
+                off = np.degrees(att.angle_between(rows, [*wanted_at.values()])).tolist()
             else:
-                off = map(math.dist, rows, asked.values())
-            miss[name] = dict(zip(asked, off, strict=True))
+                off = map(math.dist, rows, wanted_at.values())
+            miss[name] = dict(zip(wanted_at, off, strict=True))
         for i, off in miss["position"].items():
             if result.phases[targets[i][0][1]].formation is None:
-                own = float(np.fmax.reduce(self.sampled("tracking_error").values[at[i]]))
+                own = float(np.fmax.reduce(self.samples_of("tracking_error").values[at[i]]))
                 # With a vehicle lost, the centre of those left says nothing of their places.
                 miss["position"][i] = max(off, own) if self.left[at[i]].all() else own
         return {
@@ -444,7 +446,7 @@ class Measurements:
             for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
         }
 
-    def passed(self, index: int) -> Iterator[Waypoint]:
+    def misses_on_way(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""
         result, samples = self.result, self.samples[index]
         for point in (result.phases[index].target or {}).get("through", ()):

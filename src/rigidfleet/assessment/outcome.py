@@ -138,14 +138,14 @@ class PhaseVerdict:
     worst: dict[str, Extreme]
 
 
-def holds(q: Quantity, worst: float, limit: float) -> bool:
+def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
     """Whether a worst value keeps its limit."""
     if q.at_least:
         return worst >= limit - SLACK and worst > 0
     return worst <= limit + SLACK * max(1.0, abs(limit))
 
 
-def bounded(
+def limit_check(
     q: Quantity,
     e: Extreme | None,
     limit: float | None,
@@ -171,7 +171,7 @@ def bounded(
     if e.at_samples:
         words += ", at samples"
     if passed is None and limit is not None:
-        passed = holds(q, e.value, limit)
+        passed = keeps_limit(q, e.value, limit)
     passed = passed is None or bool(passed)
     return CheckResult(
         q.name, passed, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,
