@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown, worst_values
 from rigidfleet._common.plain import plain
 from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold
@@ -176,7 +176,7 @@ class Verdict(Shown):
         return Sheet(self.mission, self.title, parts)
 
 
-def _phase_table(phases: list[PhaseVerdict]) -> Table:
+def _phase_table(phases: list[PhaseVerdict]) -> FactTable:
     """Worst values of each phase."""
     worst = ("constraint", "shape", "separation", "clearance", "speed", "thrust")
     rows = []
@@ -185,10 +185,10 @@ def _phase_table(phases: list[PhaseVerdict]) -> Table:
         rows.append(Row((p.name, f"{p.t_end:.2f}", p.constraint, *map(values.get, worst))))
     heads = ("phase", "end [s]", "|c| at end [m]", "worst |c| [m]", "shape off [m]", "apart [m]",
              "clear [m]", "speed [m/s]", "thrust [N]")  # fmt: skip
-    return Table(heads, rows)
+    return FactTable(heads, rows)
 
 
-def _waypoint_table(phases: list[PhaseVerdict]) -> Table:
+def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
     """Miss of each waypoint, in position, velocity, attitude and rates."""
 
     def rows() -> Iterator[Row]:
@@ -206,4 +206,4 @@ def _waypoint_table(phases: list[PhaseVerdict]) -> Table:
         "attitude [deg]",
         "rates [deg/s]",
     )
-    return Table(heads, [*rows()])
+    return FactTable(heads, [*rows()])

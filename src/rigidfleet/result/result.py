@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.facts import Fact, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, worst_values
 from rigidfleet._common.files import write_file
 from rigidfleet._common.quantities import quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
@@ -348,7 +348,7 @@ class Result(Shown):
             for q in map(quantity, _WORST)
             if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
-        contents = Table(("about", "result"), rows, ("result",), bare=True)
+        contents = FactTable(("about", "result"), rows, ("result",), bare=True)
         return Sheet(name, title, [contents, worst_values("quantity", worst)])
 
     @property
