@@ -126,7 +126,7 @@ def draft(
         establish=f"{blend + _SETTLE}.0",
         climb=f"{climb}.0",
     )
-    return aligned(head + "".join(text for text, _ in flights) + _TAIL)
+    return align_comments(head + "".join(text for text, _ in flights) + _TAIL)
 
 
 def shape_known(shape: str) -> None:
@@ -211,7 +211,7 @@ def _time(way: Floats) -> int:
     return max(4, blend_time(float(np.linalg.norm(way))))
 
 
-def aligned(text: str) -> str:
+def align_comments(text: str) -> str:
     """Align the comments beside keys in one column."""
     beside = re.compile(r"^([^#\n]*[^#\s]) +# ?(.*)$", re.MULTILINE)
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)

@@ -18,7 +18,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
     MOST_AGENTS,
-    aligned,
+    align_comments,
     blend_time,
     output_step,
     shape_known,
@@ -163,7 +163,7 @@ def show(
         raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
     what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"
     what = " ".join(what.split())  # a name may have line breaks
-    return aligned(
+    return align_comments(
         _HEAD.format(
             name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
             what=what, title=json.dumps(what, ensure_ascii=False),
