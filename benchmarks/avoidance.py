@@ -24,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
 from rigidfleet.planning import transfers
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.typing import Floats
 
@@ -163,7 +163,7 @@ def permutation(n: int, seed: int) -> list[str]:
             ],
         }
     )
-    planned, took = clocked(lambda: preview(timed(mission))[0][1:])
+    planned, took = clocked(lambda: preview(complete_times(mission))[0][1:])
     least = min(p.certificate.separation for p in planned if p.certificate is not None)
     assert all(p.certificate is not None for p in planned)
     makespan = float(planned[-1].time[-1] - planned[0].time[0])

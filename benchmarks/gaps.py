@@ -21,7 +21,7 @@ from scipy.ndimage import binary_propagation
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.typing import Floats
 
 RADIUS, CLEARANCE = 0.25, 0.2
@@ -138,7 +138,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--walls", type=int, default=100)
     asked = parser.parse_args()
-    timed(mission([]))  # loads SciPy
+    complete_times(mission([]))  # loads SciPy
     counts = {(a, b): 0 for a in (True, False) for b in (True, False)}
     times: dict[bool, list[float]] = {True: [0.0], False: [0.0]}
     least, missed, folded = np.inf, [], 0
@@ -146,7 +146,7 @@ def main() -> None:
         boxes = wall(seed)
         begin = time.process_time()
         try:
-            flown = timed(mission(boxes))
+            flown = complete_times(mission(boxes))
         except MissionError:
             flown = None
         times[flown is not None].append(time.process_time() - begin)

@@ -21,7 +21,7 @@ from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import load_mission
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
 
 BLUE, ORANGE, GREEN, RED = PALETTE[:4]
@@ -427,7 +427,7 @@ def error_budget() -> Figure:
 
 def way_found() -> Figure:
     """The passage of narrow-passage-found from above, as it is found: formations at the ends of its phases."""
-    mission = timed(load_mission("narrow-passage-found"))
+    mission = complete_times(load_mission("narrow-passage-found"))
     planned = [p for p in preview(mission)[0] if p.phase.startswith("through the passage")]
     fig = Figure(figsize=(7.6, 3.6), layout="constrained")
     ax = fig.add_subplot()

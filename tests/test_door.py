@@ -10,7 +10,7 @@ from sample_missions import three_points
 import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.mission import load_mission
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.sweep import Sweep
 from rigidfleet.sweep.run import fly_runs
 
@@ -73,17 +73,17 @@ def test_run_reads_a_file_once(texts, tmp_path, capsys):
 )  # fmt: skip
 def test_planning_reads_and_writes_no_text(mission, texts):
     """Times, ways and transitions take their places as data; the mission then has numbers, and writes as before."""
-    planned = timed(mission)
+    planned = complete_times(mission)
     assert not any(phase.automatic for phase in planned.phases)
     assert all(phase.spelled and not phase.replaced for phase in planned.phases)
     assert texts == {"read": 0, "written": 0}
-    again = timed(rf.Mission.from_toml(planned.text))
+    again = complete_times(rf.Mission.from_toml(planned.text))
     assert again.model_dump() == planned.model_dump()
 
 
 def test_an_assignment_is_not_lost(texts):
     """A mission with another assignment keeps the times that were computed for it."""
-    planned = timed(mission_of(FLY)).with_assignment("shortest")
+    planned = complete_times(mission_of(FLY)).with_assignment("shortest")
     assert not any(phase.automatic for phase in planned.phases)
     assert texts == {"read": 0, "written": 0}
 

@@ -14,7 +14,7 @@ from rigidfleet.planning import legs, timing
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.preflight.losses import planned_way
 from rigidfleet.result import Result
 
@@ -30,7 +30,7 @@ def planned_legs(mission: Mission, result: Result) -> list[Leg]:
     A phase that settles ends when it does, and agents that distances have led are where they have come to: these alone
     are taken from the flight.
     """
-    mission = timed(mission)
+    mission = complete_times(mission)
     first = mission.first_loss if mission.on_loss != "continue" else np.inf
     found = [planned.leg for planned in preview(mission)[0]]
     sure = True
@@ -281,7 +281,8 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts, from now on, of the calls that make what a phase departs from."""
     count: Counter[str] = Counter()
-    for module, name in ((legs, "depart"), (legs, "_attached"), (legs, "align_slots"), (timing, "depart")):  # fmt: skip
+    places = (legs, "depart"), (legs, "_attach_frame"), (legs, "align_slots"), (timing, "depart")
+    for module, name in places:
         function = getattr(module, name)
 
         def counted(*arguments: Any, _function: Any = function, _name: str = name) -> Any:
@@ -313,12 +314,12 @@ def test_a_phase_departs_once(monkeypatch):
     draw = Draw(0)
     draw.smooth, draw.phases = True, ONCE
     written = draw.mission(lossless=True)
-    once = {"depart": 6, "_attached": 6, "align_slots": 3}
+    once = {"depart": 6, "_attach_frame": 6, "align_slots": 3}
     count = calls(monkeypatch)
-    mission = timed(written)
+    mission = complete_times(written)
     assert count == once | {
         "depart": 4,
-        "_attached": 4,
+        "_attach_frame": 4,
         "align_slots": 2,
     }  # up to the last automatic time
     count.clear()

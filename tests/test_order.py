@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 import rigidfleet as rf
-from rigidfleet.planning.body_layer import Deviation, least_distance, rigid_rows, steered
+from rigidfleet.planning.body_layer import Detour, least_distance, nearest_accelerations, rigid_rows
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock
 from rigidfleet.simulation.leading import Leader, Led
@@ -127,7 +127,7 @@ def test_a_path_at_the_clock_s_time_obeys_the_chain_rule(phase):
     clock = VirtualClock()
     clock.lead(0.0, 2.0)
     clock.advance(0.9)
-    leader = led(phase, Deviation(), clock)
+    leader = led(phase, Detour(), clock)
     h = 0.1
     problem = leader._piece(5.0, h, np.zeros(7))
     times = 5.0 + np.linspace(0.0, h, 5)
@@ -162,7 +162,7 @@ def test_the_body_is_steered_as_an_independent_solver_would(seed):
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     rows = rigid_rows(normals, arms[rng.integers(n, size=6)], scale)
     asked, needed = rng.normal(size=7), rng.normal(size=6) + 1.0
-    found = steered(asked, rows, needed, masses, arms, scale)
+    found = nearest_accelerations(asked, rows, needed, masses, arms, scale)
     assert found is not None
     assert (rows @ found >= needed - 1e-7).all()
 
@@ -188,7 +188,7 @@ def test_contradictory_rows_have_no_least_distance():
 @pytest.mark.parametrize("dt", [0.0, 0.04, 0.1])
 def test_a_deviation_moves_as_its_derivatives_say(dt):
     """Series of displacement, rotation and scale agree with differences."""
-    given_ = Deviation(
+    given_ = Detour(
         np.array([[0.5, 0.1, 0.0], [0.3, -0.2, 0.1], [0.1, 0.2, -0.4]]),
         np.eye(3), np.array([[0.2, 0.3, -0.1], [0.5, 0.1, 0.2]]), np.array([1.1, 0.1, -0.3]),
     ).at(0.1, np.full(7, 0.3), 0.1)  # fmt: skip

@@ -1199,7 +1199,11 @@ def test_an_arrival_between_two_samples_is_recorded():
 def test_numbers_by_edge_are_kept_edge_by_edge():
     """What an edge was given last counts, in whichever order; an edge never in force has what is offered."""
     some, other = np.array([[0, 1], [2, 5], [1, 2]]), np.array([[1, 2], [0, 7]])
-    numbers = ByEdge().updated(some, np.array([1.0, 2.0, 3.0])).updated(other, np.array([4.0, 5.0]))
+    numbers = (
+        ByEdge()
+        .with_values(some, np.array([1.0, 2.0, 3.0]))
+        .with_values(other, np.array([4.0, 5.0]))
+    )
     asked = np.array([[2, 5], [0, 7], [0, 1], [1, 2], [0, 2]])
     np.testing.assert_array_equal(numbers.of(asked, 9.0), [2.0, 5.0, 1.0, 4.0, 9.0])
     np.testing.assert_array_equal(ByEdge().of(some, np.arange(3.0)), [0.0, 1.0, 2.0])

@@ -20,9 +20,9 @@ from rigidfleet.mission import Mission, load_mission
 from rigidfleet.mission.draft import draft
 from rigidfleet.planning import derivatives as d
 from rigidfleet.planning.legs import Leg, leg_of
-from rigidfleet.planning.limits import limits_of, reached
+from rigidfleet.planning.limits import limits_of, use_of_limits
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import broken, timed
+from rigidfleet.planning.timing import broken, complete_times
 from rigidfleet.preflight.check import check
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight, simulate
@@ -366,7 +366,7 @@ def test_limits_are_found_between_samples():
     for planned in preview(mission)[0]:
         leg = planned.leg
         expected = dense(leg, mission)
-        for x in reached(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end):
+        for x in use_of_limits(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end):
             share = expected[x.limit.of.name_in_words]
             assert x.share == pytest.approx(share, rel=1e-3, abs=1e-9)
             who = np.array([x.agent])
@@ -413,7 +413,7 @@ def test_least_times_from_rest_to_rest(name):
     here = np.mean(agents["position"], axis=0)
     phases = [{"kind": "fly", "position": (here + [30, 0, 0]).tolist(), "duration": "auto"}]
     mission = a_mission(phases=phases, agents=agents, limits={name: 2.0})
-    assert isinstance(duration := timed(mission).phases[0].duration, float)
+    assert isinstance(duration := complete_times(mission).phases[0].duration, float)
     assert duration == pytest.approx((peak * 30 / 2.0) ** power, rel=0.012)
     assert duration > (peak * 30 / 2.0) ** power
 
@@ -432,7 +432,7 @@ def test_automatic_times_keep_the_limits_and_no_shorter_ones_do():
     """Every kind of automatic time: the flight keeps its limits, and nine tenths of one time would break one."""
     mission = limited(*AUTO)
     assert math.isnan(mission.latest_end)
-    resolved = timed(mission)
+    resolved = complete_times(mission)
     assert resolved.text == mission.text
     assert math.isfinite(resolved.latest_end)
     assert check(mission, search=False).passed
@@ -507,7 +507,7 @@ def test_a_limit_that_no_time_keeps():
         "duration": 30.0,
     }
     with pytest.raises(MissionError, match="no time keeps the limits"):
-        timed(limited(orbit | {"blend": "auto"}))
+        complete_times(limited(orbit | {"blend": "auto"}))
     told = [r.text for r in check(limited(orbit), search=False).remarks]
     assert any("no blend of this phase keeps all limits" in text for text in told)
 

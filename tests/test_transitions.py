@@ -11,7 +11,7 @@ from rigidfleet import assess, check, simulate
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 
 
 def permuted(side: int = 5, seed: int = 0, limit: float = 1.0, **reshape: Any) -> Mission:
@@ -58,17 +58,17 @@ def test_labelled_agents_exchange_their_places(seed):
 
 def test_the_parts_are_ordinary_phases():
     """Written and read again, they are the same mission; the record of a flight holds them."""
-    mission = timed(permuted(3))
+    mission = complete_times(permuted(3))
     again = Mission.from_dict(mission.to_dict())
     assert [p.name for p in again.phases] == [p.name for p in mission.phases]
-    assert timed(again) is again
+    assert complete_times(again) is again
     result = simulate(permuted(3))
     assert Mission.from_toml(result.mission_text).phases == mission.phases
 
 
 def test_levels_are_told_by_conflicts_alone():
     """On the way across, agents of one level pass each other at the distance asked, seen from above."""
-    mission = timed(permuted(6, seed=4))
+    mission = complete_times(permuted(6, seed=4))
     one, two = (np.array(mission.formation_slots(f"swap: {part}")) for part in ("apart", "across"))
     np.testing.assert_allclose(one[:, 2], two[:, 2])
     levels = np.unique(one[:, 2])
@@ -85,11 +85,14 @@ def test_levels_are_told_by_conflicts_alone():
 def test_auto_goes_straight_where_it_can():
     """One place on, all move together: no layers are needed. Where they cross, there are."""
     data = permuted(transition="auto").to_dict()
-    assert len(timed(Mission.from_dict(data)).phases) == 4
+    assert len(complete_times(Mission.from_dict(data)).phases) == 4
     data["formations"]["b"]["slots"] = [
         [x + 2.0, y, z] for x, y, z in data["formations"]["a"]["slots"]
     ]
-    assert [p.name for p in timed(Mission.from_dict(data)).phases] == ["establish 1", "swap"]
+    assert [p.name for p in complete_times(Mission.from_dict(data)).phases] == [
+        "establish 1",
+        "swap",
+    ]
 
 
 def test_automatic_times_are_shared_out():
@@ -98,7 +101,7 @@ def test_automatic_times_are_shared_out():
     data |= {"smoothness": "jerk"}
     data["phases"][1] |= {"blend": "auto", "duration": "auto"}
     data["limits"] |= {"speed": 2.0, "acceleration": 1.0}
-    mission = timed(Mission.from_dict(data))
+    mission = complete_times(Mission.from_dict(data))
     for planned, phase in list(zip(preview(mission)[0], mission.phases, strict=True))[1:]:
         assert isinstance(phase.least_time, float)
         speed = np.linalg.norm(planned.velocity, axis=2).max()
@@ -121,7 +124,7 @@ def test_automatic_times_are_shared_out():
 def test_what_cannot_be_is_refused(keys, words):
     """A separation that the slots themselves lack, and phases that track no slots."""
     with pytest.raises(MissionError, match=words):
-        timed(permuted(**keys))
+        complete_times(permuted(**keys))
 
 
 def test_assigned_agents_need_no_layers():

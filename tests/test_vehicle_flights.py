@@ -12,7 +12,7 @@ import rigidfleet as rf
 from rigidfleet._common.text import percent
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.planning.vehicles import TickTables, Turn, sampled_flight
+from rigidfleet.planning.vehicles import TickTables, YawTurn, sampled_flight
 from rigidfleet.result import Result
 
 
@@ -354,11 +354,11 @@ def test_yaw_along_the_way_goes_on_from_table_to_table():
         flight.advance()
     problem, start = flight.plan.problem, flight.plan.start
     first = round(start * mission.autopilot.rate)
-    turn = Turn(start, np.array([0.3, -0.2, 1.0]), np.zeros(3))
+    turn = YawTurn(start, np.array([0.3, -0.2, 1.0]), np.zeros(3))
     sampled = sampled_flight(mission)
-    whole = TickTables(mission, sampled).made(first, first + 1500, problem, turn).yaw
+    whole = TickTables(mission, sampled).tables_for(first, first + 1500, problem, turn).yaw
     tables, ends = TickTables(mission, sampled), first + np.array([0, 7, 403, 1001, 1500])
-    pieces = [tables.made(a, b, problem, turn).yaw for a, b in itertools.pairwise(ends)]
+    pieces = [tables.tables_for(a, b, problem, turn).yaw for a, b in itertools.pairwise(ends)]
     np.testing.assert_allclose(
         np.concatenate(pieces), whole, rtol=0, atol=1e-9
     )  # of an integration

@@ -11,7 +11,7 @@ import pytest
 from rigidfleet import assess, check, export, simulate
 from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 
 RADIUS = 0.15
 UP = {"kind": "takeoff", "name": "up", "height": 10.0, "duration": 5.0}
@@ -79,7 +79,7 @@ def test_groups_go_one_after_another():
 def test_vehicles_one_by_one_and_named_ones():
     """By vehicles, each goes alone; named ones go, and nobody else."""
     some = mission(UP | {"agents": [7, 2], "stagger": 3.0, "by": "vehicles", "duration": 6.0})
-    phases = timed(some).phases
+    phases = complete_times(some).phases
     assert [p.vertical.agents for p in phases if p.vertical] == [(7,), (2,)]
     end = simulate(some).position[-1, :, 2]
     wanted = places(some)[:, 2]
@@ -120,7 +120,7 @@ def test_after_a_landing_slots_are_assigned_anew():
 def test_least_times():
     """With duration auto, a take-off takes the time of the speed limit: 35/16 of the mean speed."""
     m = mission(UP | {"duration": "auto"}, limits={"speed": 3.0})
-    (phase,) = timed(m).phases
+    (phase,) = complete_times(m).phases
     assert phase.duration == pytest.approx(35 / 16 * 9.8 / 3.0, rel=0.01)
 
 
@@ -166,7 +166,7 @@ def test_groups_that_have_no_time_or_overlap(duration):
     """Three rows 2 s apart need more than 4 s, and at most 6 s; the error says so."""
     m = mission(UP | {"stagger": 2.0, "duration": duration})
     with pytest.raises(MissionError, match="give a duration of 6 s, or up to 2 s less"):
-        timed(m)
+        complete_times(m)
 
 
 def test_without_ground():

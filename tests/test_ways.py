@@ -13,9 +13,9 @@ from rigidfleet.math.attitude import dcm_from_rotation_vector
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.clearance import closest, greatest_speeds, pace
 from rigidfleet.planning.derivatives import slot_derivatives
-from rigidfleet.planning.lattice import Space, proved
+from rigidfleet.planning.lattice import FreeSpace, keeps_room
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import spelled_out, timed
+from rigidfleet.planning.timing import complete_times, spelled_out
 from rigidfleet.simulation.flight import Flight
 
 FORMS = {
@@ -62,7 +62,7 @@ def wall(width: float, y: float = 0.0, **turned: float) -> list[dict[str, Any]]:
 def sampled(mission: Mission) -> float:
     """Least distance [m] of a vehicle's surface from a box along the axes, a sphere or an upright cylinder: samples."""
     least = np.inf
-    for planned in preview(timed(mission))[0]:
+    for planned in preview(complete_times(mission))[0]:
         r = planned.position
         for o in mission.obstacles:
             if o.kind == "box":
@@ -107,7 +107,7 @@ def test_each_kind_of_obstacle_is_flown_round(kind):
     assert min(clearance for _, clearance, *_ in ahead.clearance) >= 0.5
     if kind in ("box", "sphere", "cylinder", "zone"):
         assert sampled(mission) >= 0.5
-    goal = preview(timed(mission))[0][-1].leg.after.goal
+    goal = preview(complete_times(mission))[0][-1].leg.after.goal
     assert goal is not None
     assert np.array_equal(goal.r, [12, 0, 8])
 
@@ -122,7 +122,7 @@ def test_a_gap_is_passed_as_it_is_or_folded(width, fold, yaw):
     """The square passes gaps of 3.9 m as it is, and folds for others, down to a vehicle and its clearance."""
     turned = {"yaw_deg": yaw} if yaw else {}
     mission = going(*wall(width, 4.0, **turned))
-    planned = timed(mission)
+    planned = complete_times(mission)
     taken = [p.shaping.formation for p in planned.phases if p.shaping is not None]
     assert taken == (["square", "line", "square"] if fold else ["square"])
     ahead = check(mission)
@@ -133,7 +133,7 @@ def test_a_gap_is_passed_as_it_is_or_folded(width, fold, yaw):
 def test_a_gap_is_passed_smaller():
     """Without another formation, the square shrinks for the gap, and is itself again behind it."""
     mission = going(*wall(2.8), formations={"square": FORMS["square"]}, scales=[0.9, 0.6])
-    planned = timed(mission)
+    planned = complete_times(mission)
     taken = [p.shaping.formation for p in planned.phases if p.shaping is not None]
     assert taken == ["square", "square x 0.6", "square"]
     whole, small = (planned.formation_slots(f"square{x}") for x in ("", " x 0.6"))
@@ -156,7 +156,7 @@ def test_a_gap_is_passed_smaller():
 def test_no_way_says_what_stands_in_it(keys, needs):
     """Without a fold, or with much clearance, the error has the gap, its width, and what the slimmest shape needs."""
     with pytest.raises(MissionError) as caught:
-        timed(going(*wall(1.2), **keys))
+        complete_times(going(*wall(1.2), **keys))
     (finding,) = caught.value.findings
     assert "no way is found" in finding.problem
     assert f"needs {needs:.2f} m between '" in finding.problem
@@ -185,7 +185,7 @@ def test_the_shipped_passage_folds_by_itself():
     ]
     for name in walls[0]:
         assert walls[0][name] >= walls[1][name] - 2e-3
-    planned = timed(load_mission("narrow-passage-found"))
+    planned = complete_times(load_mission("narrow-passage-found"))
     assert [p.shaping.formation for p in planned.phases if p.shaping] == ["triangle", "line", "triangle"]  # fmt: skip
 
 
@@ -202,7 +202,7 @@ def test_the_shipped_passage_folds_by_itself():
 def test_bad_input_is_refused(keys, words):
     """One error says what is wrong with a way that cannot be asked for."""
     with pytest.raises(MissionError, match=words):
-        timed(going(*wall(0.0001), **keys))
+        complete_times(going(*wall(0.0001), **keys))
 
 
 def test_a_formation_on_the_way_exists():
@@ -218,17 +218,19 @@ def test_a_way_begins_at_rest_and_in_a_formation():
     data = going().to_dict()
     fly = {"kind": "fly", "position": [-10, 0, 8], "velocity": [1, 0, 0], "duration": "auto"}
     with pytest.raises(MissionError, match="begins at 1 m/s, but a way begins at rest"):
-        timed(Mission.from_dict(data | {"phases": [data["phases"][0], fly, data["phases"][1]]}))
+        complete_times(
+            Mission.from_dict(data | {"phases": [data["phases"][0], fly, data["phases"][1]]})
+        )
     with pytest.raises(MissionError, match="needs a formation"):
-        timed(Mission.from_dict(data | {"phases": [data["phases"][1]]}))
+        complete_times(Mission.from_dict(data | {"phases": [data["phases"][1]]}))
 
 
 def test_an_obstacle_that_moves_is_met_or_not():
     """Ways lead round what is at rest; one that meets what moves is refused, with the time."""
     ball = {"kind": "sphere", "name": "ball", "radius": 2.0}
-    timed(going(ball | {"centre": [0, 0, 8], "velocity": [0, 8.0, 0]}))
+    complete_times(going(ball | {"centre": [0, 0, 8], "velocity": [0, 8.0, 0]}))
     with pytest.raises(MissionError, match="from 'ball' at"):
-        timed(going(ball | {"centre": [0, 0, 8], "velocity": [0.1, 0, 0]}))
+        complete_times(going(ball | {"centre": [0, 0, 8], "velocity": [0.1, 0, 0]}))
 
 
 def test_nothing_begins_a_way_by_hand():
@@ -243,9 +245,9 @@ def test_a_geofence_bounds_the_way():
     box = {"kind": "box", "min": [-1, -6, -50], "max": [1, 8, 50]}
     fence = {"min": [-30, -7, 0], "max": [30, 9, 20]}
     limits = {"speed": 5.0, "acceleration": 3.0, "separation": 0.5}
-    timed(going(box, limits=limits))
+    complete_times(going(box, limits=limits))
     with pytest.raises(MissionError, match="no way is found"):
-        timed(going(box, limits=limits | {"geofence": fence}))
+        complete_times(going(box, limits=limits | {"geofence": fence}))
 
 
 def test_many_agents_find_a_way_as_one_ball():
@@ -263,7 +265,7 @@ def test_many_agents_find_a_way_as_one_ball():
 @pytest.mark.parametrize("name", ["narrow-passage", "cube-passage", "show-1000"])
 def test_speeds_between_samples_are_bounded(name):
     """No slot is faster within a span than its bound, and the bounds of short spans are close."""
-    for planned in preview(timed(load_mission(name)))[0]:
+    for planned in preview(complete_times(load_mission(name)))[0]:
         leg, time = planned.leg, planned.time[::10]
         bound = greatest_speeds(leg.reference, leg.motion, time[:-1], time[1:])
         inside = time[:-1, None] + np.linspace(0, 1, 7)[1:-1] * np.diff(time)[:, None]
@@ -345,7 +347,7 @@ def test_a_fence_is_compared_exactly():
     fence = np.array([[-3.0, -2.0, 0.0], [3.0, 2.0, 4.0]])
     looks = []
 
-    class Counting(Space):
+    class Counting(FreeSpace):
         def apart(self, r, radius, most):
             looks.append(len(r))
             return super().apart(r, radius, most)
@@ -367,7 +369,7 @@ def test_a_fence_is_compared_exactly():
         centres = a[:, None, None] + share[:, None, None] * (b - a)[:, None, None] + path(share)
         room = np.minimum(centres - fence[0], fence[1] - centres).min(axis=(1, 2, 3))
         looks.clear()
-        kept = proved(space, a, b, path, ways, radius, need)
+        kept = keeps_room(space, a, b, path, ways, radius, need)
         assert 0 < kept.sum() < len(kept)
         assert not (kept & (room < need)).any()
         assert kept[room > need + float(ways.max()) / 4000].all()
@@ -379,5 +381,5 @@ def test_a_search_says_what_it_looks_for(monkeypatch):
     """Whoever watches hears the phase and the search, of a way and of automatic times."""
     heard: list[str] = []
     with watched_by(heard.append):
-        timed(load_mission("narrow-passage-found"))
+        complete_times(load_mission("narrow-passage-found"))
     assert any("looking for a way of '" in step and "round obstacles" in step for step in heard)

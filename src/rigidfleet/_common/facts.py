@@ -78,7 +78,7 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Table:
+class FactTable:
     """Things in rows, their quantities in columns; what applies to no row is not shown.
 
     Attributes
@@ -230,10 +230,10 @@ class Fact(NamedTuple):
         return Row((self.name, worst, self.bound, when, self.who), self.level)
 
 
-def worst_values(what: str, facts: Iterable[Fact]) -> Table:
+def worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
     """Table of worst values with their limits."""
     heads = (what, "worst", "limit", "at [s]", "who or where")
-    return Table(heads, [fact.row for fact in facts], heads[4:])
+    return FactTable(heads, [fact.row for fact in facts], heads[4:])
 
 
 @dataclass(frozen=True)
@@ -242,10 +242,10 @@ class Sheet:
 
     name: str
     title: str
-    parts: Sequence[Table | Line]
+    parts: Sequence[FactTable | Line]
 
     @property
-    def shown(self) -> list[Table | Line]:
+    def shown(self) -> list[FactTable | Line]:
         """The parts, without tables in which nothing stands."""
         return [part for part in self.parts if isinstance(part, Line) or part.rows]
 
@@ -258,7 +258,7 @@ class Sheet:
         begin: list[Any] = [head] if self.name else []
         blocks = [*begin]
         for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):
-            apart = isinstance(part, Table) or isinstance(before, Table)
+            apart = isinstance(part, FactTable) or isinstance(before, FactTable)
             blocks += ["", part] if apart and blocks != begin else [part]
         return blocks
 

@@ -138,7 +138,14 @@ class PhaseVerdict:
     worst: dict[str, Extreme]
 
 
-def bounded(
+def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
+    """Whether a worst value keeps its limit."""
+    if q.at_least:
+        return worst >= limit - SLACK and worst > 0
+    return worst <= limit + SLACK * max(1.0, abs(limit))
+
+
+def limit_check(
     q: Quantity,
     e: Extreme | None,
     limit: float | None,
@@ -164,8 +171,7 @@ def bounded(
     if e.at_samples:
         words += ", at samples"
     if passed is None and limit is not None:
-        greatest = limit + SLACK * max(1.0, abs(limit))
-        passed = e.value >= limit - SLACK and e.value > 0 if q.at_least else e.value <= greatest
+        passed = keeps_limit(q, e.value, limit)
     passed = passed is None or bool(passed)
     return CheckResult(
         q.name, passed, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,

@@ -52,7 +52,7 @@ def check(
     from rigidfleet._common.progress import watched_by
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import load_mission
-    from rigidfleet.planning.timing import spelled_out, timed
+    from rigidfleet.planning.timing import complete_times, spelled_out
 
     keep_existing(expand, force=force, other="give another path")
     watch = console.CheckWatch(mission)
@@ -62,7 +62,7 @@ def check(
             if expand is not None:
                 loaded = spelled_out(loaded)
                 write_file(expand, (loaded.about + to_toml(loaded.to_dict())).encode())
-            loaded = timed(loaded)
+            loaded = complete_times(loaded)
     except MissionError as error:
         if not json:
             raise

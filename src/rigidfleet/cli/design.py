@@ -75,7 +75,7 @@ def design(
     """
     from json import dumps
 
-    from rigidfleet._common.facts import Row, Table
+    from rigidfleet._common.facts import FactTable, Row
     from rigidfleet._common.files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.formation.point_files import csv_of_points
@@ -119,7 +119,9 @@ def design(
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": graphs})
         return PASSED
     heads = ("graph", "edges", "rank", "index", "condition", "longest [m]", "class")
-    table = Table(heads, [Row((what, *cells)) for what, (_, cells) in judged.items()], ("class",))
+    table = FactTable(
+        heads, [Row((what, *cells)) for what, (_, cells) in judged.items()], ("class",)
+    )
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
     if kinds:

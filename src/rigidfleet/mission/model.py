@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
@@ -204,14 +204,14 @@ class Mission(Contents, Shown):
         return Sheet(self.name, self.title, [self.phase_table, Line(self.size_in_words)])
 
     @property
-    def phase_table(self) -> Table:
+    def phase_table(self) -> FactTable:
         """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
             Row((n, p.name, p.kind, goal(p), ending(p), p.control))
             for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
-        return Table(heads, rows, heads[1:])
+        return FactTable(heads, rows, heads[1:])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
@@ -445,7 +445,7 @@ class Mission(Contents, Shown):
     def latest_end(self) -> float:
         """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout.
 
-        It is nan while a duration before it is automatic (`rigidfleet.planning.timing.timed`).
+        It is nan while a duration before it is automatic (`rigidfleet.planning.timing.complete_times`).
         """
         return latest_end(self.phases)
 

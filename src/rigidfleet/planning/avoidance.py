@@ -19,16 +19,16 @@ def avoidance_in_flight(
     mission: Mission, flight: fleet.SampledFlight
 ) -> avoidance.AvoidanceArrays | None:
     """Avoidance at the ticks of the formation's law; None without [avoidance]."""
-    given, models = mission.avoidance, mission.vehicle_models
-    if given is None or models is None:
+    settings, models = mission.avoidance, mission.vehicle_models
+    if settings is None or models is None:
         return None
     mass = mission.fleet.mass
-    separation = given.separation
+    separation = settings.separation
     if separation is None:
         separation = mission.limits.separation or 0.0
     limit = np.array([model.thrust_limit for model in models])
     solids = join([thing.solid for thing in mission.obstacles])
-    reach = np.inf if given.sensing_range is None else given.sensing_range
+    reach = np.inf if settings.sensing_range is None else settings.sensing_range
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance(
         period=flight.every * flight.steps * flight.h,
@@ -39,21 +39,21 @@ def avoidance_in_flight(
         radius=np.array(mission.agents.radius, dtype=float),
         solids=solids,
         seen=avoidance.sight(
-            solids, reach, given.sensing_noise, given.obstacle_acceleration, given.seed
+            solids, reach, settings.sensing_noise, settings.obstacle_acceleration, settings.seed
         ),
         separation=separation,
-        clearance=given.clearance,
+        clearance=settings.clearance,
         drag=drag,
         lag=reaction_times(models, mission.disturbances),
         ahead=reaction_lags(models, mission.disturbances, mission.gravity),
         tilt=np.array(
             [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
         ),
-        spare=extra_radii(given, models, mission.disturbances),
-        rate=given.rate,
-        share=given.share,
-        release=given.release,
-        guarded=given.guard,
-        filtered=given.barrier,
-        flow=given.reference == "flow",
+        spare=extra_radii(settings, models, mission.disturbances),
+        rate=settings.rate,
+        share=settings.share,
+        release=settings.release,
+        guarded=settings.guard,
+        filtered=settings.barrier,
+        flow=settings.reference == "flow",
     )

@@ -34,7 +34,7 @@ _THIN = 1e-9
 
 
 @dataclass
-class Deviation:
+class Detour:
     """What the reference of a body deviates from the planned one by, in world axes."""
 
     x: Floats = field(
@@ -48,10 +48,10 @@ class Deviation:
     def none(self) -> bool:
         """Whether there is none."""
         rest = self.scale - [1.0, 0.0, 0.0]
-        return not (self.x.any() or self.omega.any() or rest.any() or self.turned.any())
+        return not (self.x.any() or self.omega.any() or rest.any() or self.rotation_vector.any())
 
     @property
-    def turned(self) -> Floats:
+    def rotation_vector(self) -> Floats:
         """Rotation vector (3,) [rad]."""
         return att.rotation_vector_from_dcm(self.Q.T)
 
@@ -59,7 +59,7 @@ class Deviation:
         """Second derivatives (7,) of displacement, rotation and scale that bring the deviation back at a rate [1/s]."""
         return np.concatenate(
             [
-                -2 * k * self.x[1] - k * k * self.x[0], -2 * k * self.omega[0] - k * k * self.turned,
+                -2 * k * self.x[1] - k * k * self.x[0], -2 * k * self.omega[0] - k * k * self.rotation_vector,
                 [-2 * k * self.scale[1] - k * k * (self.scale[0] - 1.0)],
             ]
         )  # fmt: skip
@@ -67,16 +67,16 @@ class Deviation:
     def end(self, still: bool) -> None:
         """Take it as ended if it is small; ``still``: nothing else is asked of it."""
         rest = self.scale - [1.0, 0.0, 0.0]
-        parts = self.x, self.omega, self.turned, rest
+        parts = self.x, self.omega, self.rotation_vector, rest
         if still and max(float(np.abs(part).max()) for part in parts) < _ENDED:
             self.x, self.Q, self.omega = np.zeros((3, 3)), np.eye(3), np.zeros((2, 3))
             self.scale = np.array([1.0, 0.0, 0.0])
 
-    def at(self, dt: float, asked: Floats, h: float) -> Deviation:
+    def at(self, dt: float, accelerations: Floats, h: float) -> Detour:
         """The deviation after dt [s], if its second derivatives go linearly to those asked for (7,) within h [s]."""
         share = dt / h
 
-        def moved(x: Floats, end: Floats) -> Floats:
+        def derivatives_at(x: Floats, end: Floats) -> Floats:
             value, rate, second = x
             bend = (end - second) * share
             return np.stack(
@@ -88,9 +88,14 @@ class Deviation:
             )
 
         # The rotation vector from Q, whose rates are those of the body as long as it is small
-        spin = moved(np.stack([np.zeros(3), *self.omega]), asked[3:6])
+        spin = derivatives_at(np.stack([np.zeros(3), *self.omega]), accelerations[3:6])
         Q = att.dcm_from_rotation_vector(spin[0]).T @ self.Q
-        return Deviation(moved(self.x, asked[:3]), Q, spin[1:], moved(self.scale, asked[6]))
+        return Detour(
+            derivatives_at(self.x, accelerations[:3]),
+            Q,
+            spin[1:],
+            derivatives_at(self.scale, accelerations[6]),
+        )
 
     def series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
@@ -123,8 +128,8 @@ def rigid_rows(normals: Floats, arms: Floats, scale: float) -> Floats:
     return np.hstack([normals, np.cross(arms, normals), along / scale])
 
 
-def steered(
-    asked: Floats, rows: Floats, needed: Floats, masses: Floats, arms: Floats, scale: float
+def nearest_accelerations(
+    accelerations: Floats, rows: Floats, needed: Floats, masses: Floats, arms: Floats, scale: float
 ) -> Floats | None:
     """Second derivatives (7,) nearest to those asked for, with rows (R, 7) . them >= needed (R,); None if none exist.
 
@@ -153,11 +158,11 @@ def steered(
     L = np.linalg.cholesky(H)
     G = np.linalg.solve(L, rows.T).T
     size = np.linalg.norm(G, axis=1)
-    y = least_distance(G / size[:, None], (needed - rows @ asked) / size)
-    return None if y is None else asked + np.linalg.solve(L.T, y)
+    y = least_distance(G / size[:, None], (needed - rows @ accelerations) / size)
+    return None if y is None else accelerations + np.linalg.solve(L.T, y)
 
 
-def scale_rows(deviation: Deviation) -> tuple[Floats, Floats]:
+def scale_rows(deviation: Detour) -> tuple[Floats, Floats]:
     """Rows (2, 7) and what they need (2,), so that the scale stays between its bounds."""
     value, rate, _ = deviation.scale
     rows, needed = np.zeros((2, 7)), np.zeros(2)

@@ -63,7 +63,7 @@ def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tup
     hold = tracking.Q, tracking.R
     times = np.unique(np.concatenate([lqr.knots(length, *law) for law in regulators]))
     after = lqr.knots(rest, *hold) if rest > 0.0 else np.zeros(1)
-    zero, found = np.zeros((2, 2)), []
+    zero, by_law = np.zeros((2, 2)), []
     for law in regulators:
         response = lqr.double_integrator_response(times, length, *law)
         x = lqr.led(response, times, np.eye(2), zero, length)
@@ -72,10 +72,10 @@ def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tup
             response = lqr.double_integrator_response(after, rest, *hold, None)
             x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
             pieces.append(lqr.quintic_pieces(after, *x))
-        found.append(np.concatenate(pieces))
+        by_law.append(np.concatenate(pieces))
     knots = np.concatenate([times, length + after[1:]])
     quintics = np.zeros((2, 4, len(knots) - 1, 6))
-    quintics[:, :2] = np.stack(found).swapaxes(1, 2)
+    quintics[:, :2] = np.stack(by_law).swapaxes(1, 2)
     quintics[:, 2, :, 0] = quintics[:, 3, :, 1] = 1.0
     quintics[:, 3, :, 0] = knots[:-1] - length
     return knots, quintics.reshape(2, 4, -1)
@@ -112,7 +112,7 @@ def smooth_motion(
     return as_motion(t0 + times, np.concatenate([cm, turn], axis=1), goal.T)
 
 
-def passed(through: Sequence[Through], motion: Motion) -> tuple[dict[str, Any], ...]:
+def points_passed(through: Sequence[Through], motion: Motion) -> tuple[dict[str, Any], ...]:
     """The points that a smooth motion passes, as a result records them (`result.phases.Passed`)."""
     times = motion.knots[1:-1].tolist() if through else []
     points = [at.model_dump(mode="json", exclude_none=True) for at in through]

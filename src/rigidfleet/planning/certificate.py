@@ -42,7 +42,7 @@ class Certificate(NamedTuple):
     how: How
 
 
-def certified(
+def certificate_of(
     phase: Phase, reference: Reference, radius: Floats, lost: Bools | None = None
 ) -> Certificate | None:
     """Certificate of a phase whose agents track slots; None if they do not, if slots jump, or for a single agent.
@@ -57,11 +57,13 @@ def certified(
     if len(radius) < 2:
         return None
     some = reference
-    found = of_ways(some.knots, some.ways, radius) if len(some.knots) else straight(some, radius)
-    if found is None or left is None:
-        return found
-    i, j = (int(left[k]) for k in found.agents)
-    return found._replace(agents=(i, j))
+    certificate = (
+        of_ways(some.knots, some.ways, radius) if len(some.knots) else straight(some, radius)
+    )
+    if certificate is None or left is None:
+        return certificate
+    i, j = (int(left[k]) for k in certificate.agents)
+    return certificate._replace(agents=(i, j))
 
 
 def of_agents(reference: Reference, who: Ints) -> Reference:

@@ -38,7 +38,7 @@ from rigidfleet.planning.body_trajectories import (
     smooth_motion,
     stopping_motion,
 )
-from rigidfleet.planning.reference import PhaseState, Pose, changed, pose_at
+from rigidfleet.planning.reference import PhaseState, Pose, copy_with, pose_at
 from rigidfleet.typing import Floats
 
 #: Time in which a phase that ends by settling, without a target, brings the body to rest [s].
@@ -87,8 +87,8 @@ def _stay(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Cour
     if now.goal is None:
         return Course(None, t_end, None)
     r = now.goal.r if phase.place is None else np.array(phase.place)
-    goal = changed(now.goal, r=r, v=np.zeros(3), omega=np.zeros(3))
-    return _led(mission, phase, now, goal, arrival, t_end)
+    goal = copy_with(now.goal, r=r, v=np.zeros(3), omega=np.zeros(3))
+    return _course_to(mission, phase, now, goal, arrival, t_end)
 
 
 def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) -> Course:
@@ -123,7 +123,7 @@ def _steer(
     T = now.goal.T if angles is None else _attitude(angles)
     named = now.goal.named or angles is not None
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
-    return _led(mission, phase, now, goal, arrival, t_end)
+    return _course_to(mission, phase, now, goal, arrival, t_end)
 
 
 @kept
@@ -138,7 +138,7 @@ def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Cou
     assert now.goal is not None
     motion = orbit_motion(phase, now.pose, now.goal.T, now.t, t_end, smooth=mission.smooth)
     named = now.goal.named and not phase.turns_away
-    return Course(changed(pose_at(motion, t_end), named=named), t_end, lambda: motion)
+    return Course(copy_with(pose_at(motion, t_end), named=named), t_end, lambda: motion)
 
 
 def _brake(mission: Mission, phase: Brake, now: PhaseState, t_end: float) -> Course:
@@ -174,7 +174,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     else:
         up[2] = -max(0.0, height(mission, now))
         v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
-    goal = changed(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
+    goal = copy_with(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
     return Course(goal, arrival, partial(smooth_motion, now.pose, goal, now.t, arrival), lift)
 
 
@@ -214,7 +214,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     cm = Piecewise(knots, body).start_from(begin, fade)
     motion = as_motion(now.t + cm.time, cm.pieces, T1)
     arrival = float(min(t_end, motion.knots[-1]))
-    goal = changed(pose_at(motion, arrival), named=now.goal.named and not phase.turns_away)
+    goal = copy_with(pose_at(motion, arrival), named=now.goal.named and not phase.turns_away)
     return Course(goal, arrival, lambda: motion, lift)
 
 
@@ -223,7 +223,7 @@ def _whole_turns(yaw: float, near: float) -> float:
     return 2.0 * math.pi * round((near - yaw) / (2.0 * math.pi))
 
 
-def misled(phase: Phase, now: PhaseState) -> str:
+def obstacle_to_course(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
     return _MISLED.get(phase.kind, lambda *_: "")(phase, now)
 
@@ -315,7 +315,7 @@ def height(mission: Mission, now: PhaseState) -> float:
     return float(below[left].min() - _grounds(mission, now).min()) - ABOVE
 
 
-def _led(
+def _course_to(
     mission: Mission,
     phase: Phase | Steering,
     now: PhaseState,
@@ -329,10 +329,10 @@ def _led(
         laws, tracking = regulators(mission, phase), mission.tracking
         way = partial(regulated_motion, laws, tracking, now.pose, goal, now.t, arrival, t_end)
         return Course(goal, arrival, way)
-    end = changed(goal, v=np.full(3, np.nan)) if phase.free else goal
+    end = copy_with(goal, v=np.full(3, np.nan)) if phase.free else goal
     motion = smooth_motion(now.pose, end, now.t, arrival, phase.points)
     if phase.free:
-        goal = changed(goal, v=pose_at(motion, arrival).v)
+        goal = copy_with(goal, v=pose_at(motion, arrival).v)
     return Course(goal, arrival, lambda: motion)
 
 

@@ -49,8 +49,10 @@ def slot_derivatives(
     `desired_agents` and `blend_slots`; at times (K,) [s] of a phase's problem with control "tracking". At a knot, the
     piece after it counts. With fewer ``orders``, the last ones are left out.
     """
-    found = series.derivatives(slot_series(reference, body_series(motion, time), time)[:orders])
-    return found.transpose(3, 0, 2, 1)
+    derivatives = series.derivatives(
+        slot_series(reference, body_series(motion, time), time)[:orders]
+    )
+    return derivatives.transpose(3, 0, 2, 1)
 
 
 def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats) -> Floats:
@@ -62,20 +64,20 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     if reference.turn.any():
         turned = np.moveaxis(series.rotation(s[..., None] * reference.turn), 1, -1)
         axes = series.product(axes, turned, _matrix_product)
-    found = reference.p0 @ axes
+    slots = reference.p0 @ axes
     if reference.dp.any():
-        found += reference.dp @ series.product(s[:, None, None], axes)
-    found += cm[:, :, None]
-    return found
+        slots += reference.dp @ series.product(s[:, None, None], axes)
+    slots += cm[:, :, None]
+    return slots
 
 
 def way_series(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
     ways = Piecewise(reference.knots, reference.ways)
     inside = np.clip(time, ways.time[0], ways.time[-1])
-    found = np.moveaxis(ways.series(inside, ORDERS), 1, -1)
-    found[1:, ..., inside != time] = 0.0
-    return found
+    values = np.moveaxis(ways.series(inside, ORDERS), 1, -1)
+    values[1:, ..., inside != time] = 0.0
+    return values
 
 
 def _in_world(a: Floats, axes: Floats) -> Floats:
@@ -156,10 +158,10 @@ def yaw_of(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
     From the `body_series` and the `slot_series` at the same times.
     """
     n, times = slots.shape[2:]
-    found = np.zeros((3, n, times))
+    angles = np.zeros((3, n, times))
     if yaw.kind == "fixed":
-        found[0] = yaw.angle
-        return found
+        angles[0] = yaw.angle
+        return angles
     if yaw.kind == "formation":
         M = body[1][:3]
         turned = series.angle(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])[:, None]
@@ -168,8 +170,8 @@ def yaw_of(body: tuple[Floats, Floats], slots: Floats, yaw: Yaw) -> Floats:
         away[0] += np.array(yaw.point)[:2, None, None]
         turned = series.angle(away[:, 1], away[:, 0])
     turned[0] = np.unwrap(turned[0])
-    found[:] = series.derivatives(turned)
-    return found
+    angles[:] = series.derivatives(turned)
+    return angles
 
 
 def yaw_along(

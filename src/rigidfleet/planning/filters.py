@@ -25,7 +25,7 @@ def first_order(white: Floats, step: float, tau: float) -> Floats:
     """
     x = white * math.sqrt(-math.expm1(-2.0 * step / tau))
     x[0] = white[0]
-    return _followed(x, math.exp(-step / tau))
+    return _recursion(x, math.exp(-step / tau))
 
 
 def second_order(white: Floats, step: float, tau: float) -> Floats:
@@ -44,9 +44,9 @@ def second_order(white: Floats, step: float, tau: float) -> Floats:
     z1, z2 = root * first, low * first
     z2 += rest * second
     z1[0], z2[0] = first[0], 0.5 * (first[0] + second[0])
-    z1 = _followed(z1, a)
+    z1 = _recursion(z1, a)
     z2[1:] += a * s * z1[:-1]
-    z2 = _followed(z2, a)
+    z2 = _recursion(z2, a)
     z1 *= math.sqrt(3.0)
     z2 *= 1.0 - math.sqrt(3.0)
     z1 += z2
@@ -80,7 +80,7 @@ def _incomplete_gamma(n: int, x: float) -> float:
     return tail
 
 
-def _followed(x: Floats, a: float) -> Floats:
+def _recursion(x: Floats, a: float) -> Floats:
     """Solve z_{k+1} = a z_k + x_{k+1} from z_0 = x_0; x and z (K, ...)."""
     from rigidfleet.kernel.engine import native  # loads the compiled kernel
 

@@ -42,7 +42,7 @@ _CHANGE, _OTHER = 1.0, 1.2
 Path = Callable[[Floats], Floats]
 
 
-class Space(NamedTuple):
+class FreeSpace(NamedTuple):
     """Obstacles at rest, and the box (2, 3) [m] in which agents' centres must stay, infinite without a geofence."""
 
     obstacles: Sequence[Obstacle]
@@ -53,17 +53,17 @@ class Space(NamedTuple):
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
-        found = self.apart(r, radius, most)
+        least = self.apart(r, radius, most)
         if np.isfinite(self.fence).any():
-            found = np.minimum(found, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
-        return found
+            least = np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
+        return least
 
     def apart(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
         """The same from obstacles alone."""
         return proximity.obstacle_clearances(r, radius, self.obstacles, most=most)[0]
 
     def encloses(self, a: Floats, b: Floats, path: Path, ways: Floats, need: float) -> Bools:
-        """Whether the fence leaves the room ``need`` [m] to motions (E,), which are those of `proved`.
+        """Whether the fence leaves the room ``need`` [m] to motions (E,), which are those of `keeps_room`.
 
         Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
         spot is the same wherever it is: it is looked at once, as finely as halvings would.
@@ -102,32 +102,32 @@ class Change(NamedTuple):
         return _CHANGE + float(self.ways.max())
 
 
-def proved(
-    space: Space, a: Floats, b: Floats, path: Path, ways: Floats, radius: Floats, need: float
+def keeps_room(
+    space: FreeSpace, a: Floats, b: Floats, path: Path, ways: Floats, radius: Floats, need: float
 ) -> Bools:  # fmt: skip
     """Whether motions (E,) keep the room ``need`` [m]: from a to b (E, 3) [m], with offsets that follow a path.
 
     ``ways`` (M,) bounds what each ball flies relative to the centre of mass [m].
     """
-    found = space.encloses(a, b, path, ways, need)
+    free = space.encloses(a, b, path, ways, need)
     way = np.linalg.norm(b - a, axis=1)[:, None] + ways
-    who, length = np.flatnonzero(found), 1.0
+    who, length = np.flatnonzero(free), 1.0
     low = np.zeros(len(who))
     for _ in range(_HALVINGS):
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
         wanted = need + way[who] * length / 2
         room = space.apart(place[:, None] + path(middle), radius, wanted)
-        found[who[(room < need).any(axis=1)]] = False
-        open_ = found[who] & (room < wanted).any(axis=1)
+        free[who[(room < need).any(axis=1)]] = False
+        open_ = free[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
         if not len(who):
-            return found
+            return free
         if len(who) * 2 > _PARTS:
             break
         who, low = np.tile(who, 2), np.concatenate([low, low + length])
-    found[who] = False
-    return found
+    free[who] = False
+    return free
 
 
 def staying(layer: Layer) -> Path:
@@ -139,7 +139,7 @@ class Lattice:
     """Places of one layer in the axes of one frame, and its motions that are proved."""
 
     def __init__(
-        self, space: Space, layer: Layer, radius: Floats, need: float, frame: Floats, common: list[Floats]
+        self, space: FreeSpace, layer: Layer, radius: Floats, need: float, frame: Floats, common: list[Floats]
     ) -> None:  # fmt: skip
         """Find places and motions.
 
@@ -172,7 +172,7 @@ class Lattice:
         edges = self.all_edges[:, free[self.all_edges].all(axis=0)]
         still = np.zeros(len(radius))
         a, b = self.points[edges[0]], self.points[edges[1]]
-        self.edges = edges[:, proved(space, a, b, staying(layer), still, radius, need)]
+        self.edges = edges[:, keeps_room(space, a, b, staying(layer), still, radius, need)]
         self.common = index[
             np.ix_(*(np.searchsorted(axes[k], common[k]) for k in range(3)))
         ].ravel()
@@ -223,7 +223,7 @@ class Network:
     """Lattices of several layers and frames, joined where the layer can change."""
 
     def __init__(
-        self, space: Space, layers: list[Layer], changes: list[Change], radius: Floats, need: float,
+        self, space: FreeSpace, layers: list[Layer], changes: list[Change], radius: Floats, need: float,
         frames: list[Floats], common: list[list[Floats]], known: dict[Any, Lattice],
     ) -> None:  # fmt: skip
         """Build the lattices; the parameters are those of `Lattice`, for each layer and frame.
@@ -269,7 +269,7 @@ class Network:
                 free = one.free[one.common] & two.free[two.common]
                 a, b = one.common[free], two.common[free]
                 spots = one.points[a]
-                good = proved(space, spots, spots, change.path, change.ways, radius, need)
+                good = keeps_room(space, spots, spots, change.path, change.ways, radius, need)
                 a, b = a[good] + self.first[f, change.before], b[good] + self.first[f, change.after]
                 add(a, b, np.full(len(a), change.cost))
         for f in range(1, len(self.lattices)):
@@ -290,7 +290,7 @@ class Network:
         a, b = np.repeat(a, near.shape[1]), b[near.ravel()]
         p, q = one.points[a], two.points[b]
         still = np.zeros(len(self.radius))
-        good = proved(self.space, p, q, staying(layer), still, self.radius, self.need)
+        good = keeps_room(self.space, p, q, staying(layer), still, self.radius, self.need)
         cost = np.linalg.norm(p - q, axis=1)[good]
         return a[good] + self.first[0, k], b[good] + self.first[f, k], cost
 
@@ -320,11 +320,11 @@ class Network:
             [self.points[k] for k in nodes], [int(self.layer_of[k]) for k in nodes], float(cost[b])
         )
 
-    def shortened(self, way: Way) -> Way:
+    def shorten(self, way: Way) -> Way:
         """The way with fewer stops: straight where that is proved, with changes at stops or half-way between them."""
         stops = list(zip(way.places, way.layers, strict=True))
         for _ in range(_SHORTER):
-            stops = self._changed_on_the_way(self._straightened(stops))
+            stops = self._changed_on_the_way(self._straighten(stops))
         ends = way.places[0], way.places[-1]
         places = [p if any(p is end for end in ends) else np.round(p, 3) for p, _ in stops]
         return Way(places, [k for _, k in stops], way.cost)
@@ -338,9 +338,9 @@ class Network:
             if change is None or not np.array_equal(p, q):
                 return False
             path, ways = change.path, change.ways
-        return bool(proved(self.space, p[None], q[None], path, ways, self.radius, self.need)[0])
+        return bool(keeps_room(self.space, p[None], q[None], path, ways, self.radius, self.need)[0])
 
-    def _straightened(self, stops: list[Stop]) -> list[Stop]:
+    def _straighten(self, stops: list[Stop]) -> list[Stop]:
         """From each stop on to the farthest one of its layer that is straight ahead."""
         stops, k = list(stops), 0
         while k < len(stops) - 2:

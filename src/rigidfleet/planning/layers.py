@@ -31,7 +31,7 @@ _FRAMES = 4
 _SLACK = 1e-9
 
 
-class Shape(NamedTuple):
+class CandidateShape(NamedTuple):
     """A formation that may be taken: its name, slots (N, 3) [m] about the centre of mass, and stage of the search."""
 
     name: str
@@ -39,7 +39,7 @@ class Shape(NamedTuple):
     stage: int
 
 
-def allowed(mission: Mission, phase: Go, own: str) -> Iterator[Shape]:
+def candidate_shapes(mission: Mission, phase: Go, own: str) -> Iterator[CandidateShape]:
     """The formation as it is, others, and smaller ones; others only if their agents keep the limits of separation."""
     limits, radius = mission.limits, mission.fleet.radius
     names = tuple(mission.formations) if phase.formations is None else phase.formations
@@ -56,21 +56,21 @@ def allowed(mission: Mission, phase: Go, own: str) -> Iterator[Shape]:
         below = float(proximity.headroom(slots[None], radius)[0][0])
         kept = apart > 0.0 and apart >= (limits.separation or 0.0) - _SLACK
         if stage == 0 or (kept and below >= (limits.separation_below or 0.0) - _SLACK):
-            yield Shape(name, slots, stage)
+            yield CandidateShape(name, slots, stage)
 
 
 def frames(obstacles: Sequence[Obstacle]) -> list[Floats]:
     """Axes (3, 3) of the lattices: the world's, and those of boxes that are turned about the vertical."""
-    found = [np.eye(3)]
+    rotations = [np.eye(3)]
     for thing in obstacles:
         turn = thing.solid.turn[0]
         if not thing.solid.turned[0] or abs(abs(turn[2, 2]) - 1.0) > 1e-9:
             continue
         angle = math.atan2(turn[0, 1], turn[0, 0]) % (math.pi / 2)
         frame = att.dcm_from_euler(np.array([0.0, 0.0, angle]))
-        if all(np.abs(frame - f).max() > 1e-6 for f in found) and len(found) < _FRAMES:
-            found.append(frame)
-    return found
+        if all(np.abs(frame - f).max() > 1e-6 for f in rotations) and len(rotations) < _FRAMES:
+            rotations.append(frame)
+    return rotations
 
 
 def narrow_yaws(slots: Floats, start: Angles, axes: list[Floats]) -> set[float]:
@@ -102,7 +102,7 @@ def narrow_yaws(slots: Floats, start: Angles, axes: list[Floats]) -> set[float]:
 
 
 def changes(
-    mission: Mission, shapes: Sequence[Shape], angles: Sequence[Angles]
+    mission: Mission, shapes: Sequence[CandidateShape], angles: Sequence[Angles]
 ) -> Iterator[Change]:
     """Turns and changes of shape, each between two layers; layers are all angles of the first shape, and so on."""
     count = len(angles)
@@ -116,9 +116,9 @@ def changes(
     for s, one in enumerate(shapes):
         for t in range(s + 1, len(shapes)):
             for i in range(count):
-                found = _folding(mission, one, shapes[t], angles[i])
-                if found is not None:
-                    yield Change(s * count + i, t * count + i, *found)
+                folding = _folding(mission, one, shapes[t], angles[i])
+                if folding is not None:
+                    yield Change(s * count + i, t * count + i, *folding)
 
 
 def _turning(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats]:
@@ -132,7 +132,7 @@ def _turning(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats
 
 
 def _folding(
-    mission: Mission, one: Shape, two: Shape, angles: Angles
+    mission: Mission, one: CandidateShape, two: CandidateShape, angles: Angles
 ) -> tuple[Path, Floats] | None:
     """Offsets and ways of a change of shape, as references blend it; None if agents come too near each other."""
     p, q = one.slots, two.slots

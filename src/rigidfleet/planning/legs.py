@@ -19,15 +19,15 @@ from rigidfleet.math.rigid_body import about_cm, mean_axis_rates
 from rigidfleet.mission import Mission, Phase, Settle
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.mission.schema import Constraint
-from rigidfleet.planning.certificate import Certificate, certified
+from rigidfleet.planning.certificate import Certificate, certificate_of
 from rigidfleet.planning.courses import course
 from rigidfleet.planning.derivatives import body_series, slot_derivatives
 from rigidfleet.planning.reference import (
     PhaseState,
     Pose,
     align_slots,
-    changed,
-    fitted,
+    copy_with,
+    nearest_rotation,
     pose_at,
     reference_kind,
 )
@@ -103,8 +103,8 @@ class Leg:
     def exact(self) -> bool:
         """Whether the agents follow the plan up to control errors; if not, it is an estimate."""
         # A shape held by constraint forces alone may lag behind its slots.
-        led = self.phase.control == "open" and self.departure.kind == SHAPE
-        return self.phase.shaping is None or self.phase.control == "tracking" or led
+        blended = self.phase.control == "open" and self.departure.kind == SHAPE
+        return self.phase.shaping is None or self.phase.control == "tracking" or blended
 
     @cached_property
     def motion(self) -> Motion:
@@ -137,16 +137,16 @@ class Leg:
     @cached_property
     def certificate(self) -> Certificate | None:
         """The least separation of the planned paths, proved; None if agents track no slots."""
-        return certified(self.phase, self.reference, self.radius, self.before.lost)
+        return certificate_of(self.phase, self.reference, self.radius, self.before.lost)
 
     @cached_property
     def end(self) -> float:
         """Time [s] at which the phase is expected to end: one that ends by settling, soon after it reaches its goal."""
         if self.phase.settle is None:
             return self.t_end
-        return self.start + settling_length(self.phase, self.constraint, self._reached())
+        return self.start + settling_length(self.phase, self.constraint, self._time_near_goal())
 
-    def _reached(self) -> float:
+    def _time_near_goal(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
         goal, settle = self.goal, self.phase.settle
         if goal is None or settle is None or self.way is None:
@@ -184,8 +184,8 @@ class Leg:
         """The state from which the next phase starts if this one ends at t [s], with the agents at r and v (N, 3)."""
         goal, blend = self.goal, self.reference
         if self.phase.goal_moves and pose is not None and goal is not None and t < self.t_end:
-            goal = changed(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
-        return changed(
+            goal = copy_with(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
+        return copy_with(
             self.before, t=t, r=r, v=v, frame=frame, formation=self.formation, slots=self.slots, pose=pose, goal=goal,
             blend=blend if t < blend.t0 + blend.T_b else None,
         )  # fmt: skip
@@ -211,7 +211,7 @@ def depart(mission: Mission, phase: Phase, now: PhaseState) -> Departure:
     turn = None
     if shaping is not None:
         turn = mission.assigned_turn(now.formation, shaping.formation) if shaping.aligned else np.eye(3)  # fmt: skip
-    frame, state, turn = _attached(mission, phase, now, left, target, turn)
+    frame, state, turn = _attach_frame(mission, phase, now, left, target, turn)
     # Without slots, the agents' positions in the formations' axes.
     p0 = about_cm(state.r, left) @ mission.drawn_attitude.T if state.slots is None else state.slots
     if shaping is None:
@@ -221,7 +221,7 @@ def depart(mission: Mission, phase: Phase, now: PhaseState) -> Departure:
     return Departure(now, state, frame, target, kind, p0, *align_slots(p0, after, left, turn))
 
 
-def _attached(
+def _attach_frame(
     mission: Mission, phase: Phase, now: PhaseState, masses: Floats, target: Floats | None, turn: Floats | None
 ) -> tuple[Floats | None, PhaseState, Floats | None]:  # fmt: skip
     """Attach the body frame if a phase needs one.
@@ -265,26 +265,26 @@ def _attached(
             pose.r = pose.r - T.T @ centre
             pose.v = pose.v - T.T @ np.cross(pose.omega, centre)
     slots = now.slots if now.slots is not None else about_cm(now.r, masses) @ pose.T.T
-    goal = now.goal or changed(pose, v=np.zeros(3), omega=np.zeros(3))
+    goal = now.goal or copy_with(pose, v=np.zeros(3), omega=np.zeros(3))
     if establishing is not None and target is not None:
         # The new axes in the old ones: `axes` maps vectors from new to old.
         free = mission.free_attitude(phase)
         if free:
-            axes = fitted(slots, target, masses) if turn is None else turn
+            axes = nearest_rotation(slots, target, masses) if turn is None else turn
         else:
-            asked = mission.establish_attitude(establishing, goal.T if goal.named else None)
-            steady = now.pose is not None and goal.named and np.array_equal(goal.T, asked)
-            axes = np.eye(3) if steady else pose.T @ asked.T
+            attitude = mission.establish_attitude(establishing, goal.T if goal.named else None)
+            steady = now.pose is not None and goal.named and np.array_equal(goal.T, attitude)
+            axes = np.eye(3) if steady else pose.T @ attitude.T
         slots = slots @ axes
         pose = pose.in_axes(axes)
-        goal = changed(goal, T=pose.T if free else asked, named=not free)
+        goal = copy_with(goal, T=pose.T if free else attitude, named=not free)
         if free:  # in the axes that fit best, nothing is left to turn
             turn = np.eye(3)
         elif turn is not None:
             turn = axes.T @ turn
     if phase.control == "body" or (mission.formulation == "body" and frame is None):
         frame = pose.T
-    return frame, changed(now, pose=pose, slots=slots, goal=goal), turn
+    return frame, copy_with(now, pose=pose, slots=slots, goal=goal), turn
 
 
 def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:

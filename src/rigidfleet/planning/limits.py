@@ -73,29 +73,29 @@ def limits_of(
     def motion(q: Quantity, x: Floats, who: Ints) -> Floats:
         return SIZES[q.way](x[:, q.order]) + more(q.order, x, who)
 
-    def lifted(x: Floats, who: Ints) -> Floats:
+    def force_per_mass(x: Floats, who: Ints) -> Floats:
         """What a thrust gives per mass [m/s^2], against drag if vehicles leave a reserve."""
         air = 0.0 if reserve is None else air_force(mission, -x[:, 1], who) / mass[who, None]
         return x[:, 2] + up - air
 
     def tilt(_: Quantity, x: Floats, who: Ints) -> Floats:
-        f, off = lifted(x, who), more(2, x, who)
+        f, off = force_per_mass(x, who), more(2, x, who)
         return np.rad2deg(np.arctan2(SIZES["horizontal"](f) + off, f[..., 2] - off))
 
     def thrust(_: Quantity, x: Floats, who: Ints) -> Floats:
-        return mass[who] * (SIZES[""](lifted(x, who)) + more(2, x, who))
+        return mass[who] * (SIZES[""](force_per_mass(x, who)) + more(2, x, who))
 
-    ways, found = {"tilt": tilt, "thrust": thrust}, []
+    ways, finite = {"tilt": tilt, "thrust": thrust}, []
     for q in (*MOTIONS, QUANTITIES["tilt"], QUANTITIES["thrust"]):
         table, _, key = q.key.partition(".")
         most = mission.fleet.thrust_limit if table == "agents" else getattr(limits, key)
         if most is not None and np.isfinite(most).any():
             most = np.broadcast_to(np.asarray(most, dtype=float), n)
-            found.append(Limit(q, most, partial(ways.get(q.way, motion), q)))
-    return found
+            finite.append(Limit(q, most, partial(ways.get(q.way, motion), q)))
+    return finite
 
 
-def reached(
+def use_of_limits(
     limits: list[Limit],
     reference: Reference,
     motion: Motion,
@@ -115,11 +115,11 @@ def reached(
         for k, limit in enumerate(limits):
             if not np.isfinite(limit.most[who]).any():
                 continue
-            found = _highest(limit, reference, motion, time, x, who, fine=fine)
+            highest = _highest(limit, reference, motion, time, x, who, fine=fine)
             before = best[k]
-            if before is None or found.share > before.share:
-                best[k] = found
-    return [found for found in best if found is not None]
+            if before is None or highest.share > before.share:
+                best[k] = highest
+    return [highest for highest in best if highest is not None]
 
 
 def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Floats:

@@ -17,7 +17,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
 from rigidfleet.planning.courses import height
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
-from rigidfleet.planning.limits import limits_of, reached
+from rigidfleet.planning.limits import limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
 
 #: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
@@ -90,7 +90,7 @@ def _shortest(
     limits = limits_of(mission, own.model_copy(update=gentle))
 
     def shares(reference: Reference, motion: Motion, end: float) -> np.ndarray:
-        return np.array([x.share for x in reached(limits, reference, motion, now.t, end)])
+        return np.array([x.share for x in use_of_limits(limits, reference, motion, now.t, end)])
 
     best, least_worst, time = None, math.inf, least
     departure = depart(mission, make(time), now)

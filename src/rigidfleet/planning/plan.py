@@ -45,12 +45,12 @@ from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission import Mission, Phase, Regulator, bounds
 from rigidfleet.mission.schema import IntegratorOptions
 from rigidfleet.planning import solvers
-from rigidfleet.planning.body_trajectories import passed
+from rigidfleet.planning.body_trajectories import points_passed
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.courses import regulators
 from rigidfleet.planning.disturbances import held_in_place, without
 from rigidfleet.planning.legs import Leg
-from rigidfleet.planning.reference import PhaseState, Pose, changed, extended, pose_at
+from rigidfleet.planning.reference import PhaseState, Pose, copy_as, copy_with, pose_at
 from rigidfleet.planning.tolerances import (
     absolute_tolerances,
     tolerance_of_velocity,
@@ -87,7 +87,7 @@ class PhasePlan(Leg):
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
     loses: bool  # whether vehicles or links are lost at any time of the mission
-    through: tuple[dict[str, Any], ...]  # points to pass on the way (`passed`)
+    through: tuple[dict[str, Any], ...]  # points to pass on the way (`points_passed`)
 
     @cached_property
     def certificate(self) -> Certificate | None:
@@ -130,16 +130,16 @@ class PhasePlan(Leg):
         meets, later = phase.meets, since > _LATER
         stays, free = "position" not in meets, "velocity" not in meets
         kept = stays and goal.named and phase.control == "tracking" and phase.establishing is None
-        found: dict[str, Any] = {"time": t}
+        table: dict[str, Any] = {"time": t}
         if stays or (later and not free):
-            found |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
+            table |= {"position": (goal.r + goal.v * since).tolist(), "velocity": goal.v.tolist()}
         if later if "attitude" in meets else kept:
             # Most stay without a turn, and whether they do is asked at the end of every phase.
             T = goal.T
             if goal.omega.any():
                 T = att.dcm_from_rotation_vector(goal.omega * since) @ T
-            found |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
-        return found if len(found) > 1 else None
+            table |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
+        return table if len(table) > 1 else None
 
     def state(self) -> Floats:
         """The kernel's state vector (n,) at the start; `rigidfleet.kernel.dynamics` says what it holds."""
@@ -189,7 +189,7 @@ class PhasePlan(Leg):
         self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
         return kept
 
-    def reached(self, t: float, y: Floats, w: Workspace) -> PhaseState:
+    def state_at_end(self, t: float, y: Floats, w: Workspace) -> PhaseState:
         """The state that the next phase starts from, after an evaluation at time t [s] and state y (n,) in ``w``."""
         n, m = len(self.before.r), len(self.edges)
         frame, pose = self.before.frame, None
@@ -199,10 +199,10 @@ class PhasePlan(Leg):
         if self.problem.control.kind == TRACKING:
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
             pose = pose_at(self.problem.motion, t) if self.smooth else pose
-        return changed(
+        return copy_with(
             self.handed_on(t, w.r.copy(), w.v.copy(), frame, pose),
-            integral=self.before.integral.updated(self.edges, y[6 * n : 6 * n + m]),
-            reference=self.before.reference.updated(self.edges, self.distances),
+            integral=self.before.integral.with_values(self.edges, y[6 * n : 6 * n + m]),
+            reference=self.before.reference.with_values(self.edges, self.distances),
         )
 
 
@@ -264,17 +264,17 @@ def plan_phase(
         feedback=feedback,
         control=_control(mission, phase, masses),
         disturbance=no_disturbance(masses) if disturbance is None else disturbance,
-        external=_bounded(external or External(), motion, reference),
+        external=_limit_steps(external or External(), motion, reference),
     )  # fmt: skip
     if mission.agents.fixed:
         problem = held_in_place(problem, np.array(mission.agents.fixed) - 1)
-    plan = extended(
+    plan = copy_as(
         PhasePlan, leg, reference=reference, masses=masses, problem=problem, edges=edges, distances=d1,
         attached=leg.before.slots is not None or phase.control != "open",
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
-        loses=mission.first_loss < math.inf, through=passed(phase.points, motion),
+        loses=mission.first_loss < math.inf, through=points_passed(phase.points, motion),
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
@@ -284,7 +284,7 @@ def plan_phase(
     return plan
 
 
-def _bounded(external: External, motion: Motion, reference: Reference) -> External:
+def _limit_steps(external: External, motion: Motion, reference: Reference) -> External:
     """A user's force, if any, with steps of at most half the time for which any coordinate of a reference accelerates.
 
     Only after a rest or a uniform motion, where steps grow without bound: they could miss what comes between two.
@@ -352,14 +352,14 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs, most = _wanted(slots)
+    pairs, most = _pair_distances(slots)
     x = r.tolist()
     near = all(abs(math.dist(x[i], x[j]) - wanted) <= most for i, j, wanted in pairs)
     return name if near else None
 
 
 @kept
-def _wanted(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
+def _pair_distances(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
     """All pairs of slots (N, 3) with their distance [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
     wanted = distance_geometry.distances(slots, pairs).tolist()
@@ -368,10 +368,10 @@ def _wanted(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
 
 
 @kept
-def _agree(asked: Floats, slots: Floats, edges: Ints) -> bool:
+def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
-    found = distance_geometry.distances(slots, edges)
-    return bool((np.abs(asked - found) <= _ROUNDED + 1e-12 * found).all())
+    own = distance_geometry.distances(slots, edges)
+    return bool((np.abs(lengths - own) <= _ROUNDED + 1e-12 * own).all())
 
 
 @kept

@@ -46,7 +46,7 @@ class ByEdge:
         known = np.append(own, -1)[at] == keys
         return np.where(known, np.append(self.values, 0.0)[at], new)
 
-    def updated(self, edges: Ints, values: Floats) -> ByEdge:
+    def with_values(self, edges: Ints, values: Floats) -> ByEdge:
         """These values, updated with the ``values`` of edges (m, 2), i < j."""
         if not len(self.edges) or self._has(edges):
             return ByEdge(edges, values.copy())
@@ -70,12 +70,12 @@ _ZERO = np.zeros(3)
 _ZERO.flags.writeable = False
 
 
-def changed(state: State, **fields: Any) -> State:
+def copy_with(state: State, **fields: Any) -> State:
     """A shallow copy of a pose, a state or a plan with other fields; `dataclasses.replace` takes five times as long."""
-    return extended(type(state), state, **fields)
+    return copy_as(type(state), state, **fields)
 
 
-def extended(kind: type[State], state: Any, **fields: Any) -> State:
+def copy_as(kind: type[State], state: Any, **fields: Any) -> State:
     """A pose, state or plan of a kind, with the fields of another one and further ones."""
     new = object.__new__(kind)
     new.__dict__.update(state.__dict__, **fields)
@@ -102,7 +102,7 @@ class Pose:
     def in_axes(self, axes: Floats) -> Pose:
         """The same pose in new body axes; ``axes`` (3, 3) maps vectors from new to old ones."""
         rates = {key: axes.T @ getattr(self, key) for key in ("T", "omega", "alpha", "alpha_dot")}
-        return changed(self, **rates)
+        return copy_with(self, **rates)
 
 
 def pose_at(motion: Motion, t: float) -> Pose:
@@ -132,7 +132,7 @@ class PhaseState:
 
 
 @kept
-def fitted(before: Floats, after: Floats, masses: Floats) -> Floats:
+def nearest_rotation(before: Floats, after: Floats, masses: Floats) -> Floats:
     """The rotation (3, 3) that brings slots (N, 3) nearest to those before: Kabsch, weighted by mass."""
     return rigid_body.kabsch(before, after, masses)
 
@@ -155,16 +155,16 @@ def reference_kind(
     if target is None or not mission.formations[phase.formation].knows_slots:
         return "squares"
     edges = mission.formation_edges(phase.formation)
-    asked = mission.formation_distances(phase.formation)
-    return _leads(before, target, edges, asked)
+    lengths = mission.formation_distances(phase.formation)
+    return _leads(before, target, edges, lengths)
 
 
 @kept
 def _leads(
-    before: Floats, target: Floats, edges: Ints, asked: Floats
+    before: Floats, target: Floats, edges: Ints, lengths: Floats
 ) -> Literal["shape", "squares"]:
     """Kind of reference that leads from slots to others, whose edges have lengths (m,) [m] asked for."""
-    if not np.allclose(distance_geometry.distances(target, edges), asked, rtol=1e-3):
+    if not np.allclose(distance_geometry.distances(target, edges), lengths, rtol=1e-3):
         return "squares"
     start, goal = rigid_body.centred(before), rigid_body.centred(target)
     if distance_geometry.dimension(np.hstack([start, goal])) > 3:
@@ -184,10 +184,10 @@ def align_slots(
     straight blend then has no angular momentum in its own frame, and moves the agents least. During the blend the
     slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
-    R = fitted(before, after, masses) if turn is None else turn
-    return _aligned(before, after, R)
+    R = nearest_rotation(before, after, masses) if turn is None else turn
+    return _change_of_slots(before, after, R)
 
 
 @kept
-def _aligned(before: Floats, after: Floats, R: Floats) -> tuple[Floats, Floats]:
+def _change_of_slots(before: Floats, after: Floats, R: Floats) -> tuple[Floats, Floats]:
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T

@@ -15,12 +15,12 @@ from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
-from rigidfleet.planning.body_trajectories import passed
-from rigidfleet.planning.courses import misled
+from rigidfleet.planning.body_trajectories import points_passed
+from rigidfleet.planning.courses import obstacle_to_course
 from rigidfleet.planning.legs import Departure, Leg, at_start, depart, leg_from
-from rigidfleet.planning.limits import Limit, Reached, limits_of, reached
+from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.transitions import expanded
+from rigidfleet.planning.transitions import expand_phases
 from rigidfleet.planning.vehicles import reserves
 
 #: Shortest and longest time tried [s], and the number of times tried.
@@ -37,7 +37,7 @@ SLACK = 1e-3
 
 
 def spelled_out(mission: Mission) -> Mission:
-    """Return a mission whose transitions (`transitions.expanded`) and ways (`ways.found`) are phases of their own.
+    """The mission with phases for its transitions (`transitions.expand_phases`) and ways (`ways.find_ways`).
 
     A mission with neither is returned as it is. The result's text is that of these phases; automatic times stay so.
 
@@ -46,10 +46,10 @@ def spelled_out(mission: Mission) -> Mission:
     MissionError
         No transition keeps the separation, or no way is found.
     """
-    return ways.found(expanded(mission, timed_leg), timed_leg)
+    return ways.find_ways(expand_phases(mission, timed_leg), timed_leg)
 
 
-def timed(mission: Mission) -> Mission:
+def complete_times(mission: Mission) -> Mission:
     """Return a mission whose transitions and ways are phases of their own (`spelled_out`), with its times known.
 
     Automatic times are replaced by the least ones. A mission with neither is returned as it is.
@@ -79,7 +79,7 @@ def timed(mission: Mission) -> Mission:
             changed = leg.phase.model_dump(mode="json", include={*phase.automatic, "through"})
             tables[k] = tables[k] | {key: x for key, x in changed.items() if x or key != "through"}
         if not leg.known:
-            raise _unknown(mission, k, mission.phases[last])
+            raise _error_of_reference(mission, k, mission.phases[last])
         now = leg.after
     return mission.with_phases(tables)
 
@@ -93,7 +93,7 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
         No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
     departure = depart(mission, phase, now)
-    if problem := misled(phase, departure.now):
+    if problem := obstacle_to_course(phase, departure.now):
         key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
         path = f"phases[{number + 1}].{key}"
@@ -132,7 +132,7 @@ def broken(mission: Mission, leg: Leg) -> list[Reached]:
     """Limits that the reference of a planned leg breaks, the worst first."""
     if leg.phase.control != "tracking":
         return []
-    over = reached(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end)
+    over = use_of_limits(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end)
     return sorted((x for x in over if x.share > 1.0 + SLACK), key=lambda x: -x.share)
 
 
@@ -157,14 +157,14 @@ def _least(
     Vehicles leave a reserve of their limits, unless no time does: of a circle near a limit, for example.
     """
     if limits is None and (reserve := reserves(mission)).any():
-        found = _least(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
-        if found[0] is not None:
-            return found
+        fastest = _least(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
+        if fastest[0] is not None:
+            return fastest
     limits = limits_of(mission) if limits is None else limits
 
     def each(time: float, *, fine: bool = False) -> list[Reached]:
         leg = leg_from(mission, vary(time), departure)
-        return reached(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
+        return use_of_limits(limits, leg.reference, leg.motion, leg.start, leg.end, fine=fine)
 
     def excess(time: float) -> float:
         """Greatest share of a limit [-], as a power that falls in proportion to the time of ways from rest to rest."""
@@ -228,7 +228,7 @@ def _shared_out(mission: Mission, phase: Phase, departure: Departure) -> Phase:
     if not phase.points:
         return phase
     arriving = phase.model_copy(update={phase.time_key: _arrival(phase)})
-    points = passed(phase.points, leg_from(mission, arriving, departure).motion)
+    points = points_passed(phase.points, leg_from(mission, arriving, departure).motion)
     start = departure.now.t
     through = tuple(
         at.model_copy(update={"time": round(point["time"] - start, 6)})
@@ -237,7 +237,7 @@ def _shared_out(mission: Mission, phase: Phase, departure: Departure) -> Phase:
     return phase.model_copy(update={"through": through})
 
 
-def _unknown(mission: Mission, number: int, last: Phase) -> MissionError:
+def _error_of_reference(mission: Mission, number: int, last: Phase) -> MissionError:
     problem = (
         "depends on distances alone, so that the starts of later phases are known only in flight"
     )

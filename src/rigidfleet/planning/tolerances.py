@@ -25,7 +25,7 @@ def most_steps(flown: float) -> int:
 
 
 def absolute_tolerances(
-    given: IntegratorOptions, size: int, velocity: Floats, distances: Floats, *, large: bool
+    options: IntegratorOptions, size: int, velocity: Floats, distances: Floats, *, large: bool
 ) -> Floats:
     """Absolute tolerances (size,) of the states, class by class.
 
@@ -41,26 +41,26 @@ def absolute_tolerances(
     large : whether the formation is solved for as a large one
     """
     n, m = len(velocity), len(distances)
-    atol = np.full(size, given.atol)
+    atol = np.full(size, options.atol)
     atol[3 * n : 6 * n].reshape(n, 3)[:] = velocity[:, None]
-    if given.atol_integral is not None:
-        atol[6 * n : 6 * n + m] = given.atol_integral
+    if options.atol_integral is not None:
+        atol[6 * n : 6 * n + m] = options.atol_integral
     elif large:
-        atol[6 * n : 6 * n + m] = given.atol + given.rtol * distances
-    if given.atol_attitude is not None:
-        atol[6 * n + m : 6 * n + m + 4] = given.atol_attitude
+        atol[6 * n : 6 * n + m] = options.atol + options.rtol * distances
+    if options.atol_attitude is not None:
+        atol[6 * n + m : 6 * n + m + 4] = options.atol_attitude
     return atol
 
 
 @kept
-def tolerances_of_small(given: IntegratorOptions, n: int, m: int, size: int) -> Floats:
+def tolerances_of_small(options: IntegratorOptions, n: int, m: int, size: int) -> Floats:
     """`absolute_tolerances` of n agents with m edges that are not solved for as a large formation."""
-    velocity = np.full(n, given.atol_velocity or given.atol)
-    return absolute_tolerances(given, size, velocity, np.zeros(m), large=False)
+    velocity = np.full(n, options.atol_velocity or options.atol)
+    return absolute_tolerances(options, size, velocity, np.zeros(m), large=False)
 
 
 def tolerance_of_velocity(
-    given: IntegratorOptions, r: Floats, masses: Floats, beta: float, *, large: bool
+    options: IntegratorOptions, r: Floats, masses: Floats, beta: float, *, large: bool
 ) -> Floats:
     """Absolute tolerance (N,) of velocities [m/s] of agents at r (N, 3) [m].
 
@@ -68,7 +68,7 @@ def tolerance_of_velocity(
     its size. In large formations, unless given, the tolerance is therefore beta times that of the agent's position
     about the CM.
     """
-    if given.atol_velocity is not None or not large:
-        return np.full(len(r), given.atol_velocity or given.atol)
+    if options.atol_velocity is not None or not large:
+        return np.full(len(r), options.atol_velocity or options.atol)
     away = np.linalg.norm(about_cm(r, masses), axis=1)
-    return np.maximum(given.atol, beta * (given.atol + given.rtol * away))
+    return np.maximum(options.atol, beta * (options.atol + options.rtol * away))

@@ -123,10 +123,10 @@ def transfer(
         for start_number in range(_STARTS + 2):
             control = _straight(s, g)
             if start_number > _STARTS:  # as in a roundabout, for crowds that all meet at one place
-                control = _searched(_bowed(s, g), duration, limits, rng)
+                control = _improve(_ways_to_the_right(s, g), duration, limits, rng)
             elif start_number:  # straight ways will not do
-                control = _searched(control, duration, limits, rng)
-            if not _kept(control, duration, limits):
+                control = _improve(control, duration, limits, rng)
+            if not _keeps_limits(control, duration, limits):
                 continue
             knots, pieces = Piecewise.b_spline(control, duration)
             certificate = of_ways(knots, pieces * metric[:, None])
@@ -161,7 +161,7 @@ def _straight(s: Floats, g: Floats) -> Floats:
     return (1 - share) * s + share * g
 
 
-def _bowed(s: Floats, g: Floats) -> Floats:
+def _ways_to_the_right(s: Floats, g: Floats) -> Floats:
     """Control points (M + 3, N, 3) of ways that all keep to the right, seen from above on half an ellipse.
 
     Where each vehicle goes to the opposite place of a circle, this is half a turn of them all.
@@ -172,9 +172,7 @@ def _bowed(s: Floats, g: Floats) -> Floats:
     return s + 0.5 * (1.0 - np.cos(np.pi * share)) * way + np.sin(np.pi * share) * right
 
 
-def _searched(
-    control: Floats, duration: float, limits: _Limits, rng: np.random.Generator
-) -> Floats:
+def _improve(control: Floats, duration: float, limits: _Limits, rng: np.random.Generator) -> Floats:
     """Control points (M + 3, N, 3) with little penalty, from those of other ways; their ends stay."""
     from scipy.optimize import minimize
 
@@ -211,10 +209,10 @@ def _searched(
             over = np.sign(d) * np.maximum(np.abs(d) - 0.99, 0.0)
             cost += weight * float((over * over).sum())
             rise = 2.0 * weight * over / most
-            slope -= _turned(rise, order)
+            slope -= _difference_adjoint(rise, order)
             if order == 2:
                 cost += _SMOOTH * float((d * d).sum())
-                slope -= _turned(2.0 * _SMOOTH * d / most, order)
+                slope -= _difference_adjoint(2.0 * _SMOOTH * d / most, order)
         out = np.maximum(control - limits.high, 0.0) + np.minimum(control - limits.low, 0.0)
         cost += w_box * float((out * out).sum())
         slope += 2.0 * w_box * out
@@ -223,21 +221,21 @@ def _searched(
     bounds = [
         (a, b) for _ in range(shape[0] * n) for a, b in zip(limits.low, limits.high, strict=True)
     ]
-    found = minimize(
+    optimum = minimize(
         penalty, control[free].ravel(), jac=True, method="L-BFGS-B", bounds=bounds,
         options={"maxiter": _ITERATIONS, "maxcor": 20},
     )  # fmt: skip
-    control[free] = found.x.reshape(shape)
+    control[free] = optimum.x.reshape(shape)
     return control
 
 
-def _turned(rise: Floats, order: int) -> Floats:
+def _difference_adjoint(rise: Floats, order: int) -> Floats:
     """The negative transpose of differences of an order, applied to slopes of them."""
     turned = np.diff(np.pad(rise, ((order, order), (0, 0), (0, 0))), order, axis=0)
     return turned if order == 1 else -turned
 
 
-def _kept(control: Floats, duration: float, limits: _Limits) -> bool:
+def _keeps_limits(control: Floats, duration: float, limits: _Limits) -> bool:
     """Whether ways keep the box, and the limits of speed and acceleration on each axis."""
     h = duration / (len(control) - 3)
     speed = np.abs(np.diff(control, 1, axis=0)) / h

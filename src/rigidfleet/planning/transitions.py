@@ -24,7 +24,7 @@ from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.transfers import transfer
-from rigidfleet.planning.ways import Timed, refused
+from rigidfleet.planning.ways import Timed, error_of_key
 from rigidfleet.typing import Floats, Ints
 
 #: What the parts of a transition are called.
@@ -37,7 +37,7 @@ _ROOM = 2.0
 _SLACK = 1e-9
 
 
-def expanded(mission: Mission, timed: Timed) -> Mission:
+def expand_phases(mission: Mission, timed: Timed) -> Mission:
     """Return the mission with each phase that is flown as several in their place; itself if it has none.
 
     A transition by layers becomes three phases, a staggered take-off or landing one for each group of vehicles; one by
@@ -92,7 +92,7 @@ def _transition(
     return _phases(table, phase, names, stops), levels
 
 
-def _staggered(
+def _stagger(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, _: _Room
 ) -> _Parts:  # fmt: skip
     """The phases of a staggered take-off or landing, one for each group.
@@ -122,7 +122,7 @@ def _staggered(
             f"groups go one after another: give a duration of {len(groups) * phase.stagger:g} s, or up to"
             f" {phase.stagger:g} s less"
         )
-        raise refused(mission, number, "duration", phase.duration, problem, remedy)
+        raise error_of_key(mission, number, "duration", phase.duration, problem, remedy)
     common = {key: x for key, x in table.items() if key not in ("stagger", "by")}
     parts = [
         common
@@ -135,9 +135,9 @@ def _staggered(
 
 #: What takes the place of each kind of phase that may not be flown as it is written.
 _PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None, _Room], _Parts]] = {
-    "land": _staggered,
+    "land": _stagger,
     "reshape": _transition,
-    "takeoff": _staggered,
+    "takeoff": _stagger,
 }
 
 
@@ -192,7 +192,7 @@ def _bent(
     MissionError
         There are no limits of speed and acceleration, no ways are found, or the blend is too short for them.
     """
-    mistake = partial(refused, mission, number)
+    mistake = partial(error_of_key, mission, number)
     p, q = _ends(mission, number, phase, before)
     limits, radius = mission.limits, float(mission.fleet.radius.max())
     if limits.speed is None or limits.acceleration is None:
@@ -211,7 +211,7 @@ def _bent(
     )
     each = 1.0 / np.sqrt(3.0)  # limits of each axis, which together keep those of the vector
     try:
-        found = transfer(
+        ways = transfer(
             p, q, distance=distance, speed=each * limits.speed, acceleration=each * limits.acceleration,
             box=box, downwash=below / distance,
         )  # fmt: skip
@@ -220,13 +220,13 @@ def _bent(
         raise mistake(
             "transition", phase.transition, problem, "or lower limits.separation"
         ) from None
-    if found is None:
+    if ways is None:
         problem = (
             f"finds no ways to '{phase.formation}' that keep {distance:.3g} m from centre to centre"
         )
         remedy = "use transition = 'layers', place slots farther apart, or lower limits.separation"
         raise mistake("transition", phase.transition, problem, remedy)
-    least = math.ceil(found.duration * 1e3) / 1e3
+    least = math.ceil(ways.duration * 1e3) / 1e3
     if phase.blend != AUTO and "blend" in phase.model_fields_set and phase.blend < least:
         problem = f"is too short for the ways found; the least is {least:g} s"
         raise mistake("blend", phase.blend, problem, "give that, or leave it out")
@@ -234,12 +234,12 @@ def _bent(
     if isinstance(phase.duration, float) and phase.duration < blend:
         problem = f"is shorter than the ways found, which take {blend:g} s"
         raise mistake("duration", phase.duration, problem, "end the phase later")
-    points = np.round(found.control, 9)
+    points = np.round(ways.control, 9)
     points[:3], points[-3:] = p, q  # to the last bit, so that nothing jumps
-    told = {"blend": blend, "alignment": "none", "control_points": points.tolist()}
+    keys = {"blend": blend, "alignment": "none", "control_points": points.tolist()}
     if phase.duration == AUTO:
-        told["duration"] = blend
-    return table | told
+        keys["duration"] = blend
+    return table | keys
 
 
 def _ends(
@@ -255,7 +255,7 @@ def _ends(
     p, q = (mission.slots_about_cm(name) for name in (before, phase.formation))
     if p is None or q is None:
         problem, remedy = "starts from no formation with slots", "take a formation before"
-        raise refused(mission, number, "transition", phase.transition, problem, remedy)
+        raise error_of_key(mission, number, "transition", phase.transition, problem, remedy)
     return p, q
 
 
@@ -285,7 +285,7 @@ def _stops(
                 f" {part} (limit {limit:g} m)"
             )
             remedy = "place slots farther apart as seen from above, or lower limits.separation"
-            raise refused(mission, number, "transition", phase.transition, problem, remedy)
+            raise error_of_key(mission, number, "transition", phase.transition, problem, remedy)
     return stops
 
 

@@ -54,7 +54,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     made = [kernel_vehicle(model, m) for model, m in zip(models, mission.true_mass, strict=True)]
     # A force is held over each step: twenty of them meet a smooth pulse to 1 %
     steps = max(1, math.ceil(1.0 / autopilot.rate / min(autopilot.step, max_step / 10.0) - 1e-9))
-    found = fleet.flight(
+    flight = fleet.flight(
         fleet.quadrotors(made, mission.gravity),
         start=0.0,
         h=1.0 / (autopilot.rate * steps),
@@ -66,7 +66,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         np.full((n, 3), mission.tracking.integral),
     )
     around = disturbance(mission)
-    air = found.air._replace(
+    air = flight.air._replace(
         wind=around.wind,
         gust_step=around.gust_step,
         gust=around.gust,
@@ -78,7 +78,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         radius=around.radius,
         roofs=around.roofs,
     )
-    return found._replace(air=air, guidance=guidance, sensing=_sensing(mission))
+    return flight._replace(air=air, guidance=guidance, sensing=_sensing(mission))
 
 
 def vehicle_lags(mission: Mission) -> list[Lag]:
@@ -107,15 +107,15 @@ def reserves(mission: Mission) -> Floats:
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
     acceleration.
     """
-    found = np.zeros(mission.n_agents)
+    times = np.zeros(mission.n_agents)
     c, tracking, lags = mission.constraint, mission.tracking, vehicle_lags(mission)
     law = LoopGains(c.alpha, c.beta, c.gamma, *mission.tracking_gains, tracking.integral)
     for i, model in enumerate(mission.vehicle_models or ()):
         if not model.point:
             left = _LEFT * max(model.linear_drag)
             drag = left if tracking.drag_feedforward else model.linear_drag[0]
-            found[i] = overshoot(lags[i], law, drag / model.mass)
-    return found
+            times[i] = overshoot(lags[i], law, drag / model.mass)
+    return times
 
 
 def air_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> Floats:
@@ -180,18 +180,18 @@ def _sensing(mission: Mission) -> fleet.Sensing:
     def ticks(seconds: float) -> int:
         return round(seconds * rate)
 
-    found = fleet.exact_sensing(n)
+    sensing = fleet.exact_sensing(n)
     if noise is not None:
-        found = found._replace(
+        sensing = sensing._replace(
             every=max(1, round(rate / noise.rate)), delay=np.full(n, ticks(noise.delay))
         )
     if links is not None:
-        found = found._replace(
+        sensing = sensing._replace(
             linked=True,
             link_every=max(1, round(rate / links.rate)),
             link_delay=np.full((n, n), ticks(links.delay)),
         )
-    return found
+    return sensing
 
 
 class TickTables:
@@ -210,7 +210,7 @@ class TickTables:
         self._source: Problem | None = None
         self._anchor = np.zeros((self.n, 6))
         #: Where the yaw "along" of a turn is known from, to continue from table to table: time [s], yaw (N,).
-        self._known: tuple[Turn, float, Floats] | None = None
+        self._known: tuple[YawTurn, float, Floats] | None = None
 
     def start_path(self, problem: Problem, tick: int) -> Floats:
         """Begin to measure states about another path; return what to add (N, 6) to states measured before.
@@ -228,20 +228,22 @@ class TickTables:
         if self._source is None:
             return self._anchor
         time = np.array([tick / self.rate])
-        found = slot_derivatives(self._source.reference, self._source.motion, time, 2)
-        return np.concatenate([found[0, 0], found[0, 1]], axis=1)
+        states = slot_derivatives(self._source.reference, self._source.motion, time, 2)
+        return np.concatenate([states[0, 0], states[0, 1]], axis=1)
 
-    def made(self, first: int, last: int, problem: Problem, turn: Turn) -> fleet.TickInputs:
+    def tables_for(
+        self, first: int, last: int, problem: Problem, turn: YawTurn
+    ) -> fleet.TickInputs:
         """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase."""
         sensing = self.flight.sensing
         time = np.arange(first, last) / self.rate
-        yaw, found = self._references(problem, time, turn)
-        jerk, snap = self._force_rates(found)
+        yaw, slots = self._references(problem, time, turn)
+        jerk, snap = self._force_rates(slots)
         path = np.zeros((0, self.n, 6))
         if self.compensated:
             path = np.tile(self._anchor, (len(time), 1, 1))
-            if len(found):
-                path = _by_tick(found[:2].reshape(6, self.n, -1))
+            if len(slots):
+                path = _by_tick(slots[:2].reshape(6, self.n, -1))
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         unheard = np.zeros((0, self.n, self.n), dtype=np.bool_)
@@ -249,25 +251,27 @@ class TickTables:
             rows = _rows(first, last, sensing.every)
             seed = self.noise.seed
             if self.noise.position or self.noise.velocity:
-                white = _drawn(_NOISE, seed, rows, (2, self.n, 3))
+                white = _random_rows(_NOISE, seed, rows, (2, self.n, 3))
                 noise_r = np.ascontiguousarray(self.noise.position * white[:, 0])
                 noise_v = np.ascontiguousarray(self.noise.velocity * white[:, 1])
             if self.noise.dropped:
-                dropped = _drawn(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
+                dropped = _random_rows(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
         if self.links is not None and self.links.dropped:
             rows = _rows(first, last, sensing.link_every)
-            unheard = _drawn(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
+            unheard = (
+                _random_rows(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
+            )
         return fleet.TickInputs(
             first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard
         )
 
-    def yaw_at(self, problem: Problem, t: float, turn: Turn) -> Floats:
+    def yaw_at(self, problem: Problem, t: float, turn: YawTurn) -> Floats:
         """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""
         if t <= turn.begun:
             return turn.start
         return self._references(problem, np.array([t]), turn)[0][0, :, 0]
 
-    def _references(self, problem: Problem, time: Floats, turn: Turn) -> tuple[Floats, Floats]:
+    def _references(self, problem: Problem, time: Floats, turn: YawTurn) -> tuple[Floats, Floats]:
         """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and derivatives (5, 3, N, K) of slots.
 
         A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
@@ -321,7 +325,7 @@ def first_yaw(mission: Mission) -> Floats:
     return np.full(mission.n_agents, 0.0 if frame is None else math.radians(frame.yaw_deg))
 
 
-class Turn(NamedTuple):
+class YawTurn(NamedTuple):
     """How vehicles turn from their yaw at a time into the one asked for."""
 
     begun: float  # [s]
@@ -329,25 +333,25 @@ class Turn(NamedTuple):
     off: Floats  # (N,) what it differs by from the one asked for [rad]
 
 
-def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> Turn:
+def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTurn:
     """The turn of vehicles with yaws ``start`` (N,) [rad] at a time [s] of a problem, at which its motion begins."""
     if problem.control.kind != TRACKING:
-        return Turn(t, start, np.zeros(len(start)))
+        return YawTurn(t, start, np.zeros(len(start)))
     return turn_along(problem.reference, problem.motion, t, yaw, start)
 
 
-def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> Turn:
+def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> YawTurn:
     """`turn_from` while slots are tracked."""
     if yaw.kind == "along":
-        return Turn(t, start, np.zeros(len(start)))
+        return YawTurn(t, start, np.zeros(len(start)))
     off = start - yaw_derivatives(reference, motion, np.array([t]), yaw)[0, 0]
     if yaw.kind != "formation":
         off = (off + np.pi) % (2.0 * np.pi) - np.pi
-    return Turn(t, start, off)
+    return YawTurn(t, start, off)
 
 
 def slots_and_yaw(
-    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: Turn
+    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
 ) -> tuple[Floats, Floats, tuple[float, Floats] | None]:
     """Series of the slots (5, 3, N, K), and the yaw with two derivatives (3, N, K) that is asked of the vehicles.
 
@@ -367,10 +371,10 @@ def slots_and_yaw(
 
 def _by_tick(x: Floats) -> Floats:
     """A table (K, N, Q) of values (Q, N, K)."""
-    found = np.empty(x.shape[::-1])
+    table = np.empty(x.shape[::-1])
     for q, values in enumerate(x):  # faster than a copy of the transposed array
-        found[..., q] = values.T
-    return found
+        table[..., q] = values.T
+    return table
 
 
 def _rows(first: int, last: int, every: int) -> Ints:
@@ -378,14 +382,14 @@ def _rows(first: int, last: int, every: int) -> Ints:
     return np.arange(-(-first // every), -(-last // every))
 
 
-def _drawn(kind: int, seed: int, rows: Ints, shape: tuple[int, ...]) -> Floats:
+def _random_rows(kind: int, seed: int, rows: Ints, shape: tuple[int, ...]) -> Floats:
     """Random numbers (K, *shape) of some rows: normal ones for noise, else uniform ones."""
     if not len(rows):
         return np.zeros((0, *shape))
     blocks = range(int(rows[0]) // _BLOCK, int(rows[-1]) // _BLOCK + 1)
-    found = np.concatenate([_block(kind, seed, block, shape) for block in blocks])
+    numbers = np.concatenate([_block(kind, seed, block, shape) for block in blocks])
     begin = int(rows[0]) - blocks[0] * _BLOCK
-    return found[begin : begin + len(rows)]
+    return numbers[begin : begin + len(rows)]
 
 
 @lru_cache(maxsize=8)

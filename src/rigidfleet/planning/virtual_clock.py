@@ -97,7 +97,7 @@ class VirtualClock:
         return high
 
 
-def chained(x: Floats, rate: Floats) -> Floats:
+def time_derivatives(x: Floats, rate: Floats) -> Floats:
     """Value and two derivatives over t (3, ..., K), of those over tau (3, ..., K), for s and its derivative (2, K)."""
     s, first = rate
     return np.stack([x[0], s * x[1], s * s * x[2] + first * x[1]])

@@ -23,7 +23,7 @@ from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import closest, pace
-from rigidfleet.planning.lattice import Lattice, Layer, Network, Space, Way, staying
+from rigidfleet.planning.lattice import FreeSpace, Lattice, Layer, Network, Way, staying
 from rigidfleet.planning.legs import Leg, at_start, latest_end
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
@@ -47,7 +47,7 @@ _SHORT, _FEW = 1.2, 6
 _KEPT = 2e-3
 
 
-def found(mission: Mission, timed: Timed) -> Mission:
+def find_ways(mission: Mission, timed: Timed) -> Mission:
     """Return the mission with each phase of kind "go" replaced by those of a way; itself if it has none.
 
     The result is an ordinary mission: it can be written, read and flown by itself.
@@ -62,10 +62,10 @@ def found(mission: Mission, timed: Timed) -> Mission:
         for number, before in enumerate(mission.phases[:k]):
             leg = timed(mission, before, now, number)
             if not leg.known:
-                raise refused(mission, k, "kind", "go", "begins where distances alone have led",
+                raise error_of_key(mission, k, "kind", "go", "begins where distances alone have led",
                               "give the formation a shape or slots")  # fmt: skip
             now = leg.after
-        mission = _Search(mission, k, phase, now, timed).expanded()
+        mission = _Search(mission, k, phase, now, timed).mission_with_way()
     return mission
 
 
@@ -77,11 +77,11 @@ class _Search:
     ) -> None:
         self.mission, self.number, self.phase, self.now, self.timed = mission, number, phase, now, timed  # fmt: skip
         if now.formation is None or now.slots is None:
-            raise refused(mission, number, "kind", "go", "needs a formation that flies there",
+            raise error_of_key(mission, number, "kind", "go", "needs a formation that flies there",
                           "add a phase of kind 'establish' before")  # fmt: skip
         speed = float(np.linalg.norm(now.v, axis=1).max())
         if speed > _REST:
-            raise refused(mission, number, "kind", "go", f"begins at {speed:.2g} m/s, but a way begins at rest",
+            raise error_of_key(mission, number, "kind", "go", f"begins at {speed:.2g} m/s, but a way begins at rest",
                           "end the phase before at rest")  # fmt: skip
         masses = mission.fleet.mass
         pose = now.goal
@@ -91,7 +91,7 @@ class _Search:
         roll, pitch, yaw = (float(round(x, 6)) for x in np.rad2deg(att.euler_from_dcm(T)))
         self.start = (roll, pitch, yaw)
         self.goal = self.start if phase.attitude_deg is None else phase.attitude_deg
-        self.shapes = list(layers.allowed(mission, phase, now.formation))
+        self.shapes = list(layers.candidate_shapes(mission, phase, now.formation))
         most = max(float(np.linalg.norm(s.slots, axis=1).max()) for s in self.shapes)
         self.reach = most + float(mission.fleet.radius.max())
         self.each = mission.n_agents <= _EACH
@@ -128,18 +128,18 @@ class _Search:
 
     # -- the search ------------------------------------------------------------------------------------
 
-    def expanded(self) -> Mission:
+    def mission_with_way(self) -> Mission:
         """The mission with the way's phases in place of this one."""
         need = self.phase.clearance + _KEPT
         for _ in range(_TRIES):
-            way = self._searched(need)
-            mission, lacking = self._tried(*way)
+            way = self._cheapest_way(need)
+            mission, lacking = self._try_way(*way)
             if lacking <= 0.0:
                 return mission
             need += lacking + _KEPT
-        raise self._unproved(lacking)
+        raise self._unproved_error(lacking)
 
-    def _searched(self, need: float) -> tuple[Network, Way]:
+    def _cheapest_way(self, need: float) -> tuple[Network, Way]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
         best: tuple[Network, Way] | None = None
         straight = float(np.linalg.norm(self.end - self.begin))
@@ -159,14 +159,14 @@ class _Search:
                 break
         if best is None:
             raise self._none(network)
-        return best[0], best[0].shortened(best[1])
+        return best[0], best[0].shorten(best[1])
 
-    def _network(self, shapes: list[layers.Shape], need: float, *, more: bool) -> Network:
+    def _network(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Network:
         frames = layers.frames(self._near())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
         box = box if fence is None else np.array([fence.min, fence.max]) + [[need], [-need]]
-        space = Space(self._near(), box)
+        space = FreeSpace(self._near(), box)
         roll, pitch, yaw_before = self.start
         yaws = {yaw_before + yaw for yaw in _YAWS} if more else set()
         for shape in shapes:
@@ -176,7 +176,7 @@ class _Search:
             if all(layers.angle_between(a, b) > 1e-6 for b in angles):
                 angles.append(a)
         turns = [att.dcm_from_euler(np.deg2rad(a)) for a in angles]
-        found = [
+        nodes = [
             Layer(s.name, a, s.slots @ T if self.each else np.zeros((1, 3)))
             for s in shapes
             for a, T in zip(angles, turns, strict=True)
@@ -198,9 +198,9 @@ class _Search:
             )
         changes = list(layers.changes(self.mission, shapes, angles))
         if not self.each:  # the one ball that covers all neither turns nor changes
-            stays = staying(found[0])
+            stays = staying(nodes[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
-        return Network(space, found, changes, self.radius, need, frames, common, self._known)
+        return Network(space, nodes, changes, self.radius, need, frames, common, self._known)
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
@@ -211,8 +211,8 @@ class _Search:
         for (a, i), (b, j) in pairwise(zip(way.places, way.layers, strict=True)):
             layer = network.layers[j]
             if i == j:
-                told = f"to ({', '.join(f'{x:.4g}' for x in b)})"
-                yield told, {"kind": "fly", "position": b.tolist()}, float(np.linalg.norm(b - a))
+                place = f"to ({', '.join(f'{x:.4g}' for x in b)})"
+                yield place, {"kind": "fly", "position": b.tolist()}, float(np.linalg.norm(b - a))
             elif layer.formation != network.layers[i].formation:
                 name = written.get(layer.formation, layer.formation)
                 way_of = changes[frozenset((i, j))]
@@ -240,9 +240,9 @@ class _Search:
         roots = np.sqrt([max(length, 1e-3) for *_, length in parts])
         lengths = (end - self.now.t) * roots / roots.sum() if phase.duration != AUTO else roots
         tables = []
-        for number, ((told, keys, _), length) in enumerate(zip(parts, lengths, strict=True), 1):
+        for number, ((name, keys, _), length) in enumerate(zip(parts, lengths, strict=True), 1):
             time = AUTO if phase.duration == AUTO else round(float(length), 3)
-            table = {"name": f"{phase.name} {number}: {told}", **keys, "duration": time}
+            table = {"name": f"{phase.name} {number}: {name}", **keys, "duration": time}
             if keys["kind"] == "reshape":
                 table["blend"] = time
             if self.mission.architecture == "body":
@@ -261,7 +261,7 @@ class _Search:
                 del last["duration"]
         return tables
 
-    def _tried(self, network: Network, way: Way) -> tuple[Mission, float]:
+    def _try_way(self, network: Network, way: Way) -> tuple[Mission, float]:
         """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
         mission, k = self.mission, self.number
         data, tables = mission.to_dict(), self._tables(network, way)
@@ -312,12 +312,12 @@ class _Search:
 
     def _unmet(self) -> MissionError:
         problem = f"ways are found round obstacles at rest, and on the one found {self._worst}"
-        return refused(self.mission, self.number, "position", self.phase.position, problem,
+        return error_of_key(self.mission, self.number, "position", self.phase.position, problem,
                        "wait before by kind 'hold', or fly elsewhere first")  # fmt: skip
 
-    def _unproved(self, lacking: float) -> MissionError:
+    def _unproved_error(self, lacking: float) -> MissionError:
         problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
-        return refused(self.mission, self.number, "clearance", self.phase.clearance, problem,
+        return error_of_key(self.mission, self.number, "clearance", self.phase.clearance, problem,
                        "give more time, or ask for less clearance")  # fmt: skip
 
     def _none(self, network: Network) -> MissionError:
@@ -331,7 +331,7 @@ class _Search:
                     f"its {what} leaves agent {agent + 1} {room.min():.2f} m of clearance from {thing}, which is less"
                     f" than {self.phase.clearance:g} m"
                 )
-                return refused(self.mission, self.number, "position", self.phase.position, problem,
+                return error_of_key(self.mission, self.number, "position", self.phase.position, problem,
                                "move it, or ask for less clearance")  # fmt: skip
         least, place, layer = network.widest((self.begin, 0), (self.end, self._last))
         x = network.layers[layer]
@@ -346,7 +346,9 @@ class _Search:
             or f"has {least:.2f} m of clearance from {thing}, {network.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
-        return refused(self.mission, self.number, "position", self.phase.position, problem, remedy)
+        return error_of_key(
+            self.mission, self.number, "position", self.phase.position, problem, remedy
+        )
 
     def _nearest(
         self, network: Network, place: Floats, layer: int, room: Floats
@@ -390,7 +392,7 @@ def _angles(angles: layers.Angles) -> dict[str, float]:
     return {k: x for k, x in zip(ANGLES, angles, strict=True) if x or k == "yaw_deg"}
 
 
-def refused(
+def error_of_key(
     mission: Mission, number: int, key: str, value: object, problem: str, remedy: str
 ) -> MissionError:
     """The error of a key of a phase, whose number counts from 0."""

@@ -70,7 +70,6 @@ def rotors(result: Result) -> Figure:
         _draw_greatest(above, result)
         st.draw_agents_legend(above, result.n_agents)
         _draw_nearest(below, result)
-    st.name_phases([above], result)
     return fig
 
 
@@ -98,8 +97,6 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
     """The four rotors of the vehicle that comes nearest to its limit, enlarged."""
-    from matplotlib.lines import Line2D
-
     limits, force = rotor_limits(result.mission), rotor_forces(result)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits
     i = int(np.nanargmax(peak))
@@ -115,7 +112,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
         st.draw_limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
     ax.set_ylabel(f"rotors of agent {i + 1} [N]")
     entries = [
-        Line2D([], [], color=colour, label=name)
+        st.legend_entry(name, color=colour)
         for name, colour in zip(LABELS["rotor"], colours, strict=True)
     ]
     st.draw_legend(ax, entries, "nearest to its limit")
@@ -137,7 +134,6 @@ def vehicles(result: Result) -> Figure:
         st.draw_agents_legend(above, result.n_agents)
     draw_off_slot(middle, result)
     _draw_saturation(below, result, saturated)
-    st.name_phases([above], result)
     return fig
 
 

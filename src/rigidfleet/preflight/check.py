@@ -14,7 +14,7 @@ from pathlib import Path
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import reserves, vehicle_lags
 from rigidfleet.preflight.assignment import assignment_remarks
 from rigidfleet.preflight.avoidance import braking_remarks
@@ -59,7 +59,7 @@ def check(
     MissionError
         The mission cannot be read or has errors.
     """
-    mission = timed(as_mission(mission))
+    mission = complete_times(as_mission(mission))
     search = mission.n_agents <= SEARCHED if search is None else search
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")

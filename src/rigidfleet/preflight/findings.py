@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rigidfleet._common.facts import Fact, Line, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, Shown, worst_values
 from rigidfleet._common.plain import plain
 from rigidfleet._common.text import agent_names
 from rigidfleet.math import proximity
@@ -311,9 +311,9 @@ class Preflight(Shown):
         verdict = "no problems found" if self.passed else "the flight will fail"
         parts = [
             self.mission.phase_table,
-            Table(heads, [*map(Row, self._rows())], heads, bare=True),
+            FactTable(heads, [*map(Row, self._rows())], heads, bare=True),
             worst_values("planned", self._worst()),
-            Table(heads, remarks, heads, bare=True),
+            FactTable(heads, remarks, heads, bare=True),
             Line(f"{name}: {verdict}", "ok" if self.passed else "fails"),
         ]
         return Sheet(name, f"valid: {self.mission.size_in_words}", parts)

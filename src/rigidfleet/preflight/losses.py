@@ -10,7 +10,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
-from rigidfleet.planning.reference import changed
+from rigidfleet.planning.reference import copy_with
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import (
@@ -57,7 +57,7 @@ def planned_way(mission: Mission, at: Leg) -> list[Leg]:
     """The planned legs after the first loss, which happens in the leg ``at``."""
     first = mission.first_loss
     lost = mission.lost_at <= first
-    return after_loss(mission, changed(at.state_at(first), lost=lost if lost.any() else None))
+    return after_loss(mission, copy_with(at.state_at(first), lost=lost if lost.any() else None))
 
 
 def _links(mission: Mission) -> Iterator[Remark]:

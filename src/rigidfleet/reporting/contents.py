@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet import plotting
-from rigidfleet._common.facts import Cell, Level, Row, Table, value
+from rigidfleet._common.facts import Cell, FactTable, Level, Row, value
 from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
@@ -112,7 +112,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "facts": _facts(result),
         "phases": mission.phase_table,
-        "checks": [part for part in verdict.facts().shown if isinstance(part, Table)],
+        "checks": [part for part in verdict.facts().shown if isinstance(part, FactTable)],
         "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
@@ -166,15 +166,15 @@ def _models(mission: Mission) -> str:
     return ": " * bool(count) + ", ".join(f"{n} × {name}" for name, n in count.items())
 
 
-def _gains_table(result: Result) -> Table | None:
+def _gains_table(result: Result) -> FactTable | None:
     """The gains in words; None of trajectories that others made, which have none."""
     if result.interpolation is not None:
         return None
     heads = ("gains", "value", "meaning")
-    return Table(heads, [*map(Row, gains.gain_lines(result.mission))], heads, bare=True)
+    return FactTable(heads, [*map(Row, gains.gain_lines(result.mission))], heads, bare=True)
 
 
-def _vehicles_table(result: Result) -> Table:
+def _vehicles_table(result: Result) -> FactTable:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
 
@@ -213,7 +213,7 @@ def _vehicles_table(result: Result) -> Table:
         Row((Cell(str(i + 1), colour=colours[i]), *(column[i] for column in columns.values())))
         for i in shown.tolist()
     ]
-    return Table(("agent", *columns), rows)
+    return FactTable(("agent", *columns), rows)
 
 
 def _versions(result: Result) -> list[tuple[str, str]]:
@@ -236,7 +236,7 @@ def _versions(result: Result) -> list[tuple[str, str]]:
 
 def _safety_table(
     flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
-) -> Table:
+) -> FactTable:
     """A row for each quantity of any flight; beside the quantity, what is known of one flight, or a cell for each."""
     columns = [
         {row.quantity: row for row in safety(*each)} for each in zip(flights, verdicts, strict=True)
@@ -248,12 +248,12 @@ def _safety_table(
             for row in columns[0].values()
         ]
         heads = ("quantity", "limit", "worst", "margin", "when", "who")
-        return Table(heads, rows, ("margin", "when", "who"))
+        return FactTable(heads, rows, ("margin", "when", "who"))
     rows = [
         Row((cell, *(_safety_cell(name, column.get(name)) for column in columns)))
         for name, cell in names.items()
     ]
-    return Table(("quantity", *labels), rows, labels)
+    return FactTable(("quantity", *labels), rows, labels)
 
 
 def _level(row: Safety) -> Level:
@@ -290,7 +290,7 @@ def _safety_cell(name: str, row: Safety | None) -> Cell:
 
 def _numbers_table(
     flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
-) -> Table:
+) -> FactTable:
     """Numbers of the flights side by side, with how much they differ from those of the first."""
     measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
@@ -306,7 +306,7 @@ def _numbers_table(
             continue
         cells = [Cell("–" if x is None else value(x), _change(values[0], x)) for x in values]
         rows.append(Row((f"{name} [{unit}]" if unit else name, *cells)))
-    return Table(("quantity", *labels), rows)
+    return FactTable(("quantity", *labels), rows)
 
 
 def _worst_of(name: str, _: Result, verdict: Verdict) -> float | None:
@@ -340,7 +340,7 @@ def _change(first: float | None, x: float | None) -> str:
     return f"{percent:+.0f} %".replace("-", "−") if abs(percent) >= 0.5 else ""
 
 
-def _keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> Table:
+def _keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> FactTable:
     """Keys of the mission files that differ between missions."""
     flat = [dict(_flat_keys(mission.to_dict())) for mission in missions]
     rows = []
@@ -351,7 +351,7 @@ def _keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> Table:
     if len(rows) > _KEYS:
         more = Row((f"and {len(rows) - _KEYS} more keys", *["…"] * len(missions)))
         rows = [*rows[:_KEYS], more]
-    return Table(("key", *labels), rows, labels)
+    return FactTable(("key", *labels), rows, labels)
 
 
 def _flat_keys(data: Any, key: str = "") -> Iterator[tuple[str, str]]:

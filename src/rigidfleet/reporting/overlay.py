@@ -110,10 +110,8 @@ def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:
 
 
 def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
-    from matplotlib.lines import Line2D
-
     handles = [
-        Line2D([], [], label=st.clean_name(label), **look)
+        st.legend_entry(st.clean_name(label), **look)
         for label, look in zip(labels, _looks(flights), strict=True)
     ]
     fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))

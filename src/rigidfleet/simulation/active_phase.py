@@ -17,18 +17,24 @@ from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.vehicles import Turn
+from rigidfleet.planning.vehicles import YawTurn
 from rigidfleet.simulation.callbacks import (
     Command,
     Controller,
     ExternalForce,
     Observation,
-    called,
+    call_user,
     checked_force,
 )
 from rigidfleet.simulation.diagnosis import Place
 from rigidfleet.simulation.extremes import Extremes
-from rigidfleet.simulation.recording import LayerSamples, Led, Piece, Unevaluated, VehicleSamples
+from rigidfleet.simulation.recording import (
+    FollowedReferences,
+    LayerSamples,
+    Piece,
+    Unevaluated,
+    VehicleSamples,
+)
 from rigidfleet.simulation.solver_setup import equip
 from rigidfleet.typing import Bools, Floats
 
@@ -66,7 +72,7 @@ class Stepper:
         raise NotImplementedError
 
     @property
-    def turn_about_vertical(self) -> Turn | None:
+    def turn_about_vertical(self) -> YawTurn | None:
         """How vehicles turn about the vertical, if they do."""
         return None
 
@@ -77,14 +83,14 @@ class Stepper:
     def steer(self, problem: Problem) -> None:
         """Take up a problem that was made by hand."""
 
-    def observed(self, observation: Observation) -> Observation:
+    def seen_by_controller(self, observation: Observation) -> Observation:
         """What a controller sees, from the states of the integrator."""
         return observation
 
     def drop_command(self) -> None:
         """Drop the last command of vehicles."""
 
-    def commanded(self, command: Command) -> Problem:
+    def problem_under(self, command: Command) -> Problem:
         """The problem under a command of vehicles.
 
         Raises
@@ -169,7 +175,7 @@ class ActivePhase:
         return Place(self.plan, self.t, self.state, self.workspace, self.solver)
 
     @property
-    def settled(self) -> bool | None:
+    def has_settled(self) -> bool | None:
         """Whether the phase has settled; None if it does not end by settling."""
         settle = self.plan.phase.settle
         return None if settle is None else self.t - self.quiet_since >= settle.dwell - 1e-9
@@ -209,10 +215,10 @@ class ActivePhase:
     def _under(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""
         self.stepper.drop_command()
-        asked = called("the controller", self.t, controller, self.observe())
-        if isinstance(asked, Command):
-            return self.stepper.commanded(asked)
-        force = checked_force(asked, len(self.lost), "the controller", self.t)
+        answer = call_user("the controller", self.t, controller, self.observe())
+        if isinstance(answer, Command):
+            return self.stepper.problem_under(answer)
+        force = checked_force(answer, len(self.lost), "the controller", self.t)
         control = self.plan.problem.control._replace(kind=OPEN, force=force)
         return self.plan.problem._replace(control=control)
 
@@ -222,7 +228,7 @@ class ActivePhase:
         """Integrate until the phase has settled, or to ``t_end`` [s]; check at multiples of ``step`` [s]."""
         step *= max(1.0, round(_CHECK / step))  # segments end at samples
         least = self.plan.start + self.plan.problem.reference.T_b
-        while self.t < t_end and not self.settled:
+        while self.t < t_end and not self.has_settled:
             t = (math.floor(self.t / step + 1e-9) + 1) * step
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
@@ -255,7 +261,7 @@ class ActivePhase:
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
         tracked = self.plan.problem.control.kind == TRACKING  # elsewhere, there are no slots
         r_ref, v_ref, a_ref = (np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref))
-        return self.stepper.observed(
+        return self.stepper.seen_by_controller(
             Observation(
                 self.t, self.plan.phase.name, r.copy(), v.copy(), r_ref, v_ref, a_ref, self.plan.masses.copy(),
                 vehicles.g,
@@ -273,7 +279,7 @@ class ActivePhase:
         if not (self.state.count[records.EVALUATIONS] or self.t > self.plan.start):
             return self.plan.before
         self.evaluate()
-        return self.plan.reached(self.t, self.state.y, self.workspace)
+        return self.plan.state_at_end(self.t, self.state.y, self.workspace)
 
     def check(self) -> None:
         """Raise errors of the multipliers' solver, or of the monitor's solver."""
@@ -373,7 +379,7 @@ class ActivePhase:
     def keep(
         self,
         times: Floats,
-        given: Record | Unevaluated,
+        source: Record | Unevaluated,
         integral: Floats,
         frame: Floats,
         vehicles: VehicleSamples | None = None,
@@ -381,12 +387,23 @@ class ActivePhase:
     ) -> None:
         """Store a piece of the phase."""
         edges, attached = self.plan.edges, self.plan.attached
-        led = self._led(times)
+        references = self._references(times)
         self.pieces.append(
-            Piece(self.index, times, given, integral, frame, edges, attached, led, vehicles, layers)
+            Piece(
+                self.index,
+                times,
+                source,
+                integral,
+                frame,
+                edges,
+                attached,
+                references,
+                vehicles,
+                layers,
+            )
         )
 
-    def _led(self, times: Floats) -> Led:
+    def _references(self, times: Floats) -> FollowedReferences:
         """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""
         plan = self.plan
         if plan.problem.control.kind != TRACKING or not len(times):

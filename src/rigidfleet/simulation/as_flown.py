@@ -12,12 +12,12 @@ from rigidfleet.mission.findings import suggest
 from rigidfleet.mission.kinds import AnyPhase
 from rigidfleet.mission.losses import ON_LOSS
 from rigidfleet.planning.timing import timed_leg
-from rigidfleet.planning.transitions import expanded
+from rigidfleet.planning.transitions import expand_phases
 from rigidfleet.result import PhaseRecord
 
 
 def as_flown(
-    mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], step: float
+    mission: Mission, begun: Sequence[Phase], flown: Sequence[PhaseRecord], step: float
 ) -> tuple[Mission, list[PhaseRecord]]:
     """The mission with the phases ``flown`` by hand, and their records under its names.
 
@@ -29,7 +29,7 @@ def as_flown(
     asked : each phase as it was begun
     step : between samples [s]
     """
-    records = _told_apart(flown)
+    records = _with_unique_names(flown)
     data = mission.to_dict()
     data.pop("source", None)  # it no longer reproduces a figure
     data["name"] = f"{mission.name.removesuffix('-live')}-live"
@@ -37,10 +37,10 @@ def as_flown(
     own = data.get("obstacles", [])
     pushed = mission.obstacles[len(own) :]  # in flight, by hand
     if pushed:
-        told = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
-        data["obstacles"] = [*own, *told]
+        tables = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
+        data["obstacles"] = [*own, *tables]
     as_given = dict(data)
-    data |= _flown_data(mission, data, asked, records, step)
+    data |= _data_as_flown(mission, data, begun, records, step)
     try:
         return mission.rewritten(data, "<dict>"), records
     except MissionError:
@@ -48,7 +48,7 @@ def as_flown(
 
 
 def with_phase(
-    mission: Mission, asked: Sequence[Phase], flown: Sequence[PhaseRecord], table: Mapping[str, Any]
+    mission: Mission, begun: Sequence[Phase], flown: Sequence[PhaseRecord], table: Mapping[str, Any]
 ) -> Phase:
     """The phase given as a table of a mission file, checked after the phases flown so far.
 
@@ -61,13 +61,13 @@ def with_phase(
     if flown:
         # Names may repeat: those of phases before are not the new one's business.
         before = [replace(record, name=f"before {k}") for k, record in enumerate(flown, start=1)]
-        data |= _flown_data(mission, data, asked, before, mission.output_step)
+        data |= _data_as_flown(mission, data, begun, before, mission.output_step)
     else:
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
     made = Mission.from_dict(data, "begin()")
     if not made.phases[-1].spelled:
-        spread = expanded(made, timed_leg)
+        spread = expand_phases(made, timed_leg)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
     _check_flown(made.phases[-1])
@@ -119,7 +119,7 @@ def check_formation(mission: Mission, phase: Phase) -> None:
         raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
 
 
-def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
+def _with_unique_names(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
     """Records of phases with unique names."""
     taken = {record.name for record in flown}
     seen: set[str] = set()
@@ -136,10 +136,10 @@ def _told_apart(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
     return records
 
 
-def _flown_data(
+def _data_as_flown(
     mission: Mission,
-    given: Mapping[str, Any],
-    asked: Sequence[Phase],
+    own: Mapping[str, Any],
+    begun: Sequence[Phase],
     records: Sequence[PhaseRecord],
     step: float,
 ) -> dict[str, Any]:
@@ -150,31 +150,31 @@ def _flown_data(
     if mission.assignment != "given":
         # The assignment of agents to slots followed from phases that were not flown.
         data["assignment"] = "given"
-        data["formations"] = {name: _written_out(mission, name) for name in mission.formations}
-    data["phases"] = [_written(*each) for each in zip(asked, records, strict=True)]
-    if disturbed := given.get("disturbances"):
+        data["formations"] = {name: _formation_table(mission, name) for name in mission.formations}
+    data["phases"] = [_phase_table(*each) for each in zip(begun, records, strict=True)]
+    if disturbed := own.get("disturbances"):
         # What followed from a loss is among the phases
-        told = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
-        for table in (told, told.get("links", {})):
+        kept = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
+        for table in (kept, kept.get("links", {})):
             if "lost" in table:
                 table["lost"] = [lost for lost in table["lost"] if lost["time"] < end]
-        data["disturbances"] = told
+        data["disturbances"] = kept
     return data
 
 
-def _written(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
+def _phase_table(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
     """A phase as a mission file holds it, from its start to its actual end."""
-    given = phase.model_dump(mode="json", exclude_unset=True)
+    keys = phase.model_dump(mode="json", exclude_unset=True)
     for key in ("duration", "settle"):
-        given.pop(key, None)
-    told: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
-    told = given | told | {"control": record.control}
-    return told | phase.ended(record.t_end - record.t_start)
+        keys.pop(key, None)
+    table: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
+    table = keys | table | {"control": record.control}
+    return table | phase.ended(record.t_end - record.t_start)
 
 
-def _written_out(mission: Mission, name: str) -> dict[str, Any]:
+def _formation_table(mission: Mission, name: str) -> dict[str, Any]:
     """A formation with its slots and edges in the order of the agents."""
     edges = (mission.formation_edges(name) + 1).tolist()
     kept = {"distances", "dimension", "tolerance", "tolerance_share"}
-    given = mission.formations[name].model_dump(include=kept, exclude_defaults=True)
-    return {"slots": mission.formation_slots(name), "edges": edges} | given
+    rest = mission.formations[name].model_dump(include=kept, exclude_defaults=True)
+    return {"slots": mission.formation_slots(name), "edges": edges} | rest

@@ -87,7 +87,7 @@ Command = AttitudeCommand | RotorCommand
 Controller = Callable[[Observation], "ArrayLike | Command"]
 
 
-def called(who: str, t: float, function: Callable[..., Any], *arguments: object) -> Any:
+def call_user(who: str, t: float, function: Callable[..., Any], *arguments: object) -> Any:
     """What a user's function returns; its exceptions are told as those of a flight."""
     try:
         return function(*arguments)
@@ -96,32 +96,32 @@ def called(who: str, t: float, function: Callable[..., Any], *arguments: object)
         raise FlightError(words) from error
 
 
-def named(given: Command) -> str:
+def article_and_kind(command: Command) -> str:
     """What a controller returned, with its article."""
-    return f"{'an' if isinstance(given, AttitudeCommand) else 'a'} {type(given).__name__}"
+    return f"{'an' if isinstance(command, AttitudeCommand) else 'a'} {type(command).__name__}"
 
 
-def checked_command(given: Command, n: int, t: float) -> dict[str, Floats]:
+def checked_command(command: Command, n: int, t: float) -> dict[str, Floats]:
     """Arrays of a command, by their names; an error says which one is wrong."""
     rows = {"thrust": (n,), "attitude": (n, 4), "rates": (n, 3), "speed": (n, 4)}
-    found = {}
-    for name, value in vars(given).items():
+    arrays = {}
+    for name, value in vars(command).items():
         try:
             array = np.array(np.zeros(rows[name]) if value is None else value, dtype=np.float64)
         except (TypeError, ValueError):
             array = np.full((), np.nan)
         if array.shape != rows[name] or not np.isfinite(array).all():
             raise FlightError(
-                f"the controller returned {named(given)} at t = {t:.3f} s whose {name} is not an array"
+                f"the controller returned {article_and_kind(command)} at t = {t:.3f} s whose {name} is not an array"
                 f" {rows[name]} of finite numbers"
             )
-        found[name] = np.ascontiguousarray(array)
-    if "attitude" in found:
-        size = np.linalg.norm(found["attitude"], axis=1, keepdims=True)
+        arrays[name] = np.ascontiguousarray(array)
+    if "attitude" in arrays:
+        size = np.linalg.norm(arrays["attitude"], axis=1, keepdims=True)
         if not (size > 0.0).all():
             raise FlightError(f"the controller returned an attitude of norm zero at t = {t:.3f} s")
-        found["attitude"] = found["attitude"] / size
-    return found
+        arrays["attitude"] = arrays["attitude"] / size
+    return arrays
 
 
 def checked_force(f: ArrayLike, n: int, who: str, t: float) -> Floats:
@@ -172,8 +172,8 @@ class ExternalForce:
             x = places(r).copy(), places(v).copy()
             try:
                 if self.error is None:
-                    found = called("the force", t, force, t, *x)
-                    places(f)[:] = checked_force(found, n, "the force", t)
+                    answer = call_user("the force", t, force, t, *x)
+                    places(f)[:] = checked_force(answer, n, "the force", t)
                     return
             except BaseException as error:
                 self.error = error

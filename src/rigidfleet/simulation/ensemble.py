@@ -22,7 +22,7 @@ from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.solvers import choose
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -83,7 +83,7 @@ def establish(
     TypeError
         ``mission`` is no mission.
     """
-    mission = timed(as_mission(mission))
+    mission = complete_times(as_mission(mission))
     r = _starts("position", position, mission.n_agents)
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:
@@ -162,16 +162,16 @@ class _Flights:
         before = now.reference.of(plan.edges, _lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
-        places, given = _places(self.finished), self.mission.integrator
-        velocity = tolerance_of_velocity(given, now.r, problem.vehicles.m, law.beta, large=False)
+        places, options = _places(self.finished), self.mission.integrator
+        velocity = tolerance_of_velocity(options, now.r, problem.vehicles.m, law.beta, large=False)
         shared = batch.fits(problem) if vectors is None else vectors
         ends = batch.fly_all(
             problem,
             y[places],
             before[places],
             (now.t, plan.t_end),
-            rtol=given.rtol,
-            atol=absolute_tolerances(given, y.shape[1], velocity, plan.distances, large=False),
+            rtol=options.rtol,
+            atol=absolute_tolerances(options, y.shape[1], velocity, plan.distances, large=False),
             max_steps=most_steps(plan.t_end - now.t),
             vectors=shared,
             threads=threads,
@@ -182,7 +182,7 @@ class _Flights:
         self.finished &= ends.finished
         self.r, self.v = (x.reshape(count, n, 3) for x in np.split(y[:, : 6 * n], 2, axis=1))
         self.integral |= dict(zip(edges, y[:, 6 * n :].T, strict=True))
-        known = now.reference.updated(plan.edges, plan.distances)
+        known = now.reference.with_values(plan.edges, plan.distances)
         self.now = replace(
             now, t=plan.t_end, reference=known, formation=plan.formation, slots=plan.slots
         )
@@ -218,9 +218,9 @@ def _places(finished: Bools) -> Ints:
     return places
 
 
-def max_edge_error(r: Floats, edges: NDArray[np.integer], asked: Floats) -> Floats:
+def max_edge_error(r: Floats, edges: NDArray[np.integer], distances: Floats) -> Floats:
     """Greatest error (B,) [m] of edges (m, 2) against the lengths ``asked`` (m,) [m], at positions (B, N, 3)."""
-    return np.abs(_lengths(r, edges) - asked).max(axis=1, initial=0.0)
+    return np.abs(_lengths(r, edges) - distances).max(axis=1, initial=0.0)
 
 
 def _lengths(r: Floats, edges: NDArray[np.integer]) -> Floats:

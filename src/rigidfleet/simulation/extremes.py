@@ -149,8 +149,8 @@ class CurveWatch:
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
-        found = [x for x in (self._extremum(records.FLYING), self._landing()) if x is not None]
-        deepest = min(found, key=lambda x: x.value, default=None)
+        contacts = [x for x in (self._extremum(records.FLYING), self._landing()) if x is not None]
+        deepest = min(contacts, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
     def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
@@ -182,8 +182,8 @@ class CurveWatch:
                 half = len(steps) // 2
                 part = slice(half) if deepest(steps[:half], points[:half]) else slice(half, None)
                 steps, points = steps[part], points[part]
-            if (found := deepest(steps, points)) is not None:
-                self.touched[name] = found
+            if (contact := deepest(steps, points)) is not None:
+                self.touched[name] = contact
 
     def _deepest(
         self, kind: int, problem: Problem, work: Workspace, state: Any, *steps: Floats
@@ -198,10 +198,10 @@ class CurveWatch:
         arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
         self._take_solids(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
-        found = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
+        contact = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
         for array, own in zip(arrays, before, strict=True):
             array[...] = own
-        return found
+        return contact
 
     def _take_solids(
         self, problem: Problem, state: records.IntegratorState, first: int, end: int
@@ -217,29 +217,29 @@ class CurveWatch:
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
         none = self.none.tolist()
         new = tuple.__new__  # an extremum by its own name takes twice as long
-        found = {
+        extremes = {
             name: new(Extremum, (sign * worst[k], when[k], *who[k]))
             for name, k, sign in _STORED
             if -math.inf < worst[k] < none[k]
         }
-        if (tension := found.get("tension")) is not None and self.sign[0] < 0.0:
-            found["tension"] = tension._replace(value=-tension.value)
-        return found
+        if (tension := extremes.get("tension")) is not None and self.sign[0] < 0.0:
+            extremes["tension"] = tension._replace(value=-tension.value)
+        return extremes
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
-        found = self.so_far()
+        extremes = self.so_far()
         self.worst[_OF_PHASE] = self.none[_OF_PHASE]
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
-        return found
+        return extremes
 
     def flight(self, phases: Sequence[PhaseRecord]) -> None:
         """Give the phases of a finished flight its first contacts, and its clearances in flight and on an obstacle."""
-        found: dict[str, Extremum | None] = dict(self.touched)
+        extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):
-            found |= {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
-            found["clearance_end"] = self._landing()
-        for name, x in found.items():
+            extremes |= {name: self._extremum(k) for name, k in _OF_FLIGHT.items()}
+            extremes["clearance_end"] = self._landing()
+        for name, x in extremes.items():
             if x is not None:
                 last = [p for p in phases if p.t_start <= x.time] or phases
                 last[-1].extremes[name] = x
@@ -363,8 +363,10 @@ class Extremes(CurveWatch):
         """Continue among these obstacles; the first of them are those before."""
         self._take_obstacles(obstacles)
         if self.size is not None:
-            found = self.monitor.monitor
-            self.monitor = native.Watch(found._replace(boxes=self.boxes, count=found.count.copy()))
+            arrays = self.monitor.monitor
+            self.monitor = native.Watch(
+                arrays._replace(boxes=self.boxes, count=arrays.count.copy())
+            )
 
     def begin(
         self,
@@ -516,29 +518,29 @@ class Extremes(CurveWatch):
             i = int(values.argmax())
             self.of_vehicles[name] = Extremum(float(values[i]), float(times[i]), i, -1)
 
-    def _avoided(self) -> dict[str, Extremum]:
+    def _of_avoidance(self) -> dict[str, Extremum]:
         """What avoidance in flight has recorded of the phase so far, by name."""
-        given, found = self.avoidance, dict[str, Extremum]()
-        if given is None:
-            return found
-        ticks = max(int(given.count[avoidance.TICKS]), 1)
+        arrays, extremes = self.avoidance, dict[str, Extremum]()
+        if arrays is None:
+            return extremes
+        ticks = max(int(arrays.count[avoidance.TICKS]), 1)
         for name, kind in (("barrier", avoidance.BARRIER), ("guard", avoidance.GUARD)):
-            acted = given.acted[kind]
+            acted = arrays.acted[kind]
             i = int(acted.argmax())
             if acted[i]:
-                first = float(given.first[kind].min())
-                found[name] = Extremum(int(acted[i]) / ticks, first, i, -1)
+                first = float(arrays.first[kind].min())
+                extremes[name] = Extremum(int(acted[i]) / ticks, first, i, -1)
         for name, kind in (
             ("guarantee", avoidance.PAIR),
             ("clearance_guarantee", avoidance.OBSTACLE),
         ):
-            (value, t), who = given.margin[kind].tolist(), given.between[kind].tolist()
+            (value, t), who = arrays.margin[kind].tolist(), arrays.between[kind].tolist()
             if math.isfinite(value):
-                found[name] = Extremum(value, t, *who)
-            (t, value), who = given.lost[kind].tolist(), given.loser[kind].tolist()
+                extremes[name] = Extremum(value, t, *who)
+            (t, value), who = arrays.lost[kind].tolist(), arrays.loser[kind].tolist()
             if math.isfinite(t):
-                found[f"{name}_lost"] = Extremum(value, t, *who)
-        return found
+                extremes[f"{name}_lost"] = Extremum(value, t, *who)
+        return extremes
 
     def _take_first(self, kind: int, values: Floats, times: Floats, who: Ints) -> None:
         """Take the least of the agents' values into account; of equal ones, the first in time."""
@@ -548,13 +550,13 @@ class Extremes(CurveWatch):
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
-        return super().so_far() | self.of_vehicles | self._avoided() | self.led
+        return super().so_far() | self.of_vehicles | self._of_avoidance() | self.led
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
-        found = super().phase()
+        extremes = super().phase()
         self.of_vehicles, self.avoidance, self.led = {}, None, {}
-        return found
+        return extremes
 
 
 def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:

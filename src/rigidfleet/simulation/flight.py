@@ -22,7 +22,7 @@ from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import PhaseState, Pose, changed
+from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
@@ -37,9 +37,9 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.point_phase import PointPhase
-from rigidfleet.simulation.preparation import prepared
+from rigidfleet.simulation.preparation import preparation_of
 from rigidfleet.simulation.recording import Piece, assemble
-from rigidfleet.simulation.sampled_phase import SampledPhase, Vehicles
+from rigidfleet.simulation.sampled_phase import FleetState, SampledPhase
 from rigidfleet.simulation.sampling import Sampling, times_asked
 from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
@@ -208,7 +208,7 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        preparation = prepared(as_mission(mission))
+        preparation = preparation_of(as_mission(mission))
         self.mission = mission = preparation.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
@@ -229,8 +229,10 @@ class Flight:
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
         r, v = mission.fleet.position.copy(), mission.fleet.velocity.copy()
-        self._reached = changed(at_start(mission), r=r, v=v)
-        self._vehicles = Vehicles(mission, self._push.max_step) if mission.vehicle_models else None
+        self._reached = copy_with(at_start(mission), r=r, v=v)
+        self._vehicles = (
+            FleetState(mission, self._push.max_step) if mission.vehicle_models else None
+        )
         # Vehicles meet their disturbances in their own equations of motion.
         self._disturbance = preparation.disturbance if self._vehicles is None else None
         self._extremes = Extremes(mission)
@@ -348,8 +350,8 @@ class Flight:
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
             )  # fmt: skip
         except MissionError as error:
-            # Only times that nothing keeps are found in flight; other errors are those of the mission.
-            if by_hand or not phase.automatic:
+            # Only where a flight leaves it open can a phase of the mission be impossible: the rest are errors.
+            if by_hand or not (phase.automatic or phase.follows_curves):
                 raise
             self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
             return False
@@ -410,8 +412,8 @@ class Flight:
         active = self.under_way()
         plan, settle, loss = active.plan, active.plan.phase.settle, self._loss_ahead()
         self.phases[-1].t_end = active.t
-        if active.settled or active.over:
-            settled = active.settled
+        if active.has_settled or active.over:
+            settled = active.has_settled
             self._leave()
             if settle is not None and not settled:
                 self.ending = (
@@ -484,10 +486,10 @@ class Flight:
         self.ending = ending or self.ending
         if not self.pieces:
             raise FlightError(self.ending or "the flight ended before the first time to record")
-        given = tuple(self._route)
+        route = tuple(self._route)
         last = len(self._asked) - 1
-        own = tuple(self._asked) == given[: last + 1] and self._cut <= {last}
-        whole = own and last + 1 == len(given) and not self._cut
+        own = tuple(self._asked) == route[: last + 1] and self._cut <= {last}
+        whole = own and last + 1 == len(route) and not self._cut
         if own and not whole and not self.ending:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
         self._finished = True
@@ -580,8 +582,8 @@ class Flight:
 
         Phases begun by hand go on: who began them decides.
         """
-        given = self._given(self._asked[-1])
-        return self.mission.first_loss if given and not self._reacted else math.inf
+        routed = self._given(self._asked[-1])
+        return self.mission.first_loss if routed and not self._reacted else math.inf
 
     def _given(self, phase: Phase) -> bool:
         """Whether the route gives a phase that has begun last, or is about to."""
@@ -612,7 +614,7 @@ class Flight:
             self._following -= self._given(self._asked[-1])
             del self.phases[-1], self._asked[-1]
             return
-        if not (active.settled or active.over or abandoned):
+        if not (active.has_settled or active.over or abandoned):
             self._cut.add(len(self.phases) - 1)
         active.watch(last=True)
         record = self.phases[-1]
@@ -621,7 +623,7 @@ class Flight:
         record.controller = None if self.controller is None else active.asked > 0
         if active.stepper.delay > 0.0:
             record.target = active.plan.target
-        record.settled = None if abandoned else active.settled
+        record.settled = None if abandoned else active.has_settled
         active.count()
         self._count += active.counted
         for method, counts in active.solves:
@@ -636,7 +638,7 @@ class Flight:
             record.target = {"time": came[-1]["time"], "through": came} if came else None
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
-        if not abandoned and (active.settled or active.over or active.t >= active.plan.arrival):
+        if not abandoned and (active.has_settled or active.over or active.t >= active.plan.arrival):
             record.stay = active.plan.stay(active.t)
 
     def _check_frame(self, plan: PhasePlan) -> None:

@@ -19,15 +19,15 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Avoidance as Settings
 from rigidfleet.planning.body_layer import (
     NEAR,
-    Deviation,
+    Detour,
     greatest_acceleration,
+    nearest_accelerations,
     rigid_rows,
     scale_rows,
-    steered,
 )
 from rigidfleet.planning.derivatives import body_series, slot_derivatives, slot_series
 from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, chained
+from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, time_derivatives
 from rigidfleet.result import Extremum
 from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
 from rigidfleet.typing import Floats, Ints
@@ -56,11 +56,11 @@ _BESIDE = 1e-9
 
 def layers(mission: Mission) -> Settings | None:
     """The settings of [avoidance], if its clock or its body layer can act: obstacles move, and no vehicle is lost."""
-    given, d = mission.avoidance, mission.disturbances
-    if given is None or not (given.clock or given.body):
+    settings, d = mission.avoidance, mission.disturbances
+    if settings is None or not (settings.clock or settings.body):
         return None
     lost = d is not None and bool(d.lost)
-    return None if lost or not any(o.solid.moves for o in mission.obstacles) else given
+    return None if lost or not any(o.solid.moves for o in mission.obstacles) else settings
 
 
 class Led(NamedTuple):
@@ -68,7 +68,7 @@ class Led(NamedTuple):
 
     begun: float
     clock: VirtualClock
-    deviation: Deviation
+    deviation: Detour
 
 
 def _polynomials(times: Floats, ends: Floats) -> Floats:
@@ -93,10 +93,10 @@ class Leader:
     settings: Settings
     plan: PhasePlan
     period: float
-    deviation: Deviation = field(default_factory=Deviation)
+    deviation: Detour = field(default_factory=Detour)
     clock: VirtualClock = field(default_factory=VirtualClock)
     waited: float | None = None
-    steered: float | None = None
+    nearest_accelerations: float | None = None
     steering: float = 0.0
     who: int = 0
 
@@ -120,8 +120,8 @@ class Leader:
         h = end - t
         acts = self._acts(t + h)
         self.clock.lead(*(self._choose(t, a) if acts and self.settings.clock else (1.0, np.inf)))
-        asked = self._steer(t, a) if acts and self.settings.body else self.deviation.decay()
-        if self.clock.runs and self.deviation.none and not asked.any():
+        accelerations = self._steer(t, a) if acts and self.settings.body else self.deviation.decay()
+        if self.clock.runs and self.deviation.none and not accelerations.any():
             self.now = None
             if not self.leads:
                 return None
@@ -129,12 +129,12 @@ class Leader:
             return self._late(self.problem)
         self.leads = True
         self.now = Led(t, copy.copy(self.clock), self.deviation)
-        problem = self._piece(t, h, asked)
+        problem = self._piece(t, h, accelerations)
         lost = self.clock.advance(h)
         if lost > 0.0:
             self.waited = t if self.waited is None else self.waited
             self._put_off(end, lost)
-        self.deviation = self.deviation.at(h, asked, h)
+        self.deviation = self.deviation.at(h, accelerations, h)
         self.deviation.end(still=self.calm)
         if not self.deviation.none:
             self.steering += h
@@ -156,13 +156,13 @@ class Leader:
 
     def extremes(self, t: float) -> dict[str, Extremum]:
         """What the layers did by t [s]: delay [s], and share of the time in which the body deviated."""
-        found = {}
+        extremes = {}
         if self.waited is not None:
-            found["clock"] = Extremum(self.clock.delay, self.waited, self.who, -1)
+            extremes["clock"] = Extremum(self.clock.delay, self.waited, self.who, -1)
         if self.steered is not None:
             share = self.steering / max(t - self.plan.start, self.steering)
-            found["body"] = Extremum(share, self.steered, self.who, -1)
-        return found
+            extremes["body"] = Extremum(share, self.steered, self.who, -1)
+        return extremes
 
     # -- the clock ----------------------------------------------------------------------------------------
 
@@ -212,10 +212,10 @@ class Leader:
         for o in seen:
             x, bound = a.sight.track[o], a.sight.bound[o]
             away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
-            found = signed_distance(*own_axes(*np.moveaxis(away, -1, 0), o, a.solids), o, a.solids)
-            found = found - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
-            if (worst := float(found.min())) < least:
-                least, self.who = worst, int(np.unravel_index(found.argmin(), found.shape)[1])
+            room = signed_distance(*own_axes(*np.moveaxis(away, -1, 0), o, a.solids), o, a.solids)
+            room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
+            if (worst := float(room.min())) < least:
+                least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
         return least
 
     def _put_off(self, end: float, lost: float) -> None:
@@ -223,7 +223,7 @@ class Leader:
         assert self.now is not None
         begun, clock = self.now.begun, self.now.clock
 
-        def moved(time: float) -> float:
+        def postponed_time(time: float) -> float:
             progress = time - begun
             if progress <= 0.0:
                 return time
@@ -232,8 +232,8 @@ class Leader:
             return time + lost
 
         plan = self.plan
-        plan.t_end, plan.arrival = moved(plan.t_end), moved(plan.arrival)
-        plan.through = tuple(at | {"time": moved(at["time"])} for at in plan.through)
+        plan.t_end, plan.arrival = postponed_time(plan.t_end), postponed_time(plan.arrival)
+        plan.through = tuple(at | {"time": postponed_time(at["time"])} for at in plan.through)
         if begun < (blend := plan.reference).t0 + blend.T_b:
             plan.reference = blend._replace(t0=blend.t0 + lost)
 
@@ -248,7 +248,7 @@ class Leader:
             reference=reference._replace(t0=reference.t0 + delay, knots=knots),
         )
 
-    def _piece(self, t: float, h: float, asked: Floats) -> Problem:
+    def _piece(self, t: float, h: float, accelerations: Floats) -> Problem:
         """The problem from t for h [s]: the path at the clock's time, moved by the deviation, as polynomials.
 
         They have the values and two derivatives of both at either end, and at the end of the path, where its
@@ -268,12 +268,12 @@ class Leader:
         cm, axes = body_series(motion, tau)
         still = np.zeros_like(axes)
         still[0] = np.eye(3)[..., None]
-        p = chained(
+        p = time_derivatives(
             series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)[:3]), rates
         )
-        x = chained(series.derivatives(cm[:3]), rates)
-        B = series.from_derivatives(chained(series.derivatives(axes[:3]), rates))
-        ends = [self.deviation.at(each, asked, h) for each in dt]
+        x = time_derivatives(series.derivatives(cm[:3]), rates)
+        B = series.from_derivatives(time_derivatives(series.derivatives(axes[:3]), rates))
+        ends = [self.deviation.at(each, accelerations, h) for each in dt]
         moves, turns, grows = (
             np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True)
         )
@@ -283,43 +283,43 @@ class Leader:
         B = series.product(np.moveaxis(turns, -1, 1), np.moveaxis(B, -1, 1), np.matmul)
         phi = series.derivatives(series.rotation_vector(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
-        led = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
-        late, scaled = self._late(problem).reference, self._scaled(ends)
+        polynomials = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
+        late, scaled = self._late(problem).reference, self._any_scale(ends)
         if not (p[1:].any() or scaled):
-            return problem._replace(motion=led, reference=late)
+            return problem._replace(motion=polynomials, reference=late)
         ways = _polynomials(times, p.transpose(0, 3, 2, 1))
         kind = SHAPE if scaled else reference.kind
         return problem._replace(
-            motion=led, reference=late._replace(kind=kind, knots=times, ways=ways)
+            motion=polynomials, reference=late._replace(kind=kind, knots=times, ways=ways)
         )
 
     @staticmethod
-    def _scaled(ends: list[Deviation]) -> bool:
+    def _any_scale(ends: list[Detour]) -> bool:
         return any(np.any(e.scale != [1.0, 0.0, 0.0]) for e in ends)
 
     # -- the body -----------------------------------------------------------------------------------------
 
     def _steer(self, t: float, a: AvoidanceArrays) -> Floats:
         """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
-        asked, self.calm = self.deviation.decay(), True
+        accelerations, self.calm = self.deviation.decay(), True
         sight = a.sight
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
         if not len(moving) and self.deviation.none:
-            return asked
+            return accelerations
         r, v, rise, arms = self._slots(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
-        found = [self._cones(o, r, v, rise, arms, limit, a) for o in moving]
+        cones = [self._cones(o, r, v, rise, arms, limit, a) for o in moving]
         rows, needed, who = (
-            (np.concatenate(parts) for parts in zip(*found, strict=True))
-            if found
+            (np.concatenate(parts) for parts in zip(*cones, strict=True))
+            if cones
             else (np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))
         )
         if len(rows):
-            asked = self.deviation.decay(NEAR)
-        short = needed - rows @ asked
+            accelerations = self.deviation.decay(NEAR)
+        short = needed - rows @ accelerations
         if not (len(short) and short.max() > 0.0) and self.deviation.none:
-            return asked
+            return accelerations
         self.calm = not (len(short) and short.max() > 0.0)
         if not self.calm:
             self.who = int(who[short.argmax()])
@@ -332,18 +332,18 @@ class Leader:
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         else:
             rows[:, 6] = 0.0
-        if not (needed > rows @ asked).any():
-            return asked
-        wanted = steered(asked, rows, needed, a.weight, arms, z)
+        if not (needed > rows @ accelerations).any():
+            return accelerations
+        wanted = nearest_accelerations(accelerations, rows, needed, a.weight, arms, z)
         if wanted is None:  # no motion of the body helps: single vehicles have to give way
-            return asked
-        change = wanted - asked
+            return accelerations
+        change = wanted - accelerations
         greatest = greatest_acceleration(change, arms, z)
-        return asked + min(1.0, limit / max(greatest, 1e-12)) * change
+        return accelerations + min(1.0, limit / max(greatest, 1e-12)) * change
 
     def _scales(self) -> bool:
         """Whether slots may be scaled: their distances are those of the edges."""
-        if not self._scaled([self.deviation]) and self._unscalable is None:
+        if not self._any_scale([self.deviation]) and self._unscalable is None:
             plan = self.plan
             if plan.slots is None:
                 self._unscalable = True
@@ -359,8 +359,11 @@ class Leader:
         cm, axes = body_series(self.problem.motion, tau)
         slots = slot_series(self.problem.reference, (cm, axes), tau)
         rates = np.array(self.clock.rate[:2])[:, None]
-        c = chained(series.derivatives(cm[:3]), rates)[..., 0]
-        arm = chained(series.derivatives(slots[:3]), rates)[..., 0].transpose(0, 2, 1) - c[:, None]
+        c = time_derivatives(series.derivatives(cm[:3]), rates)[..., 0]
+        arm = (
+            time_derivatives(series.derivatives(slots[:3]), rates)[..., 0].transpose(0, 2, 1)
+            - c[:, None]
+        )
         Q = series.derivatives(self.deviation.series()[1])
         z, z1, _ = self.deviation.scale
         x = self.deviation.x

@@ -14,7 +14,7 @@ from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem
 from rigidfleet.planning.tolerances import most_steps
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
-from rigidfleet.simulation.callbacks import Command, named
+from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Unevaluated
 from rigidfleet.simulation.solver_setup import first_step, give_back, solved_by
@@ -90,7 +90,7 @@ class PointPhase(Stepper):
                 if status == records.PAUSED or full:
                     self.watch(last=False)
                 phase.pause(phase.t)
-                if status == records.PAUSED and self.stalled():
+                if status == records.PAUSED and self.has_stalled():
                     break
         finally:
             self.record(stretch)
@@ -140,17 +140,17 @@ class PointPhase(Stepper):
         if done:
             self._record(problem, times[:done], samples[:done])
 
-    def stalled(self) -> bool:
+    def has_stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
         state, since = self.phase.state, self.phase.t - self.phase.plan.start
         steps = int(state.count[records.ACCEPTED] + state.count[records.REJECTED])
         return steps > most_steps(since)
 
-    def commanded(self, command: Command) -> Problem:
+    def problem_under(self, command: Command) -> Problem:
         """Point masses take no command of vehicles."""
         raise FlightError(
-            f"the controller returned {named(command)} at t = {self.phase.t:.3f} s, which point masses do not"
-            " take; return forces [N], or give the agents a vehicle"
+            f"the controller returned {article_and_kind(command)} at t = {self.phase.t:.3f} s, which point masses do"
+            " not take; return forces [N], or give the agents a vehicle"
         )
 
     def release(self) -> None:
@@ -164,11 +164,11 @@ class PointPhase(Stepper):
         phase, plan = self.phase, self.phase.plan
         n, m = len(plan.masses), len(plan.edges)
         setup = None if phase.solver is None else phase.solver.setup
-        given = Unevaluated(problem, plan.problem, samples, setup)
+        source = Unevaluated(problem, plan.problem, samples, setup)
         if phase.external is not None:  # a user's function is asked while it is at hand
-            given = given.evaluated(times, phase.workspace)
+            source = source.evaluate(times, phase.workspace)
         frame = np.full((len(times), 4), np.nan)
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        phase.keep(times, given, samples[:, 6 * n : 6 * n + m], frame)
+        phase.keep(times, source, samples[:, 6 * n : 6 * n + m], frame)

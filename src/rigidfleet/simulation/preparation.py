@@ -8,7 +8,7 @@ from functools import cached_property
 from rigidfleet.kernel.problem import Disturbance
 from rigidfleet.mission import Mission
 from rigidfleet.planning.disturbances import disturbance
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 
 #: Number of missions whose preparation is kept, and their greatest number of agents.
 _KEPT, _SMALL = 8, 200
@@ -22,8 +22,8 @@ class Preparation:
 
     @cached_property
     def mission(self) -> Mission:
-        """The mission with its times known (`timed`)."""
-        return timed(self._mission)
+        """The mission with its times known (`complete_times`)."""
+        return complete_times(self._mission)
 
     @cached_property
     def disturbance(self) -> Disturbance:
@@ -31,17 +31,17 @@ class Preparation:
         return disturbance(self.mission)
 
 
-_prepared: OrderedDict[int, tuple[Mission, Preparation]] = OrderedDict()
+_preparations: OrderedDict[int, tuple[Mission, Preparation]] = OrderedDict()
 
 
-def prepared(mission: Mission) -> Preparation:
+def preparation_of(mission: Mission) -> Preparation:
     """The preparation of a mission, which is kept with some others of small missions."""
-    found = _prepared.get(id(mission))
-    if found is not None and found[0] is mission:
-        return found[1]
+    preparation = _preparations.get(id(mission))
+    if preparation is not None and preparation[0] is mission:
+        return preparation[1]
     made = Preparation(mission)
     if mission.n_agents <= _SMALL:
-        _prepared[id(mission)] = mission, made
-        while len(_prepared) > _KEPT:
-            _prepared.popitem(last=False)
+        _preparations[id(mission)] = mission, made
+        while len(_preparations) > _KEPT:
+            _preparations.popitem(last=False)
     return made

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import Setup
     from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
-    from rigidfleet.planning.vehicles import Turn
+    from rigidfleet.planning.vehicles import YawTurn
 
 
 #: Greatest number of edges, or of coordinates, for which the smallest singular value of J is recorded.
@@ -55,7 +55,7 @@ _UNMADE: dict[str, Any] = dict.fromkeys(
 
 #: References that slots follow one after the other, each with the time [s] from which it counts, and how vehicles with
 #: sampled control turn; none if not tracked.
-Led = tuple[tuple[float, "Reference", "Motion", "Turn | None"], ...]
+FollowedReferences = tuple[tuple[float, "Reference", "Motion", "YawTurn | None"], ...]
 
 
 class VehicleSamples(NamedTuple):
@@ -100,7 +100,7 @@ class Unevaluated(NamedTuple):
         T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
         return _in_world(r, T, cm[0]), _in_world(v, T, cm[1])
 
-    def evaluated(self, times: Floats, work: Workspace) -> Record:
+    def evaluate(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
         out = recorder(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
         self.evaluate_into(native.pack_anew(out), 0, times, work, native.pack(self.problem))
@@ -135,54 +135,54 @@ class Piece:
 
     phase: int
     time: Floats  # (K,) [s]
-    given: Record | Unevaluated
+    source: Record | Unevaluated
     integral: Floats  # (K, m) [m s]
     frame: Floats  # (K, 4)
     edges: Ints  # (m, 2) of this phase
     attached: bool  # whether the slots carry the body frame
-    led: Led  # what the slots follow, if they are tracked
+    followed: FollowedReferences  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
     #: The problem as flown, packed while it is at hand; None of a large formation, and where nothing is left to do.
     _problem: native.Packed | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        if isinstance(self.given, Unevaluated) and self.given.setup is None:
-            self._problem = native.pack(self.given.problem)
+        if isinstance(self.source, Unevaluated) and self.source.setup is None:
+            self._problem = native.pack(self.source.problem)
 
     @cached_property
     def record(self) -> Record:
         """Forces and references, of the edges of this phase."""
-        if not isinstance(self.given, Unevaluated):
-            return self.given
-        n = len(self.given.problem.vehicles.m)
+        if not isinstance(self.source, Unevaluated):
+            return self.source
+        n = len(self.source.problem.vehicles.m)
         out = recorder(len(self.time), n, len(self.edges))
         self.record_into(native.pack_anew(out), 0)
         return out
 
     def record_into(self, out: native.Packed, first: int) -> None:
         """Write forces and references, of the edges of this phase, into a packed record from row ``first`` on."""
-        given = self.given
-        if not isinstance(given, Unevaluated):
-            for rows, values in zip(out.of, given, strict=True):
+        source = self.source
+        if not isinstance(source, Unevaluated):
+            for rows, values in zip(out.of, source, strict=True):
                 if len(rows):
                     rows[first : first + len(values)] = values
-        elif given.setup is not None:
-            solver = large_solver(given.planned, given.setup)
-            planned = solved_by(solver, given.planned)
-            own = given.problem is given.planned
-            problem = planned if own else solved_by(solver, given.problem)
-            found, words = (
-                given._replace(problem=problem, planned=planned),
+        elif source.setup is not None:
+            solver = large_solver(source.planned, source.setup)
+            planned = solved_by(solver, source.planned)
+            own = source.problem is source.planned
+            problem = planned if own else solved_by(solver, source.problem)
+            renewed, words = (
+                source._replace(problem=problem, planned=planned),
                 native.pack(problem),
             )
-            found.evaluate_into(out, first, self.time, solver.workspace, words)
+            renewed.evaluate_into(out, first, self.time, solver.workspace, words)
             solver.check()
         else:
             assert self._problem is not None
-            work = small_workspace(given.planned)
-            given.evaluate_into(out, first, self.time, work, self._problem)
-            give_back(given.planned, work)
+            work = small_workspace(source.planned)
+            source.evaluate_into(out, first, self.time, work, self._problem)
+            give_back(source.planned, work)
 
 
 def assemble(
@@ -199,7 +199,7 @@ def assemble(
     been evaluated at the samples.
     """
     pieces = [p for p in pieces if len(p.time)]
-    time = _joined([p.time for p in pieces])
+    time = _join([p.time for p in pieces])
     flown = _of_vehicles(pieces)
     avoided = [piece.layers for piece in pieces if piece.layers is not None]
     layers = _together(avoided) if avoided else None
@@ -216,13 +216,13 @@ def assemble(
     ]
     # Of the pieces, what is left to do keeps no more than it needs: positions, or states that begin with them.
     motion = [
-        p.given.motion if isinstance(p.given, Unevaluated) else (p.given.r, p.given.v)
+        p.source.motion if isinstance(p.source, Unevaluated) else (p.source.r, p.source.v)
         for p in pieces
     ]
     places = Places(
         [
-            p.given.y
-            if isinstance(p.given, Unevaluated) and not p.given.problem.body_formulation
+            p.source.y
+            if isinstance(p.source, Unevaluated) and not p.source.problem.body_formulation
             else r
             for p, (r, _) in zip(pieces, motion, strict=True)
         ],
@@ -231,17 +231,17 @@ def assemble(
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
         (
             (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),
-            partial(_recorded, mission, pieces, time, flown),
+            partial(_forces_and_references, mission, pieces, time, flown),
         ),
         (CLOSE, partial(distances, mission, worst, places, time)),
-        (LATER, partial(_references, mission, [(p.time, p.led) for p in pieces])),
+        (LATER, partial(_references, mission, [(p.time, p.followed) for p in pieces])),
         (("singular_value",), partial(_singular_values, places, [p.edges for p in pieces])),
         (("mission_text",), partial(text_of, mission)),
     ]
     now: dict[str, Any] = {}
-    if all(isinstance(p.given, Unevaluated) for p in pieces):
+    if all(isinstance(p.source, Unevaluated) for p in pieces):
         now["position"], now["velocity"] = (
-            _joined(parts) if len(parts) > 1 else np.ascontiguousarray(parts[0])
+            _join(parts) if len(parts) > 1 else np.ascontiguousarray(parts[0])
             for parts in zip(*motion, strict=True)
         )
     else:
@@ -269,15 +269,15 @@ def assemble(
     )
 
 
-def _recorded(
+def _forces_and_references(
     mission: Mission, pieces: Sequence[Piece], time: Floats, flown: VehicleSamples | None
 ) -> dict[str, Any]:
     """Forces and references at all samples, and what is measured of them."""
     d = mission.disturbances
     disturbed = flown is not None or d is not None
     record = _record(pieces, mission.n_agents, mission.edges, disturbed=disturbed)
-    found = _measured(mission, pieces, time, record)
-    thrust, motion, r_ref = found.thrust, record.motion, record.r_ref
+    measured = _measure(mission, pieces, time, record)
+    thrust, motion, r_ref = measured.thrust, record.motion, record.r_ref
     if flown is not None:
         thrust = flown.thrust
         if mission.agents.saturate:  # the thrust flown, not the commanded one
@@ -286,7 +286,7 @@ def _recorded(
         r_ref = np.where(left[:, :, None], r_ref, np.nan)
     constraint = record.c
     if d is not None and d.noise is not None:
-        constraint = found.distance - record.d
+        constraint = measured.distance - record.d
     return {
         "position": record.r,
         "velocity": record.v,
@@ -299,18 +299,18 @@ def _recorded(
         "measured_position": record.r_seen,
         "measured_velocity": record.v_seen,
         "thrust": thrust,
-        "cm": found.cm,
-        "cm_velocity": found.cm_velocity,
+        "cm": measured.cm,
+        "cm_velocity": measured.cm_velocity,
         "cm_reference": motion[:, :3],
         "cm_velocity_reference": motion[:, 3:],
-        "attitude": found.attitude,
-        "attitude_reference": found.attitude_reference,
-        "frame": found.frame,
-        "rates": found.rates,
+        "attitude": measured.attitude,
+        "attitude_reference": measured.attitude_reference,
+        "frame": measured.frame,
+        "rates": measured.rates,
         "rates_reference": record.rates,
-        "wrench_asked": np.where(np.isfinite(motion[:, :1]), record.wrench, found.wrench),
-        "wrench_achieved": found.wrench,
-        "distance": found.distance,
+        "wrench_asked": np.where(np.isfinite(motion[:, :1]), record.wrench, measured.wrench),
+        "wrench_achieved": measured.wrench,
+        "distance": measured.distance,
         "distance_reference": record.d,
         "distance_rate_reference": record.d_dot,
         "constraint": constraint,
@@ -344,7 +344,9 @@ def distances(
     left = _left(mission, time) if left is None else left
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
-    close = proximity.closeness(places.joined, mission.agents.radius, mission.obstacles, time, left)
+    close = proximity.closeness(
+        places.positions, mission.agents.radius, mission.obstacles, time, left
+    )
     own = {
         name: getattr(close, name).copy()
         for name in ("separation", "pair", "clearance", "agent", "obstacle")
@@ -353,7 +355,9 @@ def distances(
     return dict(zip(CLOSE, own.values(), strict=True))
 
 
-def _references(mission: Mission, pieces: Sequence[tuple[Floats, Led]]) -> dict[str, Floats]:
+def _references(
+    mission: Mission, pieces: Sequence[tuple[Floats, FollowedReferences]]
+) -> dict[str, Floats]:
     """Derivatives of the slots and the yaw of each vehicle, of pieces of a flight; NaN where no slots are tracked.
 
     Yaw "along" continues from piece to piece.
@@ -363,29 +367,29 @@ def _references(mission: Mission, pieces: Sequence[tuple[Floats, Led]]) -> dict[
     turned = Yaw(yaw.kind, float(np.deg2rad(yaw.yaw_deg)), (x, y, z))
     states, angles = [], []
     last, until = None, 0.0
-    for times, led in pieces:
-        if not led:
+    for times, followed in pieces:
+        if not followed:
             last = None
             states.append(np.full((len(times), 3, n, 3), np.nan))
             angles.append(np.full((len(times), 2, n), np.nan))
             continue
-        spans = sorted(led, key=lambda span: span[0])
+        spans = sorted(followed, key=lambda span: span[0])
         first = np.searchsorted(times, [begin for begin, *_ in spans[1:]])
         for time, (_, reference, motion, turn) in zip(np.split(times, first), spans, strict=True):
             if not len(time):
                 continue
             states.append(slot_derivatives(reference, motion, time, 4)[:, 1:])
             if turn is not None:
-                angles.append(_turned(reference, motion, time, turned, turn))
+                angles.append(_yaw_of_turn(reference, motion, time, turned, turn))
                 continue
             # From the sample before, which may be one of an earlier piece.
             begin = np.clip(until, motion.knots[0], time[0]) if last is not None else time[0]
             since = time if begin == time[0] else np.append(begin, time)
-            found = yaw_derivatives(reference, motion, since, turned, last)[-len(time) :, :2]
-            angles.append(found)
-            last, until = found[-1, 0], time[-1]
+            yaws = yaw_derivatives(reference, motion, since, turned, last)[-len(time) :, :2]
+            angles.append(yaws)
+            last, until = yaws[-1, 0], time[-1]
     state, angle = np.concatenate(states), np.concatenate(angles)
-    left = _left(mission, _joined([times for times, _ in pieces]))
+    left = _left(mission, _join([times for times, _ in pieces]))
     if left is not None:
         state[~left[:, None].repeat(3, axis=1)] = np.nan
         angle[~left[:, None].repeat(2, axis=1)] = np.nan
@@ -395,7 +399,9 @@ def _references(mission: Mission, pieces: Sequence[tuple[Floats, Led]]) -> dict[
     return dict(zip(LATER, values, strict=True))
 
 
-def _turned(reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: Turn) -> Floats:
+def _yaw_of_turn(
+    reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: YawTurn
+) -> Floats:
     """Yaw and its rate (K, 2, N) asked of vehicles that turn into it from the yaw they had."""
     from rigidfleet.planning.vehicles import slots_and_yaw
 
@@ -405,10 +411,10 @@ def _turned(reference: Reference, motion: Motion, time: Floats, yaw: Yaw, turn: 
 
 def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     """The samples of all pieces; None if point masses flew."""
-    found = [piece.vehicles for piece in pieces if piece.vehicles is not None]
-    if not found:
+    samples = [piece.vehicles for piece in pieces if piece.vehicles is not None]
+    if not samples:
         return None
-    joined = _together(found)
+    joined = _together(samples)
     return joined._replace(
         attitude=np.stack(
             [att.unwrap_quaternion(q) for q in joined.attitude.swapaxes(0, 1)], axis=1
@@ -416,9 +422,9 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     )
 
 
-def _together(found: Sequence[Samples]) -> Samples:
+def _together(pieces: Sequence[Samples]) -> Samples:
     """Samples of pieces, one after the other."""
-    return type(found[0])(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return type(pieces[0])(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
 
 
 def _put(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness) -> None:
@@ -435,29 +441,29 @@ def _put(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Cl
                     close.agent[k], close.obstacle[k] = x.who, x.other
 
 
-def _joined(parts: Sequence[Array]) -> Array:
+def _join(parts: Sequence[Array]) -> Array:
     """Parts of a flight, one after the other."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _measured(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Record) -> Measured:
+def _measure(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Record) -> Measured:
     """Attitude, rates, wrench, thrust and distances at all samples, by the kernel.
 
     Without slots, the attitude is that of the integrated frame, if the mission attaches one.
     """
     agents = mission.agents
     n = mission.n_agents
-    found = measurement_of(
+    measured = measurement_of(
         n, len(mission.edges), len(time), time=time,
         start=np.cumsum([0, *(len(p.time) for p in pieces)]),
         attached=np.array([p.attached for p in pieces]), framed=mission.body_frame is not None,
         mass=mission.fleet.mass, lost_at=mission.lost_at,
         limit=mission.fleet.thrust_limit if agents.saturate else np.full(n, np.inf), edges=mission.edges,
         r=record.r, v=record.v, f_u=record.f_u, f_C=record.f_C, p=record.p, T_ref=record.T_ref,
-        frame=_joined([p.frame for p in pieces]),
+        frame=_join([p.frame for p in pieces]),
     )  # fmt: skip
-    native.measure(found)
-    return found
+    native.measure(measured)
+    return measured
 
 
 def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) -> Record:
@@ -485,13 +491,13 @@ def _integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
     """Integrals of the constraint errors (K, m); NaN while an edge is not active."""
     columns = [_columns(p.edges, edges) for p in pieces]
     if all(isinstance(places, slice) for places in columns):
-        return _joined([p.integral for p in pieces])
+        return _join([p.integral for p in pieces])
     rows = []
     for piece, places in zip(pieces, columns, strict=True):
         full = np.full((len(piece.time), len(edges)), np.nan)
         full[:, places] = piece.integral
         rows.append(full)
-    return _joined(rows)
+    return _join(rows)
 
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
@@ -511,7 +517,7 @@ class Places:
         self.parts, self.n = parts, n
 
     @cached_property
-    def joined(self) -> Floats:
+    def positions(self) -> Floats:
         """Positions (K, N, 3) at all samples."""
         width = 3 * self.n
         rows = [x.reshape(len(x), -1)[:, :width] for x in self.parts]
@@ -531,13 +537,13 @@ def _singular_values(places: Places, edges: Sequence[Ints]) -> dict[str, Floats]
             spans[-1][0].append(end)
         else:
             spans.append(([end], some))
-    found, begin = [], 0
+    values, begin = [], 0
     for parts, some in spans:
-        r = places.joined[begin : parts[-1]]
+        r = places.positions[begin : parts[-1]]
         within = [end - begin for end in parts[:-1]]
-        found += _singular(r, within, some)
+        values += _singular(r, within, some)
         begin = parts[-1]
-    return {"singular_value": np.concatenate(found)}
+    return {"singular_value": np.concatenate(values)}
 
 
 def _singular(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
@@ -548,12 +554,12 @@ def _singular(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
     count = max(_LEAST, _WORK // size**3)
     if count >= len(r):
         return [native.least_singular_values(r, edges)]
-    found = []
+    least = []
     for part in np.split(r, within):
         if count >= len(part):
-            found.append(native.least_singular_values(part, edges))
+            least.append(native.least_singular_values(part, edges))
             continue
         some = np.unique(np.linspace(0, len(part) - 1, count).round().astype(np.int64))
         values = native.least_singular_values(part[some], edges)
-        found.append(np.interp(np.arange(len(part)), some, values))
-    return found
+        least.append(np.interp(np.arange(len(part)), some, values))
+    return least

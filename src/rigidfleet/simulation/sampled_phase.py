@@ -18,14 +18,14 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.reference import ByEdge
-from rigidfleet.planning.vehicles import TickTables, Turn, first_yaw, sampled_flight, turn_from
+from rigidfleet.planning.vehicles import TickTables, YawTurn, first_yaw, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Command,
     Observation,
+    article_and_kind,
     checked_command,
-    named,
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
@@ -40,7 +40,7 @@ _TICKS, _STEPS = 1024, 4000
 _FAR = 1e9
 
 
-class Vehicles:
+class FleetState:
     """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
 
     def __init__(self, mission: Mission, max_step: float) -> None:
@@ -67,7 +67,7 @@ class SampledPhase(Stepper):
 
     by_ticks = True
 
-    def __init__(self, phase: ActivePhase, vehicles: Vehicles) -> None:
+    def __init__(self, phase: ActivePhase, vehicles: FleetState) -> None:
         super().__init__(phase)
         plan = phase.plan
         self.vehicles, self.flight = vehicles, vehicles.flight
@@ -88,7 +88,7 @@ class SampledPhase(Stepper):
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
-        phase, plan, given = self.phase, self.phase.plan, self.vehicles
+        phase, plan, fleet_state = self.phase, self.phase.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
         rtol, atol = plan.integrator.rtol, plan.tolerances
         phase.state = phase.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
@@ -100,15 +100,15 @@ class SampledPhase(Stepper):
             self.flight = self.flight._replace(sensing=sensing)
             phase.evaluate()  # the slots by which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
-        integral, before = y[6 * n : 6 * n + m], given.state
-        begun = fleet.begin(self.flight, given.S, phase.workspace, frame=frame)
+        integral, before = y[6 * n : 6 * n + m], fleet_state.state
+        begun = fleet.begin(self.flight, fleet_state.S, phase.workspace, frame=frame)
         if before is None:
             begun.integral[:] = integral
         else:
             renewed = fleet.under_problem(before, phase.workspace, integral, frame=frame)
             if phase.parted.any():  # without a link, vehicles do not come to the same integrals
                 own = [
-                    ByEdge().updated(given.edges, x).of(plan.edges, integral)
+                    ByEdge().with_values(fleet_state.edges, x).of(plan.edges, integral)
                     for x in before.integral
                 ]
                 renewed.integral[:] = own
@@ -117,10 +117,12 @@ class SampledPhase(Stepper):
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
         trail = phase.state.trail
-        self.sampled = given.state = begun._replace(trail=trail._replace(gauge=trail.gauge[:, :0]))
-        if given.avoidance is not None:
-            given.avoidance = avoidance.holding(given.avoidance, m)
-        given.edges = plan.edges
+        self.sampled = fleet_state.state = begun._replace(
+            trail=trail._replace(gauge=trail.gauge[:, :0])
+        )
+        if fleet_state.avoidance is not None:
+            fleet_state.avoidance = avoidance.holding(fleet_state.avoidance, m)
+        fleet_state.edges = plan.edges
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
             self.gone = phase.lost.copy()  # (N,) vehicles that do not fly in this phase
@@ -131,14 +133,14 @@ class SampledPhase(Stepper):
 
     def decide(self, *, by_law: bool) -> float:
         """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
-        leader, given = self.leader, self.vehicles.avoidance
-        if leader is None or given is None or not by_law or self.steered:
+        leader, arrays = self.leader, self.vehicles.avoidance
+        if leader is None or arrays is None or not by_law or self.steered:
             return math.inf
         t = self.phase.t
         end = leader.next_end(t, self.vehicles.output_step)
         if t >= self.led_until:
             self.led_until = end
-            if (problem := leader.lead(t, end, given)) is not None:
+            if (problem := leader.lead(t, end, arrays)) is not None:
                 self._renew(problem)
                 self.led = leader.leads
         return self.led_until
@@ -149,7 +151,7 @@ class SampledPhase(Stepper):
         return 0.0 if self.leader is None else self.leader.clock.delay
 
     @property
-    def turn_about_vertical(self) -> Turn:
+    def turn_about_vertical(self) -> YawTurn:
         """How vehicles turn about the vertical."""
         return self.turn
 
@@ -173,7 +175,7 @@ class SampledPhase(Stepper):
             self.turn = turn_from(problem, t, tables.yaw, now)
         self.led = True
 
-    def observed(self, observation: Observation) -> Observation:
+    def seen_by_controller(self, observation: Observation) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
         phase, S = self.phase, self.sampled.S
         seen = S[:, :6]
@@ -193,18 +195,18 @@ class SampledPhase(Stepper):
         """Drop the last command of vehicles."""
         self.flight = self.flight._replace(commands=fleet.no_commands(len(self.phase.lost)))
 
-    def commanded(self, command: Command) -> Problem:
+    def problem_under(self, command: Command) -> Problem:
         """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
         t = self.phase.t
         arrays = checked_command(command, len(self.phase.lost), t)
         if self.flight.vehicles.point.any():
             raise FlightError(
-                f"the controller returned {named(command)} at t = {t:.3f} s, but some agents are points;"
+                f"the controller returned {article_and_kind(command)} at t = {t:.3f} s, but some agents are points;"
                 " return forces [N]"
             )
         if self.vehicles.avoidance is not None:
             raise FlightError(
-                f"the controller returned {named(command)} at t = {t:.3f} s, which [avoidance] cannot"
+                f"the controller returned {article_and_kind(command)} at t = {t:.3f} s, which [avoidance] cannot"
                 " change; return forces [N], or remove [avoidance]"
             )
         if isinstance(command, AttitudeCommand):
@@ -242,14 +244,14 @@ class SampledPhase(Stepper):
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
         times = phase.times(t_end)
-        phase.begun, given = True, self.vehicles.avoidance
+        phase.begun, arrays = True, self.vehicles.avoidance
         call = fleet.segment(n, m, t_end, times, _STEPS)
         sampled.count[fleet.SAMPLES] = 0
         status = records.PAUSED
         try:
             while status == records.PAUSED:
                 self._supply()
-                status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, given)
+                status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, arrays)
                 self._follow()
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     phase.state.clock[records.TIME] = t_end
@@ -272,7 +274,7 @@ class SampledPhase(Stepper):
                 f"the motion of {who} grows beyond all bounds by t = {phase.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
             )
-        if given is not None and given.count[avoidance.FULL]:
+        if arrays is not None and arrays.count[avoidance.FULL]:
             raise StoppedError(
                 f"avoidance cannot go on at t = {phase.t:.2f} s: too many vehicles are near each other for their"
                 " speeds. Fly slower, or farther apart"
@@ -284,11 +286,11 @@ class SampledPhase(Stepper):
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
-        planned, given = self.phase.plan.problem, self.vehicles.tables
+        planned, source = self.phase.plan.problem, self.vehicles.tables
         if planned is self.tabled and tables.first <= tick < tables.last:
             return
-        if planned is not self.tabled and given.compensated:
-            moved = given.start_path(planned, tick)
+        if planned is not self.tabled and source.compensated:
+            moved = source.start_path(planned, tick)
             s = self.sampled
             for known in (s.seen, s.history, s.sent, s.heard):
                 np.add(known, moved, out=known)
@@ -296,8 +298,8 @@ class SampledPhase(Stepper):
         until = self.phase.plan.t_end
         if self.led:
             until = min(until, self.led_until if not self.steered else self.phase.stop)
-        last = min(tick + _TICKS, math.ceil(until * given.rate) + 1)
-        made = given.made(tick, max(last, tick + 1), planned, self.turn)
+        last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
+        made = source.tables_for(tick, max(last, tick + 1), planned, self.turn)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
     def _follow(self) -> None:

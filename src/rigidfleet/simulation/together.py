@@ -94,7 +94,7 @@ def _vector(active: Sequence[ActivePhase]) -> Vector:
     """A vector for flights whose first phases these are."""
     from rigidfleet.kernel.engine import batch
 
-    return batch.Vector(_filled([phase.plan.problem.disturbance for phase in active]))
+    return batch.Vector(_fill_lanes([phase.plan.problem.disturbance for phase in active]))
 
 
 def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
@@ -107,12 +107,12 @@ def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
     stretches = [stepper.prepare(stepper.phase.plan.problem, times) for stepper in steppers]
     try:
         vector.begin(
-            _filled([stretch.problem for stretch in stretches]),
-            _filled([phase.state for phase in active]),
-            _filled([phase.extremes.monitor.monitor for phase in active]),
+            _fill_lanes([stretch.problem for stretch in stretches]),
+            _fill_lanes([phase.state for phase in active]),
+            _fill_lanes([phase.extremes.monitor.monitor for phase in active]),
             t_end,
             times,
-            _filled([stretch.samples for stretch in stretches]),
+            _fill_lanes([stretch.samples for stretch in stretches]),
         )
     except UnfitError:
         return False
@@ -122,13 +122,13 @@ def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
         if status == records.PAUSED:
             for phase in active:
                 phase.watch(last=False)
-            if steppers[0].stalled():
+            if steppers[0].has_stalled():
                 return False
     for stepper, stretch in zip(steppers, stretches, strict=True):
         stepper.record(stretch)
     return status == records.FINISHED
 
 
-def _filled(x: list[T]) -> list[T]:
+def _fill_lanes(x: list[T]) -> list[T]:
     """Eight things: the last one is repeated."""
     return x + x[-1:] * (WIDTH - len(x))

@@ -298,14 +298,13 @@ def _small_axes(table: Table, title: str, names: Sequence[str]) -> tuple[Figure,
 
 
 def _draw_key(fig: Figure, table: Table, *, limit: bool = False) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(color=PASSED, label=f"{int(table.passed.sum())} passed")]
     if not table.passed.all():
         handles.append(Patch(color=FAILED, label=f"{int((~table.passed).sum())} failed"))
     if limit:
-        handles.append(Line2D([], [], color=st.ALERT, linestyle=(0, (6, 2)), label="limit"))
+        handles.append(st.legend_entry("limit", color=st.ALERT, linestyle=(0, (6, 2))))
     fig.legend(handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8)
 
 

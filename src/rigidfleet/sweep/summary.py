@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import plain
 from rigidfleet.sweep import store
 from rigidfleet.sweep.metrics import METRICS, readable_unit
@@ -132,22 +132,22 @@ class Summary(Shown):
             parts.append(Line(f"Random numbers: {numbers}."))
         for name, rates in self.by_value.items():
             rows = [Row((word, f"{100 * r.rate:.3g} %", r.interval)) for word, r in rates.items()]
-            parts.append(Table((name, "passed", "95 % interval"), rows))
+            parts.append(FactTable((name, "passed", "95 % interval"), rows))
         if s.of:
             words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} % (95 % interval {s.interval})."
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
-    def _percentiles(self) -> Table:
+    def _percentiles(self) -> FactTable:
         rows = [
             Row((name, readable_unit(METRICS[name].unit), *values))
             for name, values in self.percentiles.items()
         ]
-        return Table(
+        return FactTable(
             ("metric", "unit", "min", "5 %", "25 %", "median", "75 %", "95 %", "max"), rows
         )
 
-    def _reasons(self) -> Table:
+    def _reasons(self) -> FactTable:
         rows = []
         for reason, count in self.reasons.items():
             example = self.examples[reason]
@@ -162,13 +162,13 @@ class Summary(Shown):
                     )
                 )
             )
-        return Table(("failed check", "runs", "of all", "for example"), rows, ("for example",))
+        return FactTable(("failed check", "runs", "of all", "for example"), rows, ("for example",))
 
-    def _correlations(self, strong: Sequence[Driver]) -> Table:
+    def _correlations(self, strong: Sequence[Driver]) -> FactTable:
         """The strongest, those with success first."""
         first = sorted(strong, key=lambda d: d.outcome != "success")[:_SHOWN]
         rows = [Row((d.varied, d.outcome, f"{d.correlation:+.2f}")) for d in first]
-        return Table(("varied number", "outcome", "rank correlation"), rows, ("outcome",))
+        return FactTable(("varied number", "outcome", "rank correlation"), rows, ("outcome",))
 
 
 def summarise(table: store.Table) -> Summary:

@@ -19,7 +19,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.schema import Tracking
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import timed
+from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.margins import ClosedLoops, formation_laws, tracking_law
 from rigidfleet.typing import Floats
@@ -106,7 +106,7 @@ class Screen:
     """
 
     def __init__(self, mission: Mission, share: float) -> None:
-        mission = timed(mission)
+        mission = complete_times(mission)
         self.mission, self.share = mission, share
         self.gains = own_gains(mission)
         lags = vehicle_lags(mission)

@@ -151,9 +151,8 @@ class Pilot:
     @property
     def busy(self) -> bool:
         """Whether the formation is changing."""
-        phase, settle = self.commanded[-1], 0.0
-        if phase.control == "open":
-            settle = _STEADY
+        phase = self.commanded[-1]
+        settle = _STEADY if phase.control == "open" else 0.0
         blend = phase.shaping.least_time if phase.shaping is not None else 0.0
         return self.t < self.phases[-1].t_start + blend + settle - 1e-9
 
@@ -327,11 +326,11 @@ class Pilot:
     def _begin_formation(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
         common: dict[str, Any] = {"formation": formation, "blend": _BLEND, "duration": _ENDLESS}
+        law = "open" if establish else "body"
+        common["control"] = law if self.by_body else "tracking"
         if establish:
-            common["control"] = "open" if self.by_body else "tracking"
             self._begin_phase(Establish(kind="establish", name=f"establish {formation}", **common))
         else:
-            common["control"] = "body" if self.by_body else "tracking"
             self._begin_phase(Reshape(kind="reshape", name=f"change to {formation}", **common))
 
     def _begin_hold(self) -> None:
@@ -387,15 +386,9 @@ class Pilot:
         r, v, a = _step_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _step_towards(away, pose.omega, self.alpha, h, _TURN)
         if self.commanded[-1].control != "open":
-            self.flight.steer(
-                h,
-                pose,
-                (r, v, a),
-                (phi, omega, alpha),
-                a=self.a,
-                alpha=self.alpha,
-                force=self._drop_passed_gusts(),
-            )
+            force = self._drop_passed_gusts()
+            ends = (r, v, a), (phi, omega, alpha)
+            self.flight.steer(h, pose, *ends, a=self.a, alpha=self.alpha, force=force)
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)
             self.a, self.alpha = a, alpha
