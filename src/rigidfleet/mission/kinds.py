@@ -245,8 +245,8 @@ class Shaping(AnyPhase):
 
     @property
     def aligned(self) -> bool:
-        """Whether the slots are rotated during the blend, so that they move least."""
-        return True
+        """Whether the slots are rotated during the blend, so that they move least: unless `alignment` is none."""
+        return self.__dict__.get("alignment") != "none"
 
     @property
     def leads_to(self) -> str:
@@ -295,11 +295,6 @@ class Reshape(Shaping):
         description="fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
         "straight ways in the axes of the body",
     )
-
-    @property
-    def aligned(self) -> bool:
-        """Whether the slots are fitted."""
-        return self.alignment == "fit"
 
     @property
     def spelled(self) -> bool:
