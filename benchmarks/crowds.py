@@ -82,7 +82,7 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     )
     mass = np.ones(n)
     problem = plan.problem._replace(graph=graph(np.zeros((0, 2), dtype=np.int64), mass))
-    vehicles = fleet.quadrotors([fleet.Vehicle(1.0, point=True, limit=THRUST)] * n, 0.0)
+    vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True, limit=THRUST)] * n, 0.0)
     flight = fleet.flight(vehicles, start=0.0, h=PERIOD, steps=1)
     work = workspace(n, 0)
     state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)

@@ -19,11 +19,11 @@ from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.formation import outlines
 from rigidfleet.formation.point_files import Points
 from rigidfleet.mission import Mission, show_draft
-from rigidfleet.plotting import contents
+from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting.style import settings
 from rigidfleet.simulation.trajectories import of_curves
 from rigidfleet.sweep import Sweep, fly
-from rigidfleet.sweep.figures import over_two
+from rigidfleet.sweep.figures import map_over_two
 
 IMAGES = Path(__file__).parent / "images"
 MISSION = "narrow-passage"
@@ -77,9 +77,9 @@ def study() -> None:
     sweep = Sweep.load(IMAGES.parents[1] / "examples" / "gain_study.toml")
     with TemporaryDirectory() as folder:
         table = fly(sweep, folder, workers=1)
-        figure = over_two(table, ["constraint.alpha", "constraint.gamma"], "shape_end")
+        figure = map_over_two(table, ["constraint.alpha", "constraint.gamma"], "shape_end")
         assert figure is not None
-    _save_with_few_colours(io.BytesIO(contents(figure, ["png"])["png"]), "gain-study")
+    _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "gain-study")
 
 
 def _save_with_few_colours(path: Path | io.BytesIO, name: str) -> None:

@@ -13,8 +13,8 @@ from typing import Any
 
 from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
 from rigidfleet.math.margins import (
-    Feedback,
     Lag,
+    LoopGains,
     formation_loops,
     largest_pole,
     margins,
@@ -221,7 +221,7 @@ VEHICLES = {
 
 def _margins() -> str:
     """What lag and delay allow: largest p, and margins of the default gains, of a triangle of 4 m."""
-    law, p, rows = Feedback(), slots("triangle", (4.0,), 3), []
+    law, p, rows = LoopGains(), slots("triangle", (4.0,), 3), []
     for name, (k_R, k_omega, tau) in VEHICLES.items():
         for delay in (0.0, 0.02, 0.05):
             lag = Lag(k_R, k_omega, tau, delay, rate=500.0)

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import impulse, lsim
 
 from rigidfleet.assessment import assess
-from rigidfleet.math.margins import Feedback, Lag, overshoot
+from rigidfleet.math.margins import Lag, LoopGains, overshoot
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.planning.vehicles import reserves
@@ -165,7 +165,7 @@ def test_vehicles_keep_limits_in_seeded_missions(model, fed):
 @pytest.mark.parametrize("lag", [Lag(310.0, 57.0, 0.072), Lag(310.0, 57.0, 0.0125)])
 def test_the_reserve_bounds_what_a_vehicle_leaves_its_reference_by(lag):
     """The reserve is the integral of the impulse response, by another library; no input makes a greater error."""
-    law = Feedback()
+    law = LoopGains()
     tau, k_R, k_omega = lag.tau, lag.k_R, lag.k_omega
     along = np.array([tau, 1.0, k_omega, k_R])  # of the attitude with its rotors
     systems = []

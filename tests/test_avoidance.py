@@ -190,14 +190,14 @@ def test_barriers_change_accelerations_as_exact_solvers_do(seed, solve):
     edges = np.array([[0, 1], [1, 2], [2, 3], [0, 4]])
     hold, mu = rng.uniform(0.2, 1.0, n), 0.02
     ground = r[:, 2].min() - 0.5
-    plan = planned("square", 0, fleet.Vehicle(1.0, point=True), h=0.02)
+    plan = planned("square", 0, fleet.VehicleDynamics(1.0, point=True), h=0.02)
     found = graph(edges, m)
     problem = plan[0]._replace(graph=found, law=plan[0].law._replace(mu=mu))
     problem = problem._replace(vehicles=problem.vehicles._replace(mean=float(m.mean())))
     work = workspace(n, len(edges))
     u = r[edges[:, 0]] - r[edges[:, 1]]
     work.u[:] = u / np.linalg.norm(u, axis=1, keepdims=True)
-    points = [fleet.Vehicle(x, point=True) for x in m]
+    points = [fleet.VehicleDynamics(x, point=True) for x in m]
     flight = fleet.flight(fleet.quadrotors(points, 0.0), start=0.0, h=0.02, steps=1)
     state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)
     a = avoidance(

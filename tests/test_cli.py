@@ -685,7 +685,7 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
-@pytest.mark.parametrize("during", ["rendered", "write"])
+@pytest.mark.parametrize("during", ["render_figure", "write"])
 def test_interrupt_of_drawing(capsys, monkeypatch, during: str):
     """Ctrl-C while figures are drawn or written leaves the flight as it is, and says so."""
 
@@ -728,7 +728,7 @@ def plot(monkeypatch):
         assert width in {None, 88.0}
         return dict.fromkeys(formats, b"drawn" if titles else b"bare")
 
-    monkeypatch.setattr("rigidfleet.plotting.rendered", draw)
+    monkeypatch.setattr("rigidfleet.plotting.render_figure", draw)
 
 
 @pytest.mark.parametrize("options", [[], ["--figures", "few"], ["--figures", "all"]])
@@ -753,7 +753,7 @@ def test_the_verdict_is_printed_before_figures_are_drawn(capsys, monkeypatch, op
         before.append(capsys.readouterr().out)
         return dict.fromkeys(formats, b"drawn")
 
-    monkeypatch.setattr("rigidfleet.plotting.rendered", draw)
+    monkeypatch.setattr("rigidfleet.plotting.render_figure", draw)
     assert cli.main(["run", "short.toml", *options]) == codes.PASSED
     assert len(before) == 2
     verdict = Path("flights/short/verdict.json").read_text(encoding="utf-8")

@@ -6,7 +6,6 @@ test_export_readers.py.
 """
 
 import base64
-import itertools
 import json
 import math
 import os
@@ -708,8 +707,9 @@ def test_all_files_or_none(flight, tmp_path, monkeypatch):
     assert set(before) == {f"agent-{i}.csv" for i in (1, 2, 3, 4)}
 
     def broken(motion, tolerance):
-        yield from itertools.islice(FORMATS["polynomial"].write(motion, tolerance), 2)
-        raise OSError(28, "No space left on device")
+        if motion.first == 2:
+            raise OSError(28, "No space left on device")
+        return FORMATS["polynomial"].write(motion, tolerance)
 
     monkeypatch.setitem(FORMATS, "poly4d", FORMATS["polynomial"]._replace(write=broken))
     with pytest.raises(rf.ResultError, match="cannot be written: No space left on device"):

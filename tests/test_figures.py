@@ -660,13 +660,13 @@ def test_thinned_lines_keep_their_peaks():
     t = np.linspace(0, 90, 200_000)
     y = np.sin(t)
     y[[77_777, 123_456]] = 100.0, -100.0
-    x, z = style.thinned(t, y)
+    x, z = style.thin_out(t, y)
     assert len(x) < 4000
     assert (np.diff(x) > 0).all()
     assert (x[0], x[-1]) == (t[0], t[-1])
     assert (z.max(), z.min()) == (100.0, -100.0)
-    assert style.thinned(t[:100], y[:100])[0] is not None
-    np.testing.assert_array_equal(style.thinned(t[:100], y[:100])[1], y[:100])
+    assert style.thin_out(t[:100], y[:100])[0] is not None
+    np.testing.assert_array_equal(style.thin_out(t[:100], y[:100])[1], y[:100])
 
 
 def test_a_flight_that_breaks_down_is_still_readable():
@@ -885,7 +885,7 @@ def test_an_incomplete_flight_says_so_without_titles(tmp_path):
     )
     assert "incomplete, stopped at 20.00 s" in words
     assert "Thrust of each agent" not in words
-    with style.shape(titles=False):
+    with style.figure_options(titles=False):
         figure = drawn("inputs", stopped)
     assert figure._suptitle is not None
     warning = figure._suptitle.get_window_extent().corners()
@@ -949,10 +949,10 @@ def test_words_at_a_point_are_on_the_page(width):
     for k in range(0, len(apart), 4):
         dip = apart.copy()
         dip[k] = -0.228
-        with style.shape(width=width):
+        with style.figure_options(width=width):
             figure, ((ax,),) = style.time_figure(result, "Clearance", 1)
             ax.plot(result.time, dip)
-            at = style.around(result.time[k], dip[k])
+            at = style.places_around(result.time[k], dip[k])
             style.annotate(ax, f"-0.228 m at {result.time[k]:.2f} s, agents 11 and 12", at)
             style.place_words(figure)
         box = ax.texts[-1].get_window_extent()

@@ -11,8 +11,8 @@ import rigidfleet as rf
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.constraint_jacobian import filter_factors, jacobian
 from rigidfleet.math.margins import (
-    Feedback,
     Lag,
+    LoopGains,
     formation_loops,
     is_stable,
     largest_pole,
@@ -79,7 +79,7 @@ def test_exact_law_takes_all_that_it_sees():
 def test_tracking_of_a_delayed_point():
     """L = k e^(-s d) / s: gain margin pi / (2 k d), phase margin pi/2 - k d, delay margin pi / (2 k) - d."""
     k, d = 3.0, 0.1
-    found = margins(tracking_loops([Lag(point=True, delay=d)]), Feedback(k1=0.0, k2=k))
+    found = margins(tracking_loops([Lag(point=True, delay=d)]), LoopGains(k1=0.0, k2=k))
     assert found.stable
     assert found.gain == (0.0, pytest.approx(math.pi / (2 * k * d), rel=1e-9))
     assert found.phase == pytest.approx(math.pi / 2 - k * d, rel=1e-9)
@@ -90,7 +90,7 @@ def test_tracking_of_a_delayed_point():
 def test_triple_pole_with_a_lag(tau):
     """By Routh, a triple pole is stable behind a first-order lag tau for p < 8 / (9 tau)."""
     r = np.array([[0.0, 0, 1], [0, 0, -1]])
-    law = Feedback(solver="exact")
+    law = LoopGains(solver="exact")
     loops = formation_loops(r, [[0, 1]], [1.0, 2.0], law, [Lag(1.0, 5.0, tau)] * 2)
     (held,) = [loop for loop in loops if loop.is_constrained]
     assert largest_pole([held], law) == pytest.approx(8 / (9 * tau), rel=1e-3)
@@ -100,7 +100,7 @@ def test_triple_pole_with_a_lag(tau):
 def test_weak_shapes_without_tracking(k):
     """By Routh, a share sigma is stable for p (1 - 9 sigma) < 3 k_def (1 - sigma): weak motions need damping."""
     r = LINE + [[0, 0, 0], [0, 0.25, 0], [0, 0, 0]]
-    law = Feedback(control="open", k_def=k, damping=0.1, iterations=1)
+    law = LoopGains(control="open", k_def=k, damping=0.1, iterations=1)
     edges = complete_graph(3)
     w = np.linalg.eigvalsh(jacobian(r, edges) @ jacobian(r, edges).T)[0]
     sigma = w / (w + 0.1)
@@ -115,7 +115,7 @@ def test_weak_shapes_without_tracking(k):
 @pytest.mark.parametrize("constrained", [False, True])
 def test_margins_are_those_of_python_control(lag, delay, constrained):
     """Gain, phase and delay margin of scalar loops are those of python-control, delay as a Padé fraction."""
-    law = Feedback(solver="exact", ki=0.5)
+    law = LoopGains(solver="exact", ki=0.5)
     if constrained:
         # Side by side, a distance holds horizontal motion alone.
         r = np.array([[1.0, 0, 0], [-1, 0, 0]])
@@ -148,7 +148,7 @@ def test_parts_are_the_whole():
         (CUBE, lags[:1] * 8),
         (CUBE @ TURN, lags[:1] * 8),
     ):
-        law, edges = Feedback(), complete_graph(8)
+        law, edges = LoopGains(), complete_graph(8)
         S = weighted_share(r, edges, m)
         for s in 0.3 + 1j * np.array([0.5, 3.0, 9.0]):
             k_c, k_u = 2 * law.alpha * s + law.beta**2 + law.gamma / s, law.k1 + law.k2 * s
@@ -166,7 +166,7 @@ def test_parts_are_the_whole():
 
 def test_heading_does_not_matter_but_attitude_does():
     """The largest p of a pair does not depend on its heading; stood on end, only the rotors lag."""
-    law, lags = Feedback(), [delayed(HEAVY, 0.03)] * 2
+    law, lags = LoopGains(), [delayed(HEAVY, 0.03)] * 2
     heading = np.array([math.cos(0.7), math.sin(0.7), 0.0])
     along, turned, tilted, upright = (
         largest_pole(formation_loops(np.array([axis, -axis]), [[0, 1]], np.ones(2), law, lags), law)
@@ -276,7 +276,7 @@ def test_flights_are_stable_up_to_the_computed_pole(r, masses, lags, law):
     n, rate = len(r), 200.0
     m, edges = np.array([1.0] * n if masses is None else masses), complete_graph(n)
     fleet = [delayed(lags[i % len(lags)], 0.02 + 0.01 * (i % len(lags)), rate) for i in range(n)]
-    law = Feedback(**law)
+    law = LoopGains(**law)
     loops = formation_loops(r, edges, m, law, fleet)
     p = largest_pole(loops, law)
     for share in (0.97, 1.03):
@@ -287,7 +287,7 @@ def test_flights_are_stable_up_to_the_computed_pole(r, masses, lags, law):
 
 def test_delay_margin_is_the_delay_that_flies():
     """A triangle flies with 0.9 of the computed delay margin added, and no longer with 1.1 of it."""
-    rate, law, m = 200.0, Feedback(), np.ones(3)
+    rate, law, m = 200.0, LoopGains(), np.ones(3)
     edges = complete_graph(3)
     more = margins(
         formation_loops(TRIANGLE, edges, m, law, [delayed(LIGHT, 0.02, rate)] * 3), law
@@ -301,8 +301,8 @@ def test_an_attitude_that_is_unstable_by_itself():
     """Where k_omega < tau k_R the attitude itself is unstable, and so is every loop."""
     lag = Lag(k_R=500.0, k_omega=20.0, tau=0.05)
     assert not lag.stable
-    assert not margins(tracking_loops([lag]), Feedback()).stable
-    assert largest_pole(tracking_loops([lag]), Feedback()) == 0.0
+    assert not margins(tracking_loops([lag]), LoopGains()).stable
+    assert largest_pole(tracking_loops([lag]), LoopGains()) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -323,7 +323,7 @@ def test_bad_lags(bad, message):
 def test_every_agent_needs_a_lag():
     """Too few lags or masses are refused."""
     with pytest.raises(ValueError, match="3 agents need 3 lags"):
-        formation_loops(LINE, [[0, 1]], np.ones(3), Feedback(), [LIGHT])
+        formation_loops(LINE, [[0, 1]], np.ones(3), LoopGains(), [LIGHT])
 
 
 def told(mission, lag):
@@ -342,7 +342,7 @@ def test_check_tells_margins():
     words = [text for heading, text in found.describe() if heading == "margins"]
     assert words[0].startswith("tracking: stable; bears")
     assert any("'triangle' to 'line'" in text for text in words)
-    law, slots = Feedback(damping=0.03), mission.formation_slots("line")
+    law, slots = LoopGains(damping=0.03), mission.formation_slots("line")
     assert slots is not None
     alone = formation_loops(
         slots, mission.formation_edges("line"), np.ones(3), law,

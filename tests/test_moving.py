@@ -22,10 +22,10 @@ class One:
     """One free vehicle of 1 kg without gravity, called tick by tick."""
 
     def __init__(self, solids, **options):
-        plan = planned("square", 0, fleet.Vehicle(1.0, point=True), h=T)
+        plan = planned("square", 0, fleet.VehicleDynamics(1.0, point=True), h=T)
         edges, mass = np.zeros((0, 2), dtype=np.int64), np.ones(1)
         self.problem, self.work = plan[0]._replace(graph=graph(edges, mass)), workspace(1, 0)
-        points = fleet.quadrotors([fleet.Vehicle(1.0, point=True)], 0.0)
+        points = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)], 0.0)
         self.flight = fleet.flight(points, start=0.0, h=T, steps=1)
         self.state = fleet.begin(self.flight, np.zeros((1, fleet.STATES)), self.work)
         seen = {

@@ -36,12 +36,12 @@ HUMMINGBIRD = ROTORPY["hummingbird"]
 NO_AIR = {"rotor_drag": (0, 0), "lift": 0.0, "c": (0, 0, 0)}
 
 
-def derivative(vehicle: fleet.Vehicle, S, command, wind) -> np.ndarray:
+def derivative(vehicle: fleet.VehicleDynamics, S, command, wind) -> np.ndarray:
     flight = fleet.flight(fleet.quadrotors([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1)
     return sampled.derivatives(flight, np.array(S), np.array(command), np.array(wind))
 
 
-def by_rotors(flight: fleet.Flight) -> fleet.Flight:
+def by_rotors(flight: fleet.SampledFlight) -> fleet.SampledFlight:
     """The same flight under rotor commands, which can be overwritten."""
     return flight._replace(commands=flight.commands._replace(kind=fleet.ROTORS))
 

@@ -23,7 +23,7 @@ from rigidfleet.planning.reference import PhaseState
 from rigidfleet.simulation.flight import simulate
 
 SIH = replace(ROTORPY["px4_sihsim_quadx"], radius=0.12, tilt=0.6)
-POINT = fleet.Vehicle(1.0, point=True)
+POINT = fleet.VehicleDynamics(1.0, point=True)
 
 
 def fly(
@@ -71,7 +71,7 @@ def everything(rows: int = 0) -> tuple[Any, ...]:
             3, rng.integers(0, 9, n), True, 5, rng.integers(0, 30, (n, n)), np.zeros((0, 2), dtype=np.int64)
         ),
         guidance=fleet.Guidance(np.full(n, 0.8), np.full((n, 3), 0.3)),
-        tables=fleet.Tables(
+        tables=fleet.TickInputs(
             0, K, rng.normal(size=(K, n, 6)), yaw, 0.5 * small[0], small[1], 0.01 * small[2, ::3], 0.02 * small[3, ::3],
             rng.random((84, n)) < 0.1, rng.random((50, n, n)) < 0.2,
         ),
@@ -517,7 +517,7 @@ def test_a_flight_goes_on_under_another_problem():
     other, wide, *_ = planned("cube-passage", 1, SIH)
     m = len(wide.c)
     assert m != len(work.c)
-    with pytest.raises(ValueError, match=r"fleet\.renewed"):
+    with pytest.raises(ValueError, match=r"fleet\.under_problem"):
         sampled.fly_ticks(other, wide, flight, state, fleet.segment(8, m, flight.start + 0.2))
     state = fleet.under_problem(state, wide, np.full(m, 0.01))
     fly(other, wide, flight, state, flight.start + 0.2)
@@ -564,7 +564,7 @@ def se3_force(m: float, r, v, *wanted: np.ndarray) -> np.ndarray:
     return m * (-kp * (r - wanted[0]) - kd * (v - wanted[1]) + wanted[2] + [0, 0, G])
 
 
-def flown_by_us(vehicle: fleet.Vehicle, t: np.ndarray, *wanted: np.ndarray) -> np.ndarray:
+def flown_by_us(vehicle: fleet.VehicleDynamics, t: np.ndarray, *wanted: np.ndarray) -> np.ndarray:
     """Positions (K, N, 3) of vehicles under RotorPy's law at 100 Hz."""
     n = wanted[0].shape[1]
     problem, work, flight, state = begun([vehicle] * n, wanted[0][0], h=2e-3, steps=5)

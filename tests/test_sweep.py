@@ -31,8 +31,8 @@ from rigidfleet.errors import MissionError, ResultError, RigidfleetError, SweepE
 from rigidfleet.mission import Mission
 from rigidfleet.result import Extremum
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
-from rigidfleet.sweep.figures import over_two, plot
-from rigidfleet.sweep.final_states import starts
+from rigidfleet.sweep.figures import map_over_two, plot
+from rigidfleet.sweep.final_states import start_states
 from rigidfleet.sweep.metrics import measure
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.runner import SweepProgress
@@ -430,7 +430,7 @@ def test_ends_are_those_of_whole_flights(ends):
     """Starts bit for bit, what fails, and the shape to the integrator's tolerance are those of whole flights."""
     whole = Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3)
     values = [whole.values(run) for run in range(20)]
-    for k, (r, v) in enumerate(zip(*starts(whole, values), strict=True)):
+    for k, (r, v) in enumerate(zip(*start_states(whole, values), strict=True)):
         agents = Mission.from_dict(whole.varied(k)).agents
         assert (np.array(agents.position) == r).all()
         assert (np.array(agents.velocity) == v).all()
@@ -921,7 +921,7 @@ def test_figures(tmp_path):
 def test_a_map_shows_rates_where_the_runs_are():
     """Cells of the map hold the success rate of the runs in them, and a metric's median."""
     found = made()
-    heavy = over_two(found, ["agents.mass", "agents.radius"], "thrust")
+    heavy = map_over_two(found, ["agents.mass", "agents.radius"], "thrust")
     assert heavy is not None
     mesh = heavy.axes[0].collections[0].get_array()
     assert mesh is not None
@@ -929,7 +929,7 @@ def test_a_map_shows_rates_where_the_runs_are():
     edges = np.linspace(found.codes[:, 0].min(), found.codes[:, 0].max(), 11)
     assert columns == pytest.approx(9.81 * (edges[1:] + edges[:-1]) / 2, rel=0.03)
     with pytest.raises(RigidfleetError, match=r"agents\.mas' cannot be drawn"):
-        over_two(found, ["agents.mas", "agents.radius"])
+        map_over_two(found, ["agents.mas", "agents.radius"])
 
 
 def test_figures_without_titles(tmp_path):
@@ -1215,7 +1215,7 @@ def test_a_seed_is_neither_an_axis_nor_a_driver(tmp_path):
     assert {d.varied for d in drivers(table)} == {"agents.mass.1", "agents.mass.2"}
     assert summarise(table).random_numbers == "varied"
     with pytest.raises(RigidfleetError, match="a seed has no order"):
-        over_two(table, ["disturbances.noise.seed", "agents.mass.1"])
+        map_over_two(table, ["disturbances.noise.seed", "agents.mass.1"])
 
 
 def test_drivers_are_corrected_for_their_number():
@@ -1320,12 +1320,12 @@ def test_a_sweep_goes_on_only_with_the_same_controller(folder):
 
 def test_a_worker_with_another_controller_is_refused(folder):
     """A worker compares the file of the controller, not its name alone."""
-    from rigidfleet.sweep.workers import chunk
+    from rigidfleet.sweep.workers import fly_chunk
 
     Path("c_law.py").write_text(LAW)
     found = Sweep.of(MISSION, SCATTER, runs=2, controller="c_law:follow")
     with pytest.raises(RigidfleetError, match=r"a worker has rigidfleet .* with c_law:follow"):
-        chunk(found.json(), found.version.replace("c_law:follow ", "c_law:follow x"), [0])
+        fly_chunk(found.json(), found.version.replace("c_law:follow ", "c_law:follow x"), [0])
 
 
 # -- no verdict, no room, no time ------------------------------------------------------------------------

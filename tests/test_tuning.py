@@ -19,7 +19,7 @@ from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes
 from rigidfleet.errors import ResultError, RigidfleetError, SweepError
 from rigidfleet.sweep import Sweep, metrics, read
-from rigidfleet.tuning.gains import RANGES, Screen, Space, own_gains, with_gains
+from rigidfleet.tuning.gains import RANGES, GainSpace, Screen, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown
 from rigidfleet.tuning.study import OBJECTIVES, _Study, cost
 
@@ -136,9 +136,9 @@ def test_gains_that_act_are_tuned():
 
 def test_space_holds_the_own_gains():
     """The start is the mission's own gains; the ends are as far as the box reaches."""
-    space = Space({"constraint.alpha": 3.0, "tracking.Q.1": 4.0})
+    space = GainSpace({"constraint.alpha": 3.0, "tracking.Q.1": 4.0})
     assert space.gains(space.start) == space.own
-    odd = Space({"constraint.beta": math.sqrt(12)})
+    odd = GainSpace({"constraint.beta": math.sqrt(12)})
     assert odd.gains(odd.start) == odd.own
     assert space.gains([0.0, 0.0]) == {"constraint.alpha": 0.75, "tracking.Q.1": 0.25}
     assert space.gains([1.0, 1.0]) == {"constraint.alpha": 12.0, "tracking.Q.1": 64.0}

@@ -45,23 +45,23 @@ def lag(tau: float) -> tuple[float, ...]:
 
 #: RotorPy 3.0.0, `vehicles/*_params.py`, with the gains of its `SE3Control`.
 ROTORPY = {
-    "hummingbird": fleet.Vehicle(
+    "hummingbird": fleet.VehicleDynamics(
         0.5, (3.65e-3, 3.68e-3, 7.03e-3), 0.17 * SQUARE, (1, -1, 1, -1), (0, 0, 5.57e-6), (0, 0, 1.36e-7),
         (1.19e-4, 2.32e-4), 3.39e-3, (0.5e-2, 0.5e-2, 1e-2), motor=lag(0.005), speed=(0, 1500),
         k_R=3 * [544.0], k_omega=3 * [46.64],
     ),
-    "px4_sihsim_quadx": fleet.Vehicle(
+    "px4_sihsim_quadx": fleet.VehicleDynamics(
         1.0, (0.025, 0.025, 0.030), 0.17 * np.array([[1, -1, 0], [-1, 1, 0], [1, 1, 0], [-1, -1, 0]]),
         (-1, -1, 1, 1), (0, 0, 5e-6), (0, 0, 1e-7), c=(1e-2, 1e-2, 1e-2), motor=lag(0.05), speed=(0, 1000),
         k_R=3 * [310.0], k_omega=3 * [57.0],
     ),
-    "crazyflie": fleet.Vehicle(
+    "crazyflie": fleet.VehicleDynamics(
         0.03, (1.43e-5, 1.43e-5, 2.89e-5), 0.043 * SQUARE, (1, -1, 1, -1), (0, 0, 2.3e-8), (0, 0, 7.8e-10),
         (10.2506e-07, 7.553e-07), motor=lag(0.072), speed=(0, 2500), k_R=3 * [310.0], k_omega=3 * [57.0],
     ),
 }  # fmt: skip
 #: 1 kg and 4 x 5.9 N as in the paper; the rest, which it leaves open, is chosen. Flown by RotorPy in a test.
-PAPER = fleet.Vehicle(
+PAPER = fleet.VehicleDynamics(
     1.0, (0.01, 0.01, 0.0187), 0.17 * SQUARE, (1, -1, 1, -1), (0, 0, 5.9e-6), (0, 0, 5.9e-6 * 0.0152),
     (1.16e-4, 1.16e-4), 0.0, (0.5e-2, 0.5e-2, 1e-2), motor=lag(0.02), speed=(0, 1000), k_R=3 * [544.0],
     k_omega=3 * [46.64],
@@ -70,13 +70,13 @@ PAPER = fleet.Vehicle(
 CRAZYFLOW = ("cf2x_L250", "cf2x_P250")
 
 
-def from_crazyflow(given: dict[str, Any]) -> fleet.Vehicle:
+def from_crazyflow(given: dict[str, Any]) -> fleet.VehicleDynamics:
     """A vehicle from parameters of crazyflow's `first_principles`, which are in revolutions per minute."""
     unit = 2.0 * np.pi / 60.0
     powers = np.array([1.0, 1.0 / unit, 1.0 / unit**2])
     y, x, spin = given["mixing_matrix"] * np.array([[given["L"]], [-given["L"]], [1.0]])
     a, b, c, d = given["rotor_dyn_coef"]
-    return fleet.Vehicle(
+    return fleet.VehicleDynamics(
         given["mass"], np.diag(given["J"]), np.stack([x, y, 0 * x], axis=1), spin, given["rpm2thrust"] * powers,
         given["rpm2torque"] * powers, drag=-np.diag(given["drag_matrix"]), rotor_inertia=given["prop_inertia"],
         motor=(a, b / unit, c, d / unit), speed=(0.0, 25000.0 * unit),
@@ -96,8 +96,13 @@ def open_problem(vehicles: fleet.Quadrotors) -> Problem:
 
 
 def begun(
-    vehicles: list[fleet.Vehicle], r: Any = None, *, h: float = 1e-3, steps: int = 2, rows: int = 0
-) -> tuple[Problem, Workspace, fleet.Flight, fleet.SampledState]:
+    vehicles: list[fleet.VehicleDynamics],
+    r: Any = None,
+    *,
+    h: float = 1e-3,
+    steps: int = 2,
+    rows: int = 0,
+) -> tuple[Problem, Workspace, fleet.SampledFlight, fleet.SampledState]:
     """Vehicles that hover side by side, or at r (N, 3), under a problem without edges that balances their weight."""
     fleet_ = fleet.quadrotors(vehicles, G)
     n = len(vehicles)
@@ -109,8 +114,9 @@ def begun(
 
 
 def planned(
-    name: str, index: int, vehicle: fleet.Vehicle, *, h: float = 2e-3, steps: int = 1, every: int = 1, rows: int = 0
-) -> tuple[Problem, Workspace, fleet.Flight, fleet.SampledState]:  # fmt: skip
+    name: str, index: int, vehicle: fleet.VehicleDynamics, *, h: float = 2e-3, steps: int = 1, every: int = 1,
+    rows: int = 0,
+) -> tuple[Problem, Workspace, fleet.SampledFlight, fleet.SampledState]:  # fmt: skip
     """A phase of a shipped mission from the mission's start, flown by vehicles of one kind."""
     mission = load_mission(name)
     now = PhaseState(0.0, np.array(mission.agents.position), np.array(mission.agents.velocity))
@@ -123,7 +129,7 @@ def planned(
     return plan.problem, work, flight, fleet.begin(flight, S, work, rows=rows)
 
 
-def random_states(vehicle: fleet.Vehicle, n: int, seed: int) -> tuple[np.ndarray, ...]:
+def random_states(vehicle: fleet.VehicleDynamics, n: int, seed: int) -> tuple[np.ndarray, ...]:
     """States (n, 17), commands (n, 4) [rad/s] and winds (n, 3) [m/s] far from hover."""
     rng = np.random.default_rng(seed)
     S = 3.0 * rng.normal(size=(n, fleet.STATES))
@@ -154,7 +160,7 @@ def rotorpy_derivative(
     return np.concatenate([d[:6], d[[9, 6, 7, 8]], d[10:13], d[16:]])
 
 
-def random_inputs(vehicle: fleet.Vehicle) -> tuple[np.ndarray, np.ndarray]:
+def random_inputs(vehicle: fleet.VehicleDynamics) -> tuple[np.ndarray, np.ndarray]:
     """A hovering state (17,) and commands (50, 4), each held for 20 ms."""
     S = fleet.hovering(fleet.quadrotors([vehicle], G), np.zeros((1, 3)), np.zeros((1, 3)))[0]
     scatter = np.random.default_rng(5).uniform(0.9, 1.1, size=(50, 4))

@@ -40,7 +40,9 @@ class Setpoints(NamedTuple):
     yaw_rate: Floats
 
 
-def of_motion(position: Floats, velocity: Floats, acceleration: Floats, time: Floats) -> Floats:
+def states_of_motion(
+    position: Floats, velocity: Floats, acceleration: Floats, time: Floats
+) -> Floats:
     """States (K, 4, N, 3) of a flown motion (K, N, 3) at times (K,) [s], with the jerk of quintics between them.
 
     At a sample it is that of the quintic after it, or of the one before where that is clearly longer, or the last:
@@ -56,7 +58,7 @@ def of_motion(position: Floats, velocity: Floats, acceleration: Floats, time: Fl
     return x
 
 
-def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
+def at_rate(samples: Setpoints, rate: float | None) -> Setpoints:
     """Setpoints at a rate [Hz] from the first time on; without one, at their own times.
 
     Where two times are one representable number apart, as at a switch of phases, the later one counts.
@@ -66,15 +68,15 @@ def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
     ValueError
         The rate is not positive, or gives more than `MOST` setpoints, or a single one of a flight that lasts.
     """
-    time = given.time
+    time = samples.time
     later = np.append(np.nextafter(time[:-1], np.inf) < time[1:], True)
     if rate is None:
-        return Setpoints(*(x[later] for x in given))
+        return Setpoints(*(x[later] for x in samples))
     if not (np.isfinite(rate) and rate > 0.0):
         raise ValueError(f"the rate must be positive [Hz], not {rate!r}")
     span = time[-1] - time[0]
     count = int(span * rate * (1.0 + 1e-12)) + 1
-    n = given.yaw.shape[1]
+    n = samples.yaw.shape[1]
     if count < 2 and span > 0.0:
         raise ValueError(
             f"a rate of {rate:g} Hz gives one setpoint in {span:.4g} s; use {1.0 / span:.3g} Hz or more"
@@ -84,21 +86,21 @@ def at_rate(given: Setpoints, rate: float | None) -> Setpoints:
         raise ValueError(
             f"a rate of {rate:g} Hz gives {count * n:,} setpoints; use {fits:.3g} Hz or less"
         )
-    return at_times(given, np.minimum(time[0] + np.arange(count) / rate, time[-1]))
+    return at_times(samples, np.minimum(time[0] + np.arange(count) / rate, time[-1]))
 
 
-def at_times(given: Setpoints, wanted: Floats) -> Setpoints:
+def at_times(samples: Setpoints, wanted: Floats) -> Setpoints:
     """Setpoints at increasing times (n,) [s] within the given ones; of two states at a switch, the later one counts."""
-    time, count, n = given.time, len(wanted), given.yaw.shape[1]
+    time, count, n = samples.time, len(wanted), samples.yaw.shape[1]
     if len(time) == 1:
-        return given
+        return samples
     x = np.empty((count, 4, n, 4))
     for i in range(n):
-        x[:, :, i] = curve(given, i).states(wanted, 4).swapaxes(0, 1)
+        x[:, :, i] = curve_of(samples, i).states(wanted, 4).swapaxes(0, 1)
     return Setpoints(wanted, x[..., :3], x[:, 0, :, 3], x[:, 1, :, 3])
 
 
-def curve(samples: Setpoints, agent: int) -> Piecewise:
+def curve_of(samples: Setpoints, agent: int) -> Piecewise:
     """The way of an agent, from 0: pieces (k, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
     first, knots = intervals(samples.time)
     state = samples.state[:, :, agent].swapaxes(0, 1)
@@ -118,24 +120,24 @@ def intervals(time: Floats) -> tuple[Ints, Floats]:
     return first, np.append(time[first[:1]], time[first + 1])
 
 
-def csv(given: Setpoints, first: int = 1) -> str:
+def csv_text(samples: Setpoints, first: int = 1) -> str:
     """The text of a table: a row for each time and agent, numbers to 9 digits, empty where there is none.
 
     Agents count from ``first``.
     """
-    k, n = given.yaw.shape
+    k, n = samples.yaw.shape
     columns = np.concatenate(
         [
-            given.state.transpose(0, 2, 1, 3).reshape(k, n, 12),
-            given.yaw[..., None],
-            given.yaw_rate[..., None],
+            samples.state.transpose(0, 2, 1, 3).reshape(k, n, 12),
+            samples.yaw[..., None],
+            samples.yaw_rate[..., None],
         ],
         axis=2,
     )
     lines = [HEADER]
     row = ",".join(["%.9g"] * columns.shape[2])
-    for t, agents in zip(given.time.tolist(), columns, strict=True):
-        told = f"{t:.9g}"
+    for t, agents in zip(samples.time.tolist(), columns, strict=True):
+        stamp = f"{t:.9g}"
         for i, values in enumerate(agents.tolist(), start=first):
-            lines.append(f"{told},{i}," + row % tuple(values))
+            lines.append(f"{stamp},{i}," + row % tuple(values))
     return "\n".join(lines).replace("nan", "") + "\n"

@@ -14,7 +14,7 @@ from rigidfleet.reporting import html_page
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from sample_flights import swarm
 
-setattr(plotting, "rendered", lambda *_: {"svg": b"<svg/>"})  # noqa: B010
+setattr(plotting, "render_figure", lambda *_: {"svg": b"<svg/>"})  # noqa: B010
 result, printed = swarm(4, 10.0), io.StringIO()
 verdict = rf.assess(result)
 Console(width=200, file=printed).print(verdict)

@@ -163,9 +163,7 @@ class TextTable:
         """
         factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
-        odd = [
-            i for i, k in enumerate(which) if not _put_plain_numbers(self.columns[k], values[:, i])
-        ]
+        odd = [i for i, k in enumerate(which) if not _put_numbers(self.columns[k], values[:, i])]
         if odd and not self.decimal:
             columns = [self.columns[k].tolist() for k in self.places.values()]
             every = [_REMARK.sub("", x) for column in columns for x in column]
@@ -192,7 +190,7 @@ class TextTable:
         return values * factors
 
 
-def _put_plain_numbers(fields: np.ndarray, values: Floats) -> bool:
+def _put_numbers(fields: np.ndarray, values: Floats) -> bool:
     """Whether all fields are plain finite numbers, which are put into ``values``."""
     try:
         values[:] = fields.astype(np.float64)
@@ -313,22 +311,20 @@ def _rows(
     numbers, blocks, faults, line = [], [], [], start
     try:
         while block := list(islice(reader, _TOGETHER)):
-            own = list(range(line + 1, (line := start + reader.line_num) + 1))
-            if len(own) != len(block):
+            first, line = line + 1, start + reader.line_num
+            if line - first + 1 != len(block):
                 raise csv.Error("a quotation mark is not closed")
-            if not all(len(row) == width and row[0] and row[0][0] != "#" for row in block):
-                read = [
-                    _row(texts[k - 1].strip(), row, width, separator)
-                    for k, row in zip(own, block, strict=True)
-                ]
-                for k, row in zip(own, read, strict=True):
-                    if row and len(row) != width:
-                        why = f"has {len(row)} {what}"
-                        faults.append(Fault(k, texts[k - 1].strip(), why, "Is the file cut off?"))
-                own = [k for k, row in zip(own, read, strict=True) if row and len(row) == width]
-                block = [row for row in read if row and len(row) == width]
-            numbers += own
-            blocks.append([np.array(x, _TEXT) for x in zip(*block, strict=True)])
+            rows = []
+            for k, fields in enumerate(block, first):
+                plain = len(fields) == width and fields and fields[0] and fields[0][0] != "#"
+                row = fields if plain else _fields_of_row(texts[k - 1], fields, width, separator)
+                if row and len(row) == width:
+                    numbers.append(k)
+                    rows.append(row)
+                elif row:
+                    why = f"has {len(row)} {what}"
+                    faults.append(Fault(k, texts[k - 1].strip(), why, "Is the file cut off?"))
+            blocks.append([np.array(x, _TEXT) for x in zip(*rows, strict=True)])
     except csv.Error as error:
         raise fault(f"cannot be read: {error}", "Write it again", start + reader.line_num) from None
     parts = [*zip(*filter(None, blocks), strict=True)] or [[np.array([], _TEXT)]] * width
@@ -336,16 +332,17 @@ def _rows(
     return np.array(numbers, dtype=np.int64), columns, faults
 
 
-def _row(text: str, fields: list[str], width: int, separator: str) -> list[str] | None:
-    """The fields of a row that is not like the others; None for an empty line and a comment.
+def _fields_of_row(line: str, fields: list[str], width: int, separator: str) -> list[str]:
+    """The fields of a row that is not like the others; none of an empty line and a comment.
 
     A line that begins with # is a row if it has as many fields as one, or numbers alone behind its first field.
     """
+    text = line.strip()
     if not any(field.strip() for field in fields):
-        return None
+        return []
     if len(fields) == width + 1 and not fields[-1].strip():
         fields = fields[:-1]
     if len(fields) != width:
         fields = split_fields(_REMARK.sub("", text), separator)
     is_row = len(fields) == width or (len(fields) > 2 and all(map(is_number, fields[1:])))
-    return fields if text[0] != "#" or is_row else None
+    return fields if text[0] != "#" or is_row else []

@@ -22,9 +22,9 @@ from rigidfleet.result.quantities import (
     Samples,
     closeness,
     length,
-    of_left,
     owner_name,
     samples,
+    without_lost,
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -166,7 +166,7 @@ class Measurements:
         the end.
         """
         time = self.result.time
-        clearance, nearest = of_left(self.result, self.close.each), self.close.nearest
+        clearance, nearest = without_lost(self.result, self.close.each), self.close.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.told & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.

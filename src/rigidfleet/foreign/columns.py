@@ -29,12 +29,8 @@ _ROWS, _CONTINUES = 3, 5.0
 #: Numbers of vehicles that may take turns, and rows by which this is seen.
 _TURNS, _FIRST = range(2, 17), 1000
 #: Words for what a row may say of itself; for units in a line.
-_FLAGS = re.compile(
-    r"valid|status|flag|ok|quality|lost|track|visible|occluded|fix|health", re.IGNORECASE
-)
-_UNSAID = re.compile(
-    r"\b(units?|mm|cm|ft|feet|inch(es)?|ms|us|ns|deg(rees)?|ned|down)\b", re.IGNORECASE
-)
+_FLAGS = re.compile(r"(?i)valid|status|flag|ok|quality|lost|track|visible|occluded|fix|health")
+_UNSAID = re.compile(r"(?i)\b(units?|mm|cm|ft|feet|inch(es)?|ms|us|ns|deg(rees)?|ned|down)\b")
 
 
 class Doubt(str):
@@ -113,9 +109,8 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
     if not table.named:
         turned = np.linalg.norm(table.numbers(range(4, 8)), axis=1)
         if (np.abs(turned - 1.0) > 0.01).any():
-            raise fault(
-                "has no names of columns", "Begin with a line such as time_s,x_m,y_m,z_m", 1
-            )
+            remedy = "Begin with a line such as time_s,x_m,y_m,z_m"
+            raise fault("has no names of columns", remedy, 1)
         notes.append(f"8 numbers a line without names are read as TUM's: {' '.join(_TUM)}")
     before = [line.strip() for line in table.texts[: table.line - 1] if _UNSAID.search(line)]
     if before and words == ({}, ""):
@@ -266,11 +261,9 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
             raise fault(f"{names} may be places of another vehicle", remedy)
         notes.append(f"the columns {names} are not read: if a vehicle is there, it is not judged")
     for who, own in flown.items():
-        columns = [table.names[k] for k in own.place]
-        if who and meaning_of(columns[0]).who != who.lower():
-            notes.append(
-                f"the columns {', '.join(columns)} are read as places of a vehicle {who!r}"
-            )
+        if who and meaning_of(table.names[own.place[0]]).who != who.lower():
+            columns = ", ".join(table.names[k] for k in own.place)
+            notes.append(f"the columns {columns} are read as places of a vehicle {who!r}")
     return flown
 
 
@@ -449,8 +442,6 @@ def _doubts(table: TextTable, tracks: list[Track], *, axes: bool) -> Iterator[st
     fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
     moves = max(map(np.sum, ways)) > _SLOW and float(np.median(steps)) >= _LONG
     if moves and fastest < _SLOW and not table.units["time"][1]:
-        note += f", so that speeds reach {fastest:.3g} m/s"
-        note = Doubt(
-            f"{note}. Name columns such as time_ms and x_mm, or say --units ms or s, mm or m"
-        )
+        remedy = "Name columns such as time_ms and x_mm, or say --units ms or s, mm or m"
+        note = Doubt(f"{note}, so that speeds reach {fastest:.3g} m/s. {remedy}")
     yield note

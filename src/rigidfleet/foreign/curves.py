@@ -60,9 +60,8 @@ def with_headings(curve: Piecewise, times: Floats, yaws: Floats) -> Piecewise:
     """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]; it jumps where two have one time."""
     moved = curve.cut(times)
     quarter = np.diff(moved.time) / 4  # inside of a piece, where a jump at its end is not seen
-    begin, end = (
-        np.interp(t, times, yaws) for t in (moved.time[:-1] + quarter, moved.time[1:] - quarter)
-    )
+    begin = np.interp(moved.time[:-1] + quarter, times, yaws)
+    end = np.interp(moved.time[1:] - quarter, times, yaws)
     slope = (end - begin) / (2 * quarter)
     yaw = Piecewise(moved.time, np.stack([begin - slope * quarter, slope], axis=-1)[:, None])
     return Piecewise(moved.time, moved.pieces[:, :3]).beside(yaw)

@@ -86,19 +86,15 @@ def read_trajectories(
     listed = [group for path in paths for group in groups_of_files(path)]
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
-    left_out = [
-        note for path in paths if path.is_dir() for note in _note_on_unread_files(path, listed)
-    ]
+    left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
     words = units_of(units, axes)
-    parts = _put_on_one_clock(
-        [_read_sequence(group, interpolation, words) for group in listed], listed
-    )
+    parts = [_read_sequence(group, interpolation, words) for group in listed]
+    parts = _put_on_one_clock(parts, listed)
     kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
     if len(kinds) > 1:
         (_, first), (_, second), *_ = kinds.items()
-        raise TrajectoryError(
-            f"{second}: is of another kind than {first}. Give files of one kind for one flight."
-        )
+        why = f"{second}: is of another kind than {first}"
+        raise TrajectoryError(f"{why}. Give files of one kind for one flight.")
     names = [name for part in parts for name in part.names]
     sources = [group[0] for part, group in zip(parts, listed, strict=True) for _ in part.names]
     if len(set(names)) < len(names):
@@ -118,9 +114,8 @@ def read_trajectories(
     sampled = parts[0].assumed in ASSUMED.values()
     away = spans == "away" or (sampled and spans == "refuse")
     since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
-    read = Trajectories(
-        tuple(names), curves, parts[0].assumed, (), _records_of_alike_files(parts), away, since
-    )
+    records = _records_of_alike_files(parts)
+    read = Trajectories(tuple(names), curves, parts[0].assumed, (), records, away, since)
     notes += _notes_on_gaps(read, sources, spans, gaps) if sampled else []
     return read._replace(notes=(*left_out, *notes, *_note_on_spans(read)))
 
@@ -176,7 +171,7 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     """
     if not path.is_dir():
         return [[path]]
-    inside = [p for p in sorted(path.iterdir(), key=_sort_key) if not _is_hidden(p)]
+    inside = _seen_in(path)
     kinds = {p.suffix.lower() for p in inside if p.is_file()} & _SUFFIXES
     if len(kinds) > 1:
         raise TrajectoryError(
@@ -185,14 +180,7 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     if kinds:
         return [[p] for p in inside if p.suffix.lower() in kinds and p.is_file()]
     folders = [p for p in inside if p.is_dir()]
-    groups = [
-        [
-            p
-            for p in sorted(folder.iterdir(), key=_sort_key)
-            if p.suffix.lower() == ".csv" and not _is_hidden(p)
-        ]
-        for folder in folders
-    ]
+    groups = [[p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders]
     if not groups or not all(groups):
         bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
         raise TrajectoryError(
@@ -210,8 +198,8 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     return groups
 
 
-def _note_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
-    """A note on the files in a folder that are not read.
+def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
+    """A note on the files that are not read, if the path is a folder with such.
 
     Raises
     ------
@@ -231,6 +219,11 @@ def _note_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
             )
     names = _first_few([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
+
+
+def _seen_in(folder: Path) -> list[Path]:
+    """What is in a folder, in order, and not hidden."""
+    return [p for p in sorted(folder.iterdir(), key=_sort_key) if not _is_hidden(p)]
 
 
 def _is_hidden(path: Path) -> bool:
@@ -372,9 +365,8 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         words = f"{names[i]!r} has no sample between {t[0]:g} and {t[-1]:g} s, {share:.3g} times its usual step: its"
         words += " curve is assumed there"
         if nearest[0] < np.inf:
-            words += (
-                f", {nearest[0]:.3g} m from {nearest[2]!r} at {nearest[1]:.3g} s, centre to centre"
-            )
+            far, when, name = nearest
+            words += f", {far:.3g} m from {name!r} at {when:.3g} s, centre to centre"
         notes.append(words)
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")

@@ -174,10 +174,13 @@ def _floats(value: Any, shape: tuple[int | None, ...], where: str) -> Any:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
-    fits = numbers.ndim == len(shape) and all(
-        n in (None, m) for n, m in zip(shape, numbers.shape, strict=True)
-    )
-    if not fits or not np.isfinite(numbers).all() or isinstance(value, str | bool):
+    fits = [n in (None, m) for n, m in zip(shape, numbers.shape, strict=False)]
+    if (
+        numbers.ndim != len(shape)
+        or not all(fits)
+        or not np.isfinite(numbers).all()
+        or isinstance(value, str | bool)
+    ):
         words = "numbers" if shape else "a number"
         raise fault(f"{where}: has {str(value)[:60]!r} where {words} must be")
     return numbers if shape else float(numbers)

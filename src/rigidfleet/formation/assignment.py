@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from itertools import combinations, permutations, product
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +15,6 @@ from rigidfleet.typing import Floats, Ints
 #: Greatest number of points whose distances are all compared, and of orders of slots that are all tried. This is
 #: faster than importing a better algorithm.
 _TRIED = 6
-#: Number of agents whose ways are compared in plain numbers, which is faster than arrays so small.
-FEW = 6
 
 
 class AssignedSlots(NamedTuple):
@@ -40,31 +37,12 @@ def closest_approach(
     pair : the two agents, from 0
     share : share of the path at which they are nearest, in [0, 1]
     """
-    start, end = (np.asarray(x, dtype=np.float64) for x in (start, end))
-    radius = None if radius is None else np.asarray(radius, dtype=np.float64)
     best = np.inf, (0, 0), 0.0
-    if len(start) <= FEW:
-        return min(_approaches_of_few(start, end, radius), default=best)
     for i, separation, s in _approaches(start, end, radius):
         k, j = np.unravel_index(int(separation.argmin()), separation.shape)
         if separation[k, j] < best[0]:
             best = float(separation[k, j]), (int(i[k]), int(i[0] + 1 + j)), float(s[k, j])
     return best
-
-
-def _approaches_of_few(
-    start: Floats, end: Floats, radius: Floats | None
-) -> Iterator[tuple[float, tuple[int, int], float]]:
-    """Least separation of each two agents, the two, and the share of the way there, in plain numbers."""
-    p, q = start.tolist(), end.tolist()
-    r = [0.0] * len(p) if radius is None else radius.tolist()
-    for i, j in combinations(range(len(p)), 2):
-        x, y, z = (a - b for a, b in zip(p[i], p[j], strict=True))
-        u, v, w = (a - b - c for a, b, c in zip(q[i], q[j], (x, y, z), strict=True))
-        s = -(x * u + y * v + z * w) / max(u * u + v * v + w * w, 1e-300)
-        s = min(max(s, 0.0), 1.0)
-        x, y, z = x + s * u, y + s * v, z + s * w
-        yield math.sqrt(x * x + y * y + z * z) - (r[i] + r[j]), (i, j), s
 
 
 def pairs_nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:
@@ -249,16 +227,7 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
     slots that are halved along their longest axis again and again give an order from which few exchanges are left.
     """
     n, order = len(p), _order_by_halves(p, q)
-    # x . y of agents i and j is the product of row i of one matrix and row j of the other.
-    rows, columns = np.ones((n, 8)), np.ones((n, 8))
-
-    def put(i: Ints) -> None:
-        slots = q[order[i]]
-        own = np.einsum("ia,ia->i", p[i], slots)
-        rows[i, :3], rows[i, 3:6], rows[i, 7] = p[i], slots, own
-        columns[i, :3], columns[i, 3:6], columns[i, 6] = -slots, -p[i], own
-
-    put(np.arange(n))
+    slots = q[order]
     least = -_ROUNDING * float((p**2).sum(axis=1).max() + (q**2).sum(axis=1).max())
     improved = True
     while improved:
@@ -266,7 +235,9 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
         for first in range(0, n, _TOGETHER):
             i = np.arange(first, min(first + _TOGETHER, n))
             while len(i):
-                xy = rows[i] @ columns.T
+                own = np.einsum("ia,ia->i", p, slots)
+                crossed = np.hstack([p[i], slots[i]]) @ np.hstack([slots, p]).T
+                xy = own[i, None] + own - crossed
                 j = xy.argmin(axis=1)
                 gain = xy[np.arange(len(i)), j]
                 bad = np.flatnonzero(gain < least)
@@ -276,7 +247,7 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
                 bad = bad[np.argsort(gain[bad], kind="stable")]
                 i, j = _disjoint_pairs(i[bad], j[bad])
                 order[i], order[j] = order[j], order[i]
-                put(np.concatenate([i, j]))
+                slots = q[order]
                 i = np.union1d(i, j[(j >= first) & (j < first + _TOGETHER)])
     return order
 
@@ -324,11 +295,7 @@ def _assign_and_turn(p: Floats, q: Floats, turn: Floats, most: int) -> tuple[Ass
 
 
 def _rotations_of_a_cube() -> list[Floats]:
-    """The 24 rotations of a cube, as attitudes to start from."""
-    turns = []
-    for axes in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.eye(3)[list(axes)] * np.array(signs)[:, None]
-            if np.linalg.det(R) > 0:
-                turns.append(R)
-    return turns
+    """The 24 rotations that a cube does not show, as attitudes to start from."""
+    signs = [np.array(x)[:, None] for x in product((1.0, -1.0), repeat=3)]
+    turns = [np.eye(3)[list(axes)] * s for axes, s in product(permutations(range(3)), signs)]
+    return [R for R in turns if np.linalg.det(R) > 0]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import combinations, islice
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.math.rigid_body import centred
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Floats
 
 #: Relative tolerance within which given distances must be realisable. Flat and straight shapes lie exactly
 #: on the limit, so distances need about seven digits: 5.656854, not 5.657.
@@ -46,12 +46,12 @@ class Violation(NamedTuple):
     """Triangle: by how much the longest side is too long [m]. Tetrahedron: its squared volume [m^6], < 0."""
 
 
-def violations(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) -> list[Violation]:
-    """Find all triangles and tetrahedra among the given distances that do not exist in space.
+def violations(edges: ArrayLike, lengths: ArrayLike) -> list[Violation]:
+    """All triangles and tetrahedra among the given distances that do not exist in space.
 
     A triangle whose three sides are given must meet the triangle inequality; a quadruple with all six
     distances, and faces that exist, must have a Cayley-Menger determinant 288 V^2 >= 0. Both hold within
-    `tol` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not checked,
+    `REALISABLE` of their own size, so that straight (4-8-4) and flat shapes pass. Other quadruples are not checked,
     and distances between more than four agents may be unrealisable even if every four are consistent.
     """
     pairs = np.sort(np.asarray(edges, dtype=np.int64).reshape(-1, 2), axis=1).tolist()
@@ -60,23 +60,17 @@ def violations(edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE) ->
     after: dict[int, set[int]] = {i: set() for pair in pairs for i in pair}
     for i, j in pairs:
         after[i].add(j)
-
-    broken_rules: list[Violation] = []
-    for agents, sides in _with_edges(_cliques(after, 3), index):
-        a = length[sides]
-        excess = 2 * a.max(axis=1) - a.sum(axis=1)
-        for t in np.flatnonzero(excess > tol * a.max(axis=1)):
-            broken_rules.append(Violation(agents[t], tuple(sides[t].tolist()), float(excess[t])))
-    broken = {v.agents for v in broken_rules}
-    for agents, sides in _with_edges(_cliques(after, 4), index):
-        d2 = length[sides] ** 2
-        volume2 = _squared_volume(*d2.T)
-        for q in np.flatnonzero(volume2 < -tol * d2.max(axis=1) ** 3):
-            if not any(face in broken for face in combinations(agents[q], 3)):
-                broken_rules.append(
-                    Violation(agents[q], tuple(sides[q].tolist()), float(volume2[q]))
-                )
-    return broken_rules
+    broken: list[Violation] = []
+    for size, excess_of in ((3, _excess_of_triangles), (4, _squared_volumes)):
+        cliques = list(_cliques(after, size))
+        numbers = (index[pair] for agents in cliques for pair in combinations(agents, 2))
+        sides = np.fromiter(numbers, np.int64).reshape(-1, size * (size - 1) // 2)
+        excess, wrong = excess_of(length[sides])
+        faces = {v.agents for v in broken}
+        for k in np.flatnonzero(wrong):
+            if faces.isdisjoint(combinations(cliques[k], 3)):
+                broken.append(Violation(cliques[k], tuple(sides[k].tolist()), float(excess[k])))
+    return broken
 
 
 def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]:
@@ -92,24 +86,23 @@ def _cliques(after: dict[int, set[int]], size: int) -> Iterator[tuple[int, ...]]
     return extend((), set(after))
 
 
-def _with_edges(
-    cliques: Iterator[tuple[int, ...]], index: dict[tuple[int, int], int]
-) -> Iterator[tuple[list[tuple[int, ...]], Ints]]:
-    """Some thousands of cliques at a time, each with the numbers of its edges 12, 13, ..., 23, ..."""
-    while agents := list(islice(cliques, 4096)):
-        yield agents, np.array([[index[i, j] for i, j in combinations(c, 2)] for c in agents])
+def _excess_of_triangles(sides: Floats) -> tuple[Floats, Floats]:
+    """By how much the longest side of triangles (K, 3) [m] is too long, and where that is no rounding."""
+    longest = sides.max(axis=1)
+    excess = 2 * longest - sides.sum(axis=1)
+    return excess, excess > REALISABLE * longest
 
 
-def _squared_volume(a: Floats, b: Floats, c: Floats, ab: Floats, ac: Floats, bc: Floats) -> Floats:
-    """Squared volume of tetrahedra from squared lengths 12, 13, 14, 23, 24, 34 (Cayley-Menger / 288)."""
-    # Gram matrix of the three edges from the first agent, doubled: its determinant is 288 V^2.
+def _squared_volumes(sides: Floats) -> tuple[Floats, Floats]:
+    """Squared volumes of tetrahedra of sides 12, 13, 14, 23, 24, 34 (K, 6) [m], and where they are negative."""
+    a, b, c, ab, ac, bc = squares = sides.T**2
+    # Gram matrix of the three edges from the first agent, doubled: its determinant is 288 V^2 (Cayley-Menger).
     x, y, z = a + b - ab, a + c - ac, b + c - bc
-    return (8 * a * b * c + 2 * x * y * z - 2 * (a * z**2 + b * y**2 + c * x**2)) / 288
+    volume2 = (8 * a * b * c + 2 * x * y * z - 2 * (a * z**2 + b * y**2 + c * x**2)) / 288
+    return volume2, volume2 < -REALISABLE * squares.max(axis=0) ** 3
 
 
-def slots_from_distances(
-    n: int, edges: ArrayLike, lengths: ArrayLike, tol: float = REALISABLE
-) -> Floats | None:
+def slots_from_distances(n: int, edges: ArrayLike, lengths: ArrayLike) -> Floats | None:
     """Slots (n, 3) [m] of a *complete* set of distances (classical multidimensional scaling).
 
     Distances determine neither attitude nor handedness; both follow a convention that agrees with the paper's
@@ -122,7 +115,7 @@ def slots_from_distances(
     Raises
     ------
     ValueError
-        No points in space have these distances, within `tol` of the largest.
+        No points in space have these distances, within `REALISABLE` of the largest.
     """
     e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
     length = np.asarray(lengths, dtype=np.float64)
@@ -139,7 +132,8 @@ def slots_from_distances(
     p[:, : len(top)] = vector[:, -3:][:, ::-1] * np.sqrt(top)
     error = float(np.abs(distances(p, e) - length).max(initial=0.0))
     # Near a flat shape, an error e in a distance moves points by sqrt(e); therefore distances decide, not the volume.
-    if error > np.sqrt(tol) * d.max(initial=0.0) or value[0] < -tol * n * d.max(initial=0.0) ** 2:
+    largest = d.max(initial=0.0)
+    if error > np.sqrt(REALISABLE) * largest or value[0] < -REALISABLE * n * largest**2:
         raise ValueError(
             f"no points in space have these distances (the nearest realisable set is {error:.3g} m off)"
         )
@@ -165,7 +159,7 @@ def _first_direction(vectors: Iterable[Floats], p: Floats) -> Floats | None:
     return next((v / np.linalg.norm(v) for v in vectors if np.linalg.norm(v) > small), None)
 
 
-def handedness(points: ArrayLike, tol: float = 1e-6) -> int:
+def handedness(points: ArrayLike) -> int:
     """+1 or -1 for a spatial shape and its mirror image, 0 for a planar one.
 
     The sign of (b - a) x (c - a) . (d - a) for the first four agents a < b < c < d that span space, and so the
@@ -179,7 +173,7 @@ def handedness(points: ArrayLike, tol: float = 1e-6) -> int:
         for b in basis:
             rest -= (rest @ b) * b
         length = np.linalg.norm(rest)
-        if length <= tol * size:
+        if length <= 1e-6 * size:
             continue
         if len(basis) == 2:
             return int(np.sign(np.cross(basis[0], basis[1]) @ q))

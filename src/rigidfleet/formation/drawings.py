@@ -65,9 +65,8 @@ class Drawing:
         text = re.sub(r"\s*!important", "", ElementTree.tostring(root, encoding="unicode"))
         unread = re.findall(_BLOCKS, sheet) + re.findall(_SELECTORS, style.text)
         self.notes.update(f"style rule '{' '.join(x.split())[:40]}' is not read" for x in unread)
-        self.notes.update(
-            f"{key} is not followed: all is drawn" for key in re.findall(_IGNORED, text)
-        )
+        ignored = re.findall(_IGNORED, text)
+        self.notes.update(f"{key} is not followed: all is drawn" for key in ignored)
         page = svg.SVG.parse(io.StringIO(text), ppi=96, width=size[0], height=size[1])
         for element in page.elements():
             if isinstance(element, svg.Shape | svg.Text | svg.Image):
@@ -125,12 +124,12 @@ class Drawing:
         if filled:
             self.notes["fill is drawn by its edge, without colour"] += 1
         for part in map(svg.Path, abs(svg.Path(element)).as_subpaths()):
-            ends = [
-                x.npoint(_LINE if isinstance(x, svg.Linear) else _CURVE) for x in list(part)[1:]
-            ]
+            segments = list(part)[1:]
+            ends = [x.npoint(_LINE if isinstance(x, svg.Linear) else _CURVE) for x in segments]
             if ends:
-                x = np.concatenate([ends[0][:1], *(end[1:] for end in ends)])
-                self.outlines.append(np.concatenate([x, x[:1]]) if filled else x)
+                first = ends[0][:1]
+                points = [first, *(x[1:] for x in ends), *([first] if filled else [])]
+                self.outlines.append(np.concatenate(points))
 
 
 def _tag(element: Any) -> str:

@@ -85,9 +85,8 @@ def henneberg(points: ArrayLike) -> Ints:
 
     p = np.asarray(points, dtype=np.float64)
     n = len(p)
-    order = _put_spanning_points_first(
-        p, np.argsort(((p - p.mean(axis=0)) ** 2).sum(axis=1), kind="stable")
-    )
+    away = ((p - p.mean(axis=0)) ** 2).sum(axis=1)
+    order = _put_spanning_points_first(p, np.argsort(away, kind="stable"))
     rank = np.empty(n, dtype=np.int64)
     rank[order] = np.arange(n)
     tree = KDTree(p)
@@ -217,9 +216,8 @@ def _order_from_coarse_to_fine(p: Floats) -> Ints:
 def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
     """The order (N,) with four points that span space moved to the front, each the earliest possible one."""
     if len(p) < 4:
-        raise ValueError(
-            f"{len(p)} points cannot have three edges each; at least four points are needed"
-        )
+        few = f"{len(p)} points cannot have three edges each"
+        raise ValueError(f"{few}; at least four points are needed")
     x = p[order] - p[order[0]]
     x = x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-300)
     chosen = [0, 1]
@@ -229,8 +227,7 @@ def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
     ):
         fits = np.flatnonzero(size() > 0.2)
         if not len(fits):
-            raise ValueError(
-                "points in a plane or on a line cannot be held by three edges each; they need slots"
-            )
+            flat = "points in a plane or on a line cannot be held by three edges each"
+            raise ValueError(f"{flat}; they need slots")
         chosen.append(int(fits[0]))
     return np.concatenate([order[chosen], np.delete(order, chosen)])

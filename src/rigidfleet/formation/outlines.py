@@ -97,16 +97,13 @@ def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
     letters.normalize_rendering(1.0)
     if missing := "".join(x for x in words if x not in letters.all_glyphs):
         raise ValueError(f"has letters that {font!r} lacks: {missing}")
-    return _with_extent(
-        [np.array(x, dtype=np.float64) for x in map(list, letters.strokes_for_text(words))]
-    )
+    strokes = map(list, letters.strokes_for_text(words))
+    return _with_extent([np.array(x, dtype=np.float64) for x in strokes])
 
 
 def _with_extent(outlines: list[Floats]) -> list[Floats]:
-    extended = [
-        x for x in outlines if len(x) > 1 and np.isfinite(x).all() and np.ptp(x, axis=0).any()
-    ]
-    if not extended:
+    finite = (x for x in outlines if len(x) > 1 and np.isfinite(x).all())
+    if not (extended := [x for x in finite if np.ptp(x, axis=0).any()]):
         raise ValueError("has no outline")
     return extended
 

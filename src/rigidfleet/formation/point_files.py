@@ -86,10 +86,8 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
     keys = [tuple(point) for point in np.round(points, 9).tolist()]
     first = {key: k for k, key in reversed(list(enumerate(keys)))}
     if repeated and len(first) < len(keys):
-        notes = (
-            *notes,
-            f"{len(keys) - len(first):,} of {len(keys):,} points repeat others and are left out",
-        )
+        again = f"{len(keys) - len(first):,} of {len(keys):,} points"
+        notes = (*notes, f"{again} repeat others and are left out")
         kept = sorted(first.values())
         points, colours = points[kept], colours and tuple(colours[k] for k in kept)
     else:
@@ -104,10 +102,8 @@ def parse_points(data: bytes, name: str, *, repeated: bool = False) -> Points:
                 continue
             faults.append(Fault(int(lines[k]), f"{points[k].tolist()}", problem, remedy))
         if faults or not keys:
-            raise MissionError(
-                _findings(faults, name, place)
-                or [Finding(name, "", None, "has no points", "write one agent per row: x, y, z")]
-            )
+            faults = faults or [Fault(0, "", "has no points", "write one agent per row: x, y, z")]
+            raise MissionError(_findings(faults, name, place))
     return Points(points, colours, notes)
 
 
@@ -164,20 +160,15 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
     table, notes = TextTable(data, unnamed), []
     if not table.columns:
         return table.lines, np.zeros((0, 3)), None, ()
-    if (
-        not table.named
-        and table.separator == ","
-        and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE)
-    ):
-        raise fault(
-            "has numbers such as 00", "if commas are decimal marks, separate numbers by semicolons"
-        )
+    bare = not table.named and table.separator == ","
+    if bare and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE):
+        remedy = "if commas are decimal marks, separate numbers by semicolons"
+        raise fault("has numbers such as 00", remedy)
     if not table.place("x", "y"):
         raise table.missing("x", "y")
     if (time := table.place("time")) and len(table.codes(time[0])[1]) > 1:
-        raise fault(
-            "has points of several times", "keep the rows of one, or fly it as a trajectory"
-        )
+        remedy = "keep the rows of one, or fly it as a trajectory"
+        raise fault("has points of several times", remedy)
     axes = [axis for axis in _AXES if table.place(axis)]
     hues = table.place(*_HUES) if not table.place("colour") else []
     values = table.numbers(table.place(*axes) + hues)
@@ -193,9 +184,8 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
         shares = values[:, len(axes) :].max(initial=0.0) <= 1.0
         decimal = shares and any("." in x for k in hues for x in table.columns[k].tolist())
         if shares and not decimal and values[:, len(axes) :].any():
-            notes.append(
-                "colours are at most 1 of 255; write shares from 0 to 1 with a point (1.0)"
-            )
+            remedy = "write shares from 0 to 1 with a point (1.0)"
+            notes.append(f"colours are at most 1 of 255; {remedy}")
         colours = _hexadecimal(values[:, len(axes) :], shares=decimal)
     return table.lines, points, colours, tuple(notes)
 
@@ -215,11 +205,8 @@ def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     if array.shape[1] < 6:
         return points, None, ()
     hues = array[:, 3:].astype(np.float64)
-    return (
-        points,
-        _hexadecimal(hues, shares=hues.max(initial=0.0) <= 1.0 and bool((hues % 1.0).any())),
-        (),
-    )
+    shares = hues.max(initial=0.0) <= 1.0 and bool((hues % 1.0).any())
+    return points, _hexadecimal(hues, shares=shares), ()
 
 
 def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
@@ -262,9 +249,8 @@ def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
         if len(cells) < count or any(len(row) < len(columns) for row in cells):
             raise short
         places = [[*columns].index(name) for name in names]
-        values = np.array([[float(row[i]) for i in places] for row in cells]).reshape(
-            -1, len(names)
-        )
+        values = np.array([[float(row[i]) for i in places] for row in cells])
+        values = values.reshape(count, len(names))
     if len(names) == 3:
         return values, None, ()
     types = {columns[name] for name in names[3:]}

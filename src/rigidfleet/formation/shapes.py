@@ -7,6 +7,7 @@ slots do.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -77,14 +78,14 @@ def _shells(size: Floats, n: int) -> Floats:
     def radius(count: int) -> float:
         return float(np.linalg.norm(_sphere(size, count)[0]))
 
-    low, high = n // 2, n - 4  # numbers of agents of the outer sphere: too few, and enough
-    if radius(high) - radius(n - high) < size[0]:
+    def apart(outer: int) -> float:
+        return radius(outer) - radius(n - outer)
+
+    numbers = range(n // 2 + 1, n - 3)  # of agents of the outer sphere
+    outer = n // 2 + 1 + bisect_left(numbers, size[0], key=apart)
+    if outer not in numbers:
         raise ValueError(f"{n} agents are too few for a sphere inside a sphere")
-    while high - low > 1:
-        middle = (low + high) // 2
-        apart = radius(middle) - radius(n - middle)
-        low, high = (middle, high) if apart < size[0] else (low, middle)
-    return np.concatenate([_sphere(size, high), _sphere(size, n - high)])
+    return np.concatenate([_sphere(size, outer), _sphere(size, n - outer)])
 
 
 def _helix(size: Floats, n: int) -> Floats:
@@ -103,9 +104,8 @@ def _helix(size: Floats, n: int) -> Floats:
         middle = (low + high) / 2
         low, high = (middle, high) if chord(middle) < spacing else (low, middle)
     angle = high * np.arange(n)
-    return np.column_stack(
-        [radius * np.cos(angle), radius * np.sin(angle), rise * angle / 2 / np.pi]
-    )
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    return np.column_stack([x, y, rise * angle / 2 / np.pi])
 
 
 def _rings(*rings: tuple[int, float, float, float]) -> Floats:

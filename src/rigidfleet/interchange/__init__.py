@@ -1,15 +1,15 @@
 """Flights as the files that other programs fly, show or record.
 
 `export` writes a flight in one of `FORMATS`, reads its own output back, and says how far it is from what was exported.
-Each module of this package writes and reads the formats of one family: a ``write`` function yields the bytes of one
-file after the other, and its ``read`` function returns the ways in them.
+Each module of this package writes and reads the formats of one family: a ``write`` function returns the bytes of a
+file of one or all vehicles, and its ``read`` function the ways in them.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,11 +21,12 @@ from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import replacing_folder, write_file
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
-from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush, tables
+from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush
 from rigidfleet.interchange.curves import Deviation, ExportedMotion, deviation, exported_motion
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights
+from rigidfleet.setpoints import csv_text
 
 __all__ = ["FORMATS", "Export", "Format", "FormatName", "export"]
 
@@ -41,7 +42,7 @@ class Format(NamedTuple):
 
     Attributes
     ----------
-    write : from what is exported and the rate [Hz] or the tolerance [m] to the bytes of each file
+    write : from the motion in a file and the rate [Hz] or the tolerance [m] to the file's bytes
     read : from the bytes of a file to the ways of its vehicles
     suffix : of the files' names
     each : whether each vehicle has a file of its own
@@ -52,7 +53,7 @@ class Format(NamedTuple):
     lights : whether it has the vehicles' lights
     """
 
-    write: Callable[[ExportedMotion, Any], Iterator[bytes]]
+    write: Callable[[ExportedMotion, Any], bytes]
     read: Callable[[bytes], list[Piecewise]]
     suffix: str
     each: bool
@@ -65,9 +66,14 @@ class Format(NamedTuple):
     lights: bool = False
 
 
+def _write_table(motion: ExportedMotion, rate: float | None) -> bytes:
+    """The table that `Result.to_csv` writes: a row for each time and vehicle."""
+    return csv_text(motion.at_rate(rate), motion.first + 1).encode()
+
+
 FORMATS: dict[str, Format] = {
     "setpoints": Format(
-        tables.write_table, texts.read_table, "csv", False, None,
+        _write_table, texts.read_table, "csv", False, None,
         "position, velocity, acceleration, jerk, yaw and yaw rate", "tilt and rotors", False,
     ),
     "polynomial": Format(
@@ -185,7 +191,9 @@ def export(
         ``result`` is neither a flight nor a path.
     """
     result, path = as_result(result), as_path(path)
-    chosen = _chosen(format, path)
+    chosen = format_of(format)
+    if format == "setpoints" and path.suffix != ".csv":
+        chosen = chosen._replace(each=True)
     setting = _setting(format, chosen, rate, tolerance)
     if chosen.package and find_spec(chosen.package) is None:
         raise ResultError(
@@ -200,9 +208,8 @@ def export(
     end = motion.end - off.missing
     part = ""
     if cut or off.missing > 1e-3:
-        part = f" from {motion.start:g} to {end:g} s" + (
-            " (slots are not tracked before or after)" if cut else ""
-        )
+        why = " (slots are not tracked before or after)" if cut else ""
+        part = f" from {motion.start:g} to {end:g} s{why}"
     return Export(
         format, path, count, size, flown, off.position, off.yaw, (motion.start, end), part,
         has_lights(result),
@@ -221,13 +228,6 @@ def format_of(name: str) -> Format:
         why = "; plans have no times: use tlog to fly, gltf to look" if name == "plan" else ""
         raise ValueError(f"there is no format {name!r}{why}; use one of {', '.join(FORMATS)}")
     return FORMATS[name]
-
-
-def _chosen(format: str, path: Path) -> Format:
-    chosen = format_of(format)
-    if format == "setpoints" and path.suffix != ".csv":
-        return chosen._replace(write=tables.write_tables, each=True)
-    return chosen
 
 
 def _setting(
@@ -250,43 +250,36 @@ def _write_and_measure(
 ) -> tuple[Deviation, int, int]:
     """Write the files, all or none; return how far they are off, and how many bytes and files they are."""
     deviations: list[Deviation] = []
-    size = count = 0
-    for_each = chosen.write(motion, setting)
+    sizes: list[int] = []
 
-    def measured() -> Iterator[bytes]:
-        nonlocal size, count
-        for data in for_each:
-            deviations.extend(_deviations(motion, chosen, data, len(deviations)))
-            worst = max(deviations, key=lambda x: x.position).position
-            if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
-                raise ResultError(
-                    f"the tolerance of {1e3 * setting:g} mm cannot be met: what was written is {1e3 * worst:.2g} mm "
-                    f"off, by rounding. Use --tolerance {1.2 * worst:.2g}."
-                )
-            size, count = size + len(data), count + 1
-            yield data
+    def file_of(part: ExportedMotion) -> bytes:
+        data = chosen.write(part, setting)
+        start = motion.start if chosen.own_time else 0.0
+        for i, way in enumerate(chosen.read(data)):
+            until = motion.result.motors_off[part.first + i]
+            deviations.append(deviation(part.curve(i), way.later(start), until))
+        worst = max(x.position for x in deviations)
+        if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
+            raise ResultError(
+                f"the tolerance of {1e3 * setting:g} mm cannot be met: what was written is {1e3 * worst:.2g} mm "
+                f"off, by rounding. Use --tolerance {1.2 * worst:.2g}."
+            )
+        sizes.append(len(data))
+        return data
 
     if not chosen.each:
-        for data in measured():
-            write_file(path, data)
+        write_file(path, file_of(motion))
     else:
         if path.suffix == f".{chosen.suffix}":
             raise ResultError(f"{path}: each vehicle has a file of its own. Give a folder.")
         width = len(str(motion.n_agents))
         ours = re.compile(rf"agent-\d+\.{chosen.suffix}")
         with replacing_folder(path, ours) as folder:
-            for i, data in enumerate(measured(), start=1):
-                (folder / f"agent-{i:0{width}}.{chosen.suffix}").write_bytes(data)
-    return Deviation(*(float(np.max(x)) for x in zip(*deviations, strict=True))), size, count
-
-
-def _deviations(motion: ExportedMotion, chosen: Format, data: bytes, first: int) -> list[Deviation]:
-    """How far the ways in a file are from those of the vehicles from ``first`` on."""
-    start = motion.start if chosen.own_time else 0.0
-    return [
-        deviation(motion.curve(first + i), curve.later(start), motion.result.motors_off[first + i])
-        for i, curve in enumerate(chosen.read(data))
-    ]
+            for i in range(motion.n_agents):
+                name = f"agent-{i + 1:0{width}}.{chosen.suffix}"
+                (folder / name).write_bytes(file_of(motion.of_vehicle(i)))
+    greatest = Deviation(*(float(np.max(x)) for x in zip(*deviations, strict=True)))
+    return greatest, sum(sizes), len(sizes)
 
 
 def brief_number(x: float) -> str:

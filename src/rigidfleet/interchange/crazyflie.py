@@ -8,7 +8,7 @@ the piece before).
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from rigidfleet.foreign.curves import NAMES, curve_to_rows, rows_to_curve
 from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
-from rigidfleet.typing import Floats
 
 #: Bytes of the vehicle's memory for trajectories, and of one piece of kind poly4d.
 MEMORY, _POLY4D = 4096, 4 * (4 * POWERS + 1)
@@ -36,34 +35,29 @@ _END = _PIECE.pack(0, 0)
 _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 1000]))
 
 
-def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
-    """One table a vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
-    for agent in range(motion.n_agents):
-        rows = curve_to_rows(fit_curve(motion.curve(agent), tolerance))
-        lines = [",".join(f"{x:.9g}" for x in row) for row in rows]
-        yield "\n".join([_HEADER, *lines, ""]).encode()
+def write_polynomial(motion: ExportedMotion, tolerance: float) -> bytes:
+    """A table for one vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
+    rows = curve_to_rows(fit_curve(motion.curve(), tolerance))
+    lines = [",".join(f"{x:.9g}" for x in row) for row in rows]
+    return "\n".join([_HEADER, *lines, ""]).encode()
 
 
-def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
-    """One memory image a vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
+def write_poly4d(motion: ExportedMotion, tolerance: float) -> bytes:
+    """A memory image for one vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
 
     Raises
     ------
     ResultError
-        A flight needs more than `PIECES` pieces.
+        The flight needs more than `PIECES` pieces.
     """
-    for agent in range(motion.n_agents):
-        way = motion.curve(agent)
-        curve = fit_curve(way, tolerance)
-        if len(curve.pieces) > PIECES:
-            raise _error_of_a_long_flight(
-                agent,
-                f"{len(curve.pieces)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}",
-                curve.time[PIECES] - curve.time[0],
-                tolerance,
-                lambda x, way=way: len(fit_curve(way, x).pieces) <= PIECES,
-            )
-        yield np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
+    way = motion.curve()
+    curve = fit_curve(way, tolerance)
+    if (count := len(curve.pieces)) > PIECES:
+        needed = f"{count} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
+        until = curve.time[PIECES] - curve.time[0]
+        fits = lambda x: len(fit_curve(way, x).pieces) <= PIECES  # noqa: E731
+        raise _error_of_a_long_flight(motion, needed, until, tolerance, fits)
+    return np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
 
 
 def read_poly4d(data: bytes) -> list[Piecewise]:
@@ -72,13 +66,13 @@ def read_poly4d(data: bytes) -> list[Piecewise]:
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
-def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
-    """One compressed image a vehicle: Bernstein coefficients in millimetres and tenths of a degree.
+def write_compressed(motion: ExportedMotion, tolerance: float) -> bytes:
+    """A compressed image for one vehicle: Bernstein coefficients in millimetres and tenths of a degree.
 
     Raises
     ------
     ResultError
-        The tolerance is not more than the rounding, or a flight needs more than `MEMORY` bytes, a length more than
+        The tolerance is not more than the rounding, or the flight needs more than `MEMORY` bytes, a length more than
         32.767 m, or a piece more than 65.535 s.
     """
     if tolerance <= COMPRESSED_ROUNDING:
@@ -86,26 +80,22 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[bytes
             f"the tolerance of {1e3 * tolerance:g} mm cannot be met: this format rounds to millimetres. "
             f"Use --tolerance {2 * COMPRESSED_ROUNDING:g} or more."
         )
-    for agent in range(motion.n_agents):
-        way = motion.curve(agent)
-        way = way.on(np.round(way.time / _MS) * _MS)
-        data, ends = _compressed_image(way, tolerance, agent)
-        if len(data) > MEMORY:
-            raise _error_of_a_long_flight(
-                agent,
-                f"{len(data)} bytes, and the memory has {MEMORY}",
-                ends[
-                    max(0, int(np.searchsorted(ends[:, 0], MEMORY - len(_END), side="right")) - 1),
-                    1,
-                ],
-                tolerance,
-                lambda x, way=way, agent=agent: len(_compressed_image(way, x, agent)[0]) <= MEMORY,
-            )
-        yield data
+    way = motion.curve()
+    way, number = way.on(np.round(way.time / _MS) * _MS), motion.first + 1
+    data, ends = _compressed_image(way, tolerance, number)
+    if len(data) > MEMORY:
+        needed = f"{len(data)} bytes, and the memory has {MEMORY}"
+        room = MEMORY - len(_END)
+        until = max((t for size, t in ends if size <= room), default=ends[0][1])
+        fits = lambda x: len(_compressed_image(way, x, number)[0]) <= MEMORY  # noqa: E731
+        raise _error_of_a_long_flight(motion, needed, until, tolerance, fits)
+    return data
 
 
-def _compressed_image(way: Piecewise, tolerance: float, agent: int) -> tuple[bytes, Floats]:
-    """The image of a way with times in whole milliseconds, and where each piece ends in it: (n, 2) [bytes, s]."""
+def _compressed_image(
+    way: Piecewise, tolerance: float, number: int
+) -> tuple[bytes, list[tuple[int, float]]]:
+    """The image of a way with times in whole milliseconds, and where each piece ends in it [bytes, s]."""
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
     curve = fit_curve(way, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     duration = np.diff(curve.time)
@@ -116,13 +106,13 @@ def _compressed_image(way: Piecewise, tolerance: float, agent: int) -> tuple[byt
         k = int(np.argmax(abs(position).max(axis=(1, 2))))
         far = float(abs(position).max()) * _MM
         raise ResultError(
-            f"agent {agent + 1} or a control point of its curve is {far:.3f} m from the origin along an axis, between "
+            f"agent {number} or a control point of its curve is {far:.3f} m from the origin along an axis, between "
             f"{curve.time[k]:g} and {curve.time[k + 1]:g} s, and this format ends at {_MOST * _MM:g} m. Fly nearer to "
             f"the origin, or smaller by a factor of {_MOST * _MM / far:.2g}, or use poly4d."
         )
     if abs(yaw).max() > _MOST:
         raise ResultError(
-            f"the yaw of agent {agent + 1} reaches {abs(yaw).max() / 10:.0f} deg, and this format ends at "
+            f"the yaw of agent {number} reaches {abs(yaw).max() / 10:.0f} deg, and this format ends at "
             f"{_MOST / 10:g} deg. Turn less, or use poly4d."
         )
     points = [*np.round(np.moveaxis(position, 1, 0)).astype(int), np.round(yaw[:, 0]).astype(int)]
@@ -138,7 +128,7 @@ def _compressed_image(way: Piecewise, tolerance: float, agent: int) -> tuple[byt
                 at[axis] = due[-1]
         data += _PIECE.pack(kinds, milliseconds) + body
         ends.append((len(data), curve.time[k + 1] - curve.time[0]))
-    return data + _END, np.array(ends)
+    return data + _END, ends
 
 
 def read_compressed(data: bytes) -> list[Piecewise]:
@@ -163,14 +153,16 @@ def read_compressed(data: bytes) -> list[Piecewise]:
 
 
 def _error_of_a_long_flight(
-    agent: int, needed: str, until: float, tolerance: float, fits: Callable[[float], bool]
+    motion: ExportedMotion,
+    needed: str,
+    until: float,
+    tolerance: float,
+    fits: Callable[[float], bool],
 ) -> ResultError:
     """Error about a flight that does not fit: which tolerance makes it fit, and how many seconds do."""
     enough = next((x for x in _TRIED if x > tolerance and fits(x)), None)
-    remedy = (
-        f"--tolerance {enough:g} makes it fit" if enough else "no tolerance up to 1 m makes it fit"
-    )
+    remedy = f"--tolerance {enough:g}" if enough else "No tolerance up to 1 m"
     return ResultError(
-        f"the flight of agent {agent + 1} needs {needed}. {remedy[0].upper()}{remedy[1:]}; at "
+        f"the flight of agent {motion.first + 1} needs {needed}. {remedy} makes it fit; at "
         f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
     )

@@ -11,7 +11,7 @@ from rigidfleet.errors import ResultError
 from rigidfleet.math import series
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result import Result
-from rigidfleet.setpoints import Setpoints, at_rate, curve
+from rigidfleet.setpoints import Setpoints, at_rate, curve_of
 from rigidfleet.typing import Floats
 
 #: Tolerance of yaw [rad] of exported curves. Position does not depend on it.
@@ -23,18 +23,18 @@ _COMPARED = np.array([0.02, 0.25, 0.5, 0.75, 0.98])
 
 @dataclass(frozen=True)
 class ExportedMotion:
-    """What is exported: the states of all vehicles at both ends of every interval between samples.
+    """What a file gets: the states of its vehicles at both ends of every interval between samples.
 
     Attributes
     ----------
     result : the flight
     samples : setpoints as recorded, both at a change of phase
-    flown : whether it is the motion flown, not the reference
+    first : the first of the vehicles, from 0
     """
 
     result: Result
     samples: Setpoints
-    flown: bool
+    first: int = 0
 
     @property
     def start(self) -> float:
@@ -51,13 +51,19 @@ class ExportedMotion:
         """Number of vehicles."""
         return self.samples.yaw.shape[1]
 
+    def of_vehicle(self, agent: int) -> ExportedMotion:
+        """The motion of one of all vehicles alone."""
+        time, state, yaw, yaw_rate = self.samples
+        samples = Setpoints(time, state[:, :, [agent]], yaw[:, [agent]], yaw_rate[:, [agent]])
+        return ExportedMotion(self.result, samples, agent)
+
     def at_rate(self, rate: float | None) -> Setpoints:
         """Setpoints at a rate [Hz]; without one, the samples."""
         return at_rate(self.samples, rate)
 
-    def curve(self, agent: int) -> Piecewise:
-        """The way of one vehicle: degree 7 (yaw: 3) between samples."""
-        return curve(self.samples, agent)
+    def curve(self, agent: int = 0) -> Piecewise:
+        """The way of one of the vehicles, from 0: degree 7 (yaw: 3) between samples."""
+        return curve_of(self.samples, agent)
 
 
 def fit_curve(
@@ -181,20 +187,17 @@ def exported_motion(result: Result, *, flown: bool) -> tuple[ExportedMotion, boo
     yaw, yaw_rate = setpoints.yaw, setpoints.yaw_rate
     if flown:  # a flight without yaw of its own keeps pointing east
         yaw, yaw_rate = np.nan_to_num(yaw), np.nan_to_num(yaw_rate)
-    k, n = yaw.shape
-    states = setpoints.state.swapaxes(1, 2).reshape(k, n, 12)
-    every = np.concatenate([states, yaw[..., None], yaw_rate[..., None]], axis=2)
-    bad = ~np.asarray(np.isfinite(every).all(axis=2))
-    nothing = np.asarray(bad.all(axis=1))
+    known = np.isfinite(setpoints.state).all(axis=(1, 3)) & np.isfinite(yaw) & np.isfinite(yaw_rate)
+    there = np.flatnonzero(known.any(axis=1))
     which = "motion flown" if flown else "reference"
-    if nothing.all():
+    if not len(there):
         raise ResultError(
             f"the {which} of this flight has no numbers: nothing is tracked. Export what was flown: --flown."
         )
-    first, last = int(np.argmin(nothing)), len(nothing) - int(np.argmin(nothing[::-1]))
+    first, last = int(there[0]), int(there[-1]) + 1
     kept = slice(first, last)
-    if bad[kept].any():
-        k, agent = np.argwhere(bad[kept])[0]
+    if not known[kept].all():
+        k, agent = np.argwhere(~known[kept])[0]
         at = setpoints.time[first + k]
         name = result.phases[result.phase[first + k]].name
         raise ResultError(
@@ -204,4 +207,4 @@ def exported_motion(result: Result, *, flown: bool) -> tuple[ExportedMotion, boo
     if last - first < 2:
         raise ResultError(f"the {which} has one sample only. Fly the mission further.")
     cut = Setpoints(setpoints.time[kept], setpoints.state[kept], yaw[kept], yaw_rate[kept])
-    return ExportedMotion(result, cut, flown), last - first < len(nothing)
+    return ExportedMotion(result, cut), last - first < len(known)

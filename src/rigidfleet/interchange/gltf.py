@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,7 @@ _MAGIC, _JSON, _BINARY = 0x46546C67, 0x4E4F534A, 0x004E4942
 #: Extension by which lights change, and the camera's vertical angle of view [rad].
 _POINTER, _FOV = "KHR_animation_pointer", 0.6
 #: An octahedron of radius 1: corners and triangles.
-_CORNERS = np.array(
-    [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], dtype=float
-)
+_CORNERS = np.kron(np.eye(3), [[1.0], [-1.0]]) + 0.0  # no -0.0
 _FACES = np.array(
     [[2, 4, 0], [2, 1, 4], [2, 5, 1], [2, 0, 5], [3, 0, 4], [3, 4, 1], [3, 1, 5], [3, 5, 0]]
 )
@@ -60,7 +57,7 @@ class _File:
         return len(self.accessors) - 1
 
 
-def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+def write_gltf(motion: ExportedMotion, tolerance: float) -> bytes:
     """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between.
 
     If the flight has lights, each vehicle shines in its own, seen by a camera in front.
@@ -99,7 +96,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     words = json.dumps(scene).encode()
     parts = [(_JSON, words + b" " * (-len(words) % 4)), (_BINARY, bytes(file.data))]
     size = 12 + sum(8 + len(part) for _, part in parts)
-    yield struct.pack("<III", _MAGIC, 2, size) + b"".join(
+    return struct.pack("<III", _MAGIC, 2, size) + b"".join(
         struct.pack("<II", len(part), kind) + part for kind, part in parts
     )
 

@@ -7,7 +7,6 @@ checksum CRC-16/MCRF4XX. Local axes are north, east, down: (N, E, D) = (y, x, -z
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import numpy as np
 from rigidfleet.foreign.curves import curve_through_states
 from rigidfleet.interchange.curves import ExportedMotion
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.setpoints import Setpoints, at_times
+from rigidfleet.setpoints import at_times
 from rigidfleet.typing import Floats
 
 #: SET_POSITION_TARGET_LOCAL_NED: number, extra byte of the checksum, and fields in the order of the wire.
@@ -41,36 +40,35 @@ _MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
 _LOCAL_NED, _AUTOPILOT = 1, 1
 
 
-def write_tlog(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
-    """One log a vehicle: at each time the message that asks for position, velocity, acceleration, yaw and yaw rate.
+def write_tlog(motion: ExportedMotion, rate: float | None) -> bytes:
+    """A log for one vehicle: at each time a message that asks for position, velocity, acceleration, yaw and yaw rate.
 
     Vehicle i is system i (from 256 on, again from 1). Times are whole milliseconds since the start; states are those
     of these times. If the mission has a geodetic origin, the first message sets it. A vehicle that has landed for good
     is disarmed, and gets no more setpoints.
     """
-    setpoints = _in_milliseconds(motion, rate)
+    wanted = np.unique(np.round((motion.at_rate(rate).time - motion.start) * 1e3))
+    setpoints = at_times(motion.samples, np.minimum(wanted / 1e3 + motion.start, motion.end))
     every = np.round((setpoints.time - motion.start) * 1e3).astype(np.int64)
-    for agent in range(motion.n_agents):
-        system = agent % _SYSTEMS + 1
-        off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
-        flies = every <= off
-        milliseconds = every[flies]
-        records: Any = np.zeros(len(milliseconds), dtype=_RECORD)
-        records["time"] = 1000 * milliseconds
-        records["mark"], records["length"], records["system"] = _MARK, _FIELDS.itemsize, _STATION
-        records["sequence"] = (np.arange(len(records)) + 1) % 256
-        records["message"] = _TARGET
-        fields = records["fields"]
-        fields["time_boot_ms"] = milliseconds
-        fields["state"] = _swap_enu_and_ned(setpoints.state[flies, :3, agent])
-        fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, agent] + np.pi) % (2.0 * np.pi) - np.pi
-        fields["yaw_rate"] = -setpoints.yaw_rate[flies, agent]
-        fields["target_system"], fields["target_component"] = system, _AUTOPILOT
-        fields["coordinate_frame"] = _LOCAL_NED
-        covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
-        records["checksum"] = _checksum(covered, _TARGET_EXTRA)
-        disarmed = b"" if off > every[-1] else _disarm_record(int(milliseconds[-1]), system)
-        yield _origin_record(motion, system) + records.tobytes() + disarmed
+    off = 1e3 * (float(motion.result.motors_off[motion.first]) - motion.start)
+    flies, system = every <= off, motion.first % _SYSTEMS + 1
+    milliseconds = every[flies]
+    records: Any = np.zeros(len(milliseconds), dtype=_RECORD)
+    records["time"] = 1000 * milliseconds
+    records["mark"], records["length"], records["system"] = _MARK, _FIELDS.itemsize, _STATION
+    records["sequence"] = (np.arange(len(records)) + 1) % 256
+    records["message"] = _TARGET
+    fields = records["fields"]
+    fields["time_boot_ms"] = milliseconds
+    fields["state"] = _swap_enu_and_ned(setpoints.state[flies, :3, 0])
+    fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, 0] + np.pi) % (2.0 * np.pi) - np.pi
+    fields["yaw_rate"] = -setpoints.yaw_rate[flies, 0]
+    fields["target_system"], fields["target_component"] = system, _AUTOPILOT
+    fields["coordinate_frame"] = _LOCAL_NED
+    covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
+    records["checksum"] = _checksum(covered, _TARGET_EXTRA)
+    disarmed = b"" if off > every[-1] else _disarm_record(int(milliseconds[-1]), system)
+    return _origin_record(motion, system) + records.tobytes() + disarmed
 
 
 def read_tlog(data: bytes) -> list[Piecewise]:
@@ -81,17 +79,9 @@ def read_tlog(data: bytes) -> list[Piecewise]:
     records: Any = np.frombuffer(data, dtype=_RECORD, count=len(data) // _RECORD.itemsize)
     fields = records["fields"]
     state = _swap_enu_and_ned(fields["state"].astype(float)).swapaxes(0, 1)
-    yaw = np.stack(
-        [np.unwrap(np.pi / 2 - fields["yaw"].astype(float)), -fields["yaw_rate"].astype(float)]
-    )
+    north, rate = fields["yaw"].astype(float), fields["yaw_rate"].astype(float)
+    yaw = np.stack([np.unwrap(np.pi / 2 - north), -rate])
     return [curve_through_states(fields["time_boot_ms"] / 1e3, state[:2], yaw)]
-
-
-def _in_milliseconds(motion: ExportedMotion, rate: float | None) -> Setpoints:
-    """Setpoints at a rate [Hz], at times that are whole milliseconds after the start."""
-    setpoints = motion.at_rate(rate)
-    wanted = np.unique(np.round((setpoints.time - motion.start) * 1e3)) / 1e3 + motion.start
-    return at_times(motion.samples, np.minimum(wanted, motion.end))
 
 
 def _swap_enu_and_ned(x: Floats) -> Floats:
@@ -102,12 +92,8 @@ def _swap_enu_and_ned(x: Floats) -> Floats:
 def _origin_record(motion: ExportedMotion, system: int) -> bytes:
     if (origin := motion.result.mission.geodetic_origin) is None:
         return b""
-    fields = _ORIGIN_FIELDS.pack(
-        round(1e7 * origin.latitude_deg),
-        round(1e7 * origin.longitude_deg),
-        round(1e3 * origin.altitude),
-        system,
-    )
+    place = round(1e7 * origin.latitude_deg), round(1e7 * origin.longitude_deg)
+    fields = _ORIGIN_FIELDS.pack(*place, round(1e3 * origin.altitude), system)
     return _record(0, _ORIGIN, fields, _ORIGIN_EXTRA)
 
 

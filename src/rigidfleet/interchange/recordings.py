@@ -9,55 +9,28 @@ from __future__ import annotations
 import io
 import struct
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from rigidfleet.foreign.columns import yaws_of
 from rigidfleet.foreign.curves import curve_through_states
 from rigidfleet.interchange.curves import ExportedMotion
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
-_HEADER = """
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-_RULE = "=" * 80
-_POSE = f"""std_msgs/Header header
-geometry_msgs/Pose pose
-{_RULE}
-MSG: geometry_msgs/Pose
-geometry_msgs/Point position
-geometry_msgs/Quaternion orientation
-{_RULE}
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-{_RULE}
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w{_HEADER}"""
-_TWIST = f"""std_msgs/Header header
-geometry_msgs/Twist twist
-{_RULE}
-MSG: geometry_msgs/Twist
-geometry_msgs/Vector3 linear
-geometry_msgs/Vector3 angular
-{_RULE}
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z{_HEADER}"""
+#: Fields of each type of message, in the order in which definitions name the types.
+_FIELDS = {
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Twist": "geometry_msgs/Vector3 linear\ngeometry_msgs/Vector3 angular",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n",
+}
+#: Types of the parts of a pose and of a twist.
+_PARTS = {"Pose": ("Point", "Quaternion"), "Twist": ("Vector3",)}
 #: Both messages in CDR: mark of little-endian CDR, stamp, length and text of the frame's name, numbers.
 _FRAME = b"map\0"
 _START = struct.Struct("<4siII4s")
@@ -65,7 +38,7 @@ _CDR = b"\0\1\0\0"
 _BILLION = 1_000_000_000
 
 
-def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+def write_mcap(motion: ExportedMotion, rate: float | None) -> bytes:
     """One file: topics /agent_i/pose (PoseStamped) and /agent_i/twist (TwistStamped), in world axes, frame "map"."""
     from mcap.writer import Writer
 
@@ -79,12 +52,11 @@ def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     writer = Writer(buffer)
     writer.start(profile="ros2", library="rigidfleet")
     channels = []
-    for kind, words in (("pose", _POSE), ("twist", _TWIST)):
-        name = f"geometry_msgs/msg/{kind.capitalize()}Stamped"
+    for kind in _PARTS:
+        name, words = f"geometry_msgs/msg/{kind}Stamped", _definition(kind)
         schema = writer.register_schema(name=name, encoding="ros2msg", data=words.encode())
-        channels.append(
-            [writer.register_channel(f"/agent_{i + 1}/{kind}", "cdr", schema) for i in range(n)]
-        )
+        topics = [f"/agent_{i + 1}/{kind.lower()}" for i in range(n)]
+        channels.append([writer.register_channel(topic, "cdr", schema) for topic in topics])
     for k, t in enumerate(setpoints.time.tolist()):
         at = round(t * _BILLION)
         start = _START.pack(_CDR, at // _BILLION, at % _BILLION, len(_FRAME), _FRAME)
@@ -92,7 +64,15 @@ def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
             for channel, row in zip(ids, rows.astype("<f8"), strict=True):
                 writer.add_message(channel, at, start + row.tobytes(), at, k)
     writer.finish()
-    yield buffer.getvalue()
+    return buffer.getvalue()
+
+
+def _definition(kind: str) -> str:
+    """The definition of a stamped pose or twist, and of all types that it has, as ROS 2 writes it."""
+    types = [f"geometry_msgs/{name}" for name in (kind, *_PARTS[kind])]
+    fields = f"std_msgs/Header header\n{types[0]} {kind.lower()}"
+    types += ["std_msgs/Header", "builtin_interfaces/Time"]
+    return "".join([fields, *(f"\n{'=' * 80}\nMSG: {name}\n{_FIELDS[name]}" for name in types)])
 
 
 def read_mcap(data: bytes) -> list[Piecewise]:
@@ -107,14 +87,13 @@ def read_mcap(data: bytes) -> list[Piecewise]:
     curves = []
     for i in range(1, len(rows_of) // 2 + 1):
         pose, twist = (np.array(rows_of[f"/agent_{i}/{kind}"]) for kind in ("pose", "twist"))
-        yaw = np.stack([_yaws(pose[:, 4:]), twist[:, 6]])
-        curves.append(
-            curve_through_states(pose[:, 0], np.stack([pose[:, 1:4], twist[:, 1:4]]), yaw)
-        )
+        states = np.stack([pose[:, 1:4], twist[:, 1:4]])
+        yaw = np.stack([np.unwrap(yaws_of(pose[:, 4:])), twist[:, 6]])
+        curves.append(curve_through_states(pose[:, 0], states, yaw))
     return curves
 
 
-def write_rrd(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+def write_rrd(motion: ExportedMotion, rate: float | None) -> bytes:
     """One recording: a frame that moves for each vehicle, with a ball of its radius, on the timeline "time"."""
     import rerun as rr
 
@@ -128,14 +107,13 @@ def write_rrd(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
         name = f"vehicles/{i + 1}"
         ball = rr.Points3D([[0.0, 0.0, 0.0]], radii=radius, labels=str(i + 1), show_labels=False)
         recording.log(name, ball, static=True)
-        moved = rr.Transform3D.columns(
-            translation=setpoints.state[:, 0, i], quaternion=quaternions[:, i]
-        )
+        places, turns = setpoints.state[:, 0, i], quaternions[:, i]
+        moved = rr.Transform3D.columns(translation=places, quaternion=turns)
         recording.send_columns(name, [times], moved)
     recording.flush()
     data = stream.read()
     recording.disconnect()
-    yield data or b""
+    return data or b""
 
 
 def read_rrd(data: bytes) -> list[Piecewise]:
@@ -163,7 +141,8 @@ def read_rrd(data: bytes) -> list[Piecewise]:
     for number in sorted(curves):
         rows = np.concatenate(curves[number])
         rows = rows[rows[:, 0].argsort()]
-        ways.append(curve_through_states(rows[:, 0], rows[None, :, 1:4], _yaws(rows[:, 4:])[None]))
+        yaw = np.unwrap(yaws_of(rows[:, 4:]))
+        ways.append(curve_through_states(rows[:, 0], rows[None, :, 1:4], yaw[None]))
     return ways
 
 
@@ -171,8 +150,3 @@ def _quaternions(yaw: Floats) -> Floats:
     """Quaternions (..., 4), scalar last, body to world, of turns about the vertical."""
     zero = np.zeros_like(yaw)
     return np.stack([zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)], axis=-1)
-
-
-def _yaws(quaternions: Floats) -> Floats:
-    """Yaws (K,) [rad], without jumps, of quaternions (K, 4), scalar last, about the vertical."""
-    return np.unwrap(2.0 * np.arctan2(quaternions[:, 2], quaternions[:, 3]))

@@ -12,7 +12,6 @@ import base64
 import io
 import json
 import zipfile
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ _EAST = 90.0
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+def write_skyc(motion: ExportedMotion, tolerance: float) -> bytes:
     """One show: for each drone its home, a way of cubic curves, its yaw and its light.
 
     Raises
@@ -50,20 +49,16 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _bezier_segments(curve)
-        landing = min(
-            round(float(motion.result.motors_off[agent]) - motion.start, 6), points[-1][0]
-        )
-        files[f"{folder}/trajectory.json"] = {
-            "version": 1, "points": points, "takeoffTime": 0, "landingTime": landing
-        }  # fmt: skip
+        off = round(float(motion.result.motors_off[agent]) - motion.start, 6)
+        span = {"takeoffTime": 0, "landingTime": min(off, points[-1][0])}
+        files[f"{folder}/trajectory.json"] = {"version": 1, "points": points, **span}
         times, yaws = heading_lines(curve)
         clockwise = -np.degrees(yaws)
         clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
         setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
         files[f"{folder}/yaw.json"] = {"version": 1, "setpoints": setpoints}
-        light = base64.b64encode(
-            bytes(light_program(changes, agent, motion.start, motion.end))
-        ).decode()
+        program = bytes(light_program(changes, agent, motion.start, motion.end))
+        light = base64.b64encode(program).decode()
         files[f"{folder}/lights.json"] = {"version": 1, "data": light}
         settings = {
             "name": name,
@@ -82,9 +77,8 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     environment: dict[str, Any] = {"type": "outdoor"}
     if (origin := mission.geodetic_origin) is not None:
         place = [round(1e7 * origin.latitude_deg), round(1e7 * origin.longitude_deg)]
-        environment["location"] = {
-            "origin": [*place, round(1e3 * origin.altitude)], "orientation": _EAST
-        }  # fmt: skip
+        place.append(round(1e3 * origin.altitude))
+        environment["location"] = {"origin": place, "orientation": _EAST}
     show = {
         "version": 1,
         "environment": environment,
@@ -97,7 +91,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         for path, content in {"show.json": show, **files}.items():
             entry = zipfile.ZipInfo(path, _DATE)
             archive.writestr(entry, json.dumps(content), zipfile.ZIP_DEFLATED)
-    yield buffer.getvalue()
+    return buffer.getvalue()
 
 
 def read_skyc(data: bytes) -> list[Piecewise]:

@@ -84,7 +84,7 @@ def _ball(solids: Solids, o: int) -> tuple[Floats, float]:
     return origin + 0.5 * (size[:3] + size[3:]) @ solids.turn[o], half + float(solids.rounding[o])
 
 
-class Avoidance(NamedTuple):
+class AvoidanceArrays(NamedTuple):
     """What avoidance reads and writes at the ticks of the formation's law; K candidates, P entries of neighbours."""
 
     law: Ints  # (2,) addresses of the `Problem` whose law gave the forces, and of its `Workspace`
@@ -189,8 +189,8 @@ def avoidance(
     flow: bool = False,
     seen: Sight | None = None,
     edges: int = 0,
-) -> Avoidance:
-    """Avoidance of a fleet; see `Avoidance`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,).
+) -> AvoidanceArrays:
+    """Avoidance of a fleet; see `AvoidanceArrays`. ``drag`` [1/s], ``lag`` and ``spare`` are one for all, or (N,).
 
     Obstacles that move are known in advance, without ``seen``.
     """
@@ -199,7 +199,7 @@ def avoidance(
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     radius = np.asarray(radius, dtype=float)
     lags: Floats = np.ascontiguousarray(np.broadcast_to(np.asarray(ahead, dtype=float), (n, 3, 3)))
-    return Avoidance(
+    return AvoidanceArrays(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
         share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
         inverse=1.0 / _each(mass, n),
@@ -221,13 +221,13 @@ def avoidance(
     )  # fmt: skip
 
 
-def of_next_phase(avoidance: Avoidance) -> Avoidance:
+def of_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
     """The same avoidance in the next phase, which has a record of its own."""
     avoidance.count[TICKS] = 0
     return avoidance._replace(**_record(len(avoidance.b)))
 
 
-def among(avoidance: Avoidance, solids: Solids) -> Avoidance:
+def among(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArrays:
     """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
     before, seen = (
         avoidance.sight,
@@ -252,7 +252,7 @@ def _by_obstacle(n: int, count: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def holding(avoidance: Avoidance, edges: int) -> Avoidance:
+def holding(avoidance: AvoidanceArrays, edges: int) -> AvoidanceArrays:
     """The same avoidance for so many other edges; neighbours are listed again."""
     avoidance.count[LISTED] = 0
     return avoidance._replace(pull=np.zeros(edges))

@@ -49,7 +49,7 @@ def _three(values: ArrayLike) -> tuple[float, float, float]:
 
 
 @dataclass(frozen=True)
-class Vehicle:
+class VehicleDynamics:
     """One quadrotor, or one ideal point.
 
     A rotor at speed w [rad/s] has the thrust ``thrust[0] + thrust[1] w + thrust[2] w^2`` [N] and the torque about its
@@ -121,7 +121,7 @@ class Vehicle:
 
 
 class Quadrotors(NamedTuple):
-    """Vehicles as arrays; see `Vehicle` for meanings and units."""
+    """Vehicles as arrays; see `VehicleDynamics` for meanings and units."""
 
     m: Floats  # (N,) true mass
     inertia: Floats  # (N, 3)
@@ -189,7 +189,7 @@ class Guidance(NamedTuple):
     k_i: Floats  # (N, 3) integral gain of the tracking error, world axes [1/s^3]
 
 
-class Tables(NamedTuple):
+class TickInputs(NamedTuple):
     """Values for attitude ticks from ``first`` to before ``last``, where the flight pauses for the next ones.
 
     A table without rows stands for zeros, or for nothing dropped. K = last - first ticks. A measurement or message
@@ -218,14 +218,14 @@ class Commands(NamedTuple):
     speeds: Floats  # (N, 4) of the rotors [rad/s]
 
 
-class Flight(NamedTuple):
+class SampledFlight(NamedTuple):
     """All that a sampled flight reads, beside the `Problem` of its formation law."""
 
     vehicles: Quadrotors
     air: Air
     sensing: Sensing
     guidance: Guidance
-    tables: Tables
+    tables: TickInputs
     commands: Commands
     start: float  # time of tick 0 [s]
     h: float  # step of integration [s]
@@ -346,7 +346,7 @@ def jet_speed(weight, density, radius, span, s, rr):
 # -- making them -------------------------------------------------------------------------------------
 
 
-def quadrotors(vehicles: Sequence[Vehicle], g: float = 9.81) -> Quadrotors:
+def quadrotors(vehicles: Sequence[VehicleDynamics], g: float = 9.81) -> Quadrotors:
     """Put vehicles into arrays."""
 
     def rows(name: str) -> Floats:
@@ -382,10 +382,10 @@ def exact_sensing(n: int) -> Sensing:
     )
 
 
-def no_tables(n: int) -> Tables:
+def no_tables(n: int) -> TickInputs:
     """No feedforward, yaw 0, no noise, nothing dropped."""
     none = np.zeros((0, n, 3))
-    return Tables(
+    return TickInputs(
         0, ENDLESS, np.zeros((0, n, 6)), none, none, none, none, none, np.zeros((0, n), dtype=np.bool_),
         np.zeros((0, n, n), dtype=np.bool_),
     )  # fmt: skip
@@ -398,10 +398,12 @@ def no_commands(n: int) -> Commands:
     )
 
 
-def flight(vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1) -> Flight:
-    """A flight in still air with exact sensing; see `Flight`. Replace parts of it by ``_replace``."""
+def flight(
+    vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1
+) -> SampledFlight:
+    """A flight in still air with exact sensing; see `SampledFlight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
-    return Flight(
+    return SampledFlight(
         vehicles, still_air(n), exact_sensing(n), Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n),
         no_commands(n), start, h, steps, every,
     )  # fmt: skip
@@ -422,7 +424,12 @@ def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 
 
 
 def begin(
-    flight: Flight, S: Floats, workspace: Workspace, *, frame: Floats | None = None, rows: int = 0
+    flight: SampledFlight,
+    S: Floats,
+    workspace: Workspace,
+    *,
+    frame: Floats | None = None,
+    rows: int = 0,
 ) -> SampledState:
     """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail."""
     n, m = len(S), len(workspace.c)

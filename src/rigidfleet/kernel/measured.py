@@ -49,7 +49,7 @@ class Measured(NamedTuple):
     x: Annotated[Floats, Extents((2, "N", 3))]  # agents and slots about their centres
 
 
-class Spectrum(NamedTuple):
+class SingularValues(NamedTuple):
     """Singular values of the constraint Jacobian at K samples, of eight at once: rows of eights are theirs."""
 
     positions: Floats  # (K, N, 3)
@@ -88,11 +88,11 @@ def measurement_of(n: int, m: int, K: int, **samples: Any) -> Measured:
     return Measured(**(fields | samples))
 
 
-def spectrum_of(r: Floats, edges: Ints) -> Spectrum:
+def spectrum_of(r: Floats, edges: Ints) -> SingularValues:
     """Arrays for the singular values of J with ``edges`` (m, 2) at positions r (K, N, 3)."""
     m, size = len(edges), min(len(edges), 3 * r.shape[1])
     share = np.empty((m, m) if m == size else (0, 0))
-    return Spectrum(
+    return SingularValues(
         r, edges, share, np.empty((r.shape[1], 24)), np.empty((m, 24)), np.empty((size, 8 * size)), np.empty((1, 8)),
         np.empty((size, size)), np.empty((3, size)), np.empty(len(r)),
     )  # fmt: skip

@@ -105,7 +105,7 @@ class Lag:
 
 
 @dataclass(frozen=True)
-class Feedback:
+class LoopGains:
     """Gains of the laws, as in a mission.
 
     Attributes
@@ -133,14 +133,14 @@ class Feedback:
     cutoff: float = 1e-3
     link: float = 0.0
 
-    def with_pole(self, p: float) -> Feedback:
+    def with_pole(self, p: float) -> LoopGains:
         """With all three poles of the constraint law at -p [1/s]."""
         alpha, beta, gamma = pid.triple_pole(p)
         return replace(self, alpha=alpha, beta=beta, gamma=gamma)
 
 
 @lru_cache
-def overshoot(lag: Lag, laws: Feedback, drag: float) -> float:
+def overshoot(lag: Lag, laws: LoopGains, drag: float) -> float:
     """Time T [s] by which a vehicle that tracks leaves its reference at most, in any direction, under either law.
 
     The reference's acceleration, jerk and snap are fed forward past the attitude control, so that only rotors and the
@@ -185,7 +185,7 @@ class Loop(NamedTuple):
         """Whether the constraint law has a share in it."""
         return bool(np.abs(self.S[0]).max() > _NO_SHARE)
 
-    def gain(self, s: Complexes, law: Feedback) -> Complexes:
+    def gain(self, s: Complexes, law: LoopGains) -> Complexes:
         """L (K, n, n) at s (K,)."""
         k_u, to_k_c, to_rigid = _gains(s, law)[..., None, None]
         heard = np.exp(-s * law.link)[:, None, None]
@@ -197,7 +197,7 @@ class Loop(NamedTuple):
         return np.tensordot(np.transpose(G), self.P, axes=1) @ K
 
 
-def _gains(s: Complexes, law: Feedback) -> Complexes:
+def _gains(s: Complexes, law: LoopGains) -> Complexes:
     """k_u, and what is added to it on S and on rigid motions Q (3, K): K = k_u 1 + ... S + ... Q, because S Q = 0."""
     k_c = 2 * law.alpha * s + law.beta**2 + law.gamma / s
     k_t, k_d = law.k1 + law.k2 * s + law.ki / s, law.k_def * s
@@ -233,7 +233,7 @@ def formation_loops(
     positions: ArrayLike,
     edges: ArrayLike,
     masses: ArrayLike,
-    law: Feedback,
+    law: LoopGains,
     lags: Sequence[Lag],
 ) -> list[Loop]:
     """The distinct parts of a formation's loop at rest, for `margins`, `is_stable` and `largest_pole`.
@@ -290,7 +290,7 @@ def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
 
-def shares(r: Floats, edges: Ints, m: Floats, law: Feedback) -> Floats:
+def shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
     if not len(edges):
         return np.zeros((r.size, r.size))
@@ -342,12 +342,12 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     return list(bases.values())
 
 
-def is_stable(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> bool:
+def is_stable(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> bool:
     """Whether no motion grows at a rate of ``growth`` [1/s] > 0 or more: Nyquist's criterion on det(1 + L)."""
     return all(_unstable(loop, law, growth) == 0 for loop in loops)
 
 
-def _unstable(loop: Loop, law: Feedback, growth: float) -> int:
+def _unstable(loop: Loop, law: LoopGains, growth: float) -> int:
     """Number of roots of det(1 + L) to the right of ``growth``; 1 if a vehicle's attitude itself is unstable."""
     if not all(lag.stable for lag, _ in loop.channels):
         return 1
@@ -384,7 +384,7 @@ def _unstable(loop: Loop, law: Feedback, growth: float) -> int:
     return round(float(rest - turned) / math.pi)
 
 
-def _highest(loop: Loop, law: Feedback, size: float) -> float:
+def _highest(loop: Loop, law: LoopGains, size: float) -> float:
     """Frequency [rad/s] from which on the norm of L is below ``size``, by an upper bound; 0 if it is nowhere above."""
     omega = np.geomspace(*_FREQUENCIES, 600)
     s = 1j * omega
@@ -400,7 +400,7 @@ def _eigenvalues(A: Complexes) -> Complexes:
     return A[..., 0] if A.shape[-1] == 1 else np.linalg.eigvals(A)
 
 
-def margins(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> Margins:
+def margins(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> Margins:
     """Gain, phase and delay margin common to all loops: the smallest of them; ``growth`` as in `is_stable`."""
     if not is_stable(loops, law, growth):
         return Margins(stable=False)
@@ -418,7 +418,7 @@ def margins(loops: Sequence[Loop], law: Feedback, growth: float = GROWTH) -> Mar
     return Margins(True, (low, high), phase, delay)
 
 
-def _loci_at(loop: Loop, law: Feedback, *, on_axis: bool) -> list[tuple[float, complex]]:
+def _loci_at(loop: Loop, law: LoopGains, *, on_axis: bool) -> list[tuple[float, complex]]:
     """Frequencies [rad/s] at which a locus is negative real (``on_axis``), or has unit gain; and the locus there."""
     omega, loci = _loci(loop, law)
     if not len(omega):
@@ -456,7 +456,7 @@ def _root(f: Callable[[float], float], a: float, b: float) -> float:
     return float(brentq(f, a, b, xtol=1e-12))
 
 
-def _loci(loop: Loop, law: Feedback) -> tuple[Floats, Complexes]:
+def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
     """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
     end = _highest(loop, law, _FAINT)
     if end <= _FREQUENCIES[0]:
@@ -492,7 +492,7 @@ def _follow(loci: Complexes) -> Complexes:
 
 
 def largest_pole(
-    loops: Sequence[Loop], law: Feedback, most: float = math.inf, growth: float = GROWTH
+    loops: Sequence[Loop], law: LoopGains, most: float = math.inf, growth: float = GROWTH
 ) -> float:
     """Rate p [1/s] up to which a triple pole -p of the constraint law keeps the loops stable; infinite if all do.
 

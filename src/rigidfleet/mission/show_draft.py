@@ -37,7 +37,7 @@ _SHOWN, _SETTLED = 4.0, 1.0
 _RISE = 1.5
 
 
-class Scene(NamedTuple):
+class ShowFormation(NamedTuple):
     """A formation of a show.
 
     Attributes
@@ -52,7 +52,7 @@ class Scene(NamedTuple):
     table: str
 
 
-def scene(shape: str, agents: int, spacing: float) -> Scene:
+def scene(shape: str, agents: int, spacing: float) -> ShowFormation:
     """A named shape whose nearest two agents are a spacing [m] apart.
 
     Raises
@@ -73,32 +73,34 @@ def scene(shape: str, agents: int, spacing: float) -> Scene:
         size = [math.ceil(1e3 * x * spacing / least) / 1e3 for x in size]
         slots = shapes.slots(shape, size, agents)
     written = json.dumps(size if len(size) > 1 else size[0])
-    return Scene(shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n')
+    return ShowFormation(
+        shape, slots, f'shape = "{shape}"\nsize = {written}                 # [m]\n'
+    )
 
 
-def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> Scene:
+def points_scene(name: str, points: Points, source: str, *, by_name: bool = False) -> ShowFormation:
     """A formation of points, written as numbers, with their notes as comments, or by the name of their file."""
     slots, colours, notes = points
     if by_name:
-        return Scene(name, slots, f"slots = {json.dumps(source)}\n")
+        return ShowFormation(name, slots, f"slots = {json.dumps(source)}\n")
     lights = "" if colours is None else f"colour = {json.dumps(colours)}\n"
     rows = "".join(f"    {row},\n" for row in np.round(slots + 0.0, 6).tolist())
     about = "".join(f"# {note}\n" for note in (f"points of {json.dumps(source)}", *notes))
-    return Scene(name, slots, f"{about}slots = [\n{rows}]\n{lights}")
+    return ShowFormation(name, slots, f"{about}slots = [\n{rows}]\n{lights}")
 
 
-def _rested(one: Scene, agents: int) -> Scene:
+def _rested(one: ShowFormation, agents: int) -> ShowFormation:
     """A scene in which the vehicles that have no point rest at its sides."""
     waiting = agents - len(one.slots)
     if waiting < 1:
         return one
     slots = np.concatenate([one.slots, places_beside(one.slots, waiting)])
     told = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
-    return Scene(one.name, slots, one.table + told)
+    return ShowFormation(one.name, slots, one.table + told)
 
 
 def show(
-    name: str, scenes: Sequence[Scene], *, agents: int, spacing: float, mass: float = _MASS,
+    name: str, scenes: Sequence[ShowFormation], *, agents: int, spacing: float, mass: float = _MASS,
     thrust_limit: float | None = None, file: str = "",
 ) -> str:  # fmt: skip
     """Return the TOML text of a show: from a grid through the scenes, and back.

@@ -10,7 +10,9 @@ from rigidfleet.mission.avoidance import braking, foresight, reaction_times, wid
 from rigidfleet.solids.records import join
 
 
-def avoidance_in_flight(mission: Mission, flight: fleet.Flight) -> avoidance.Avoidance | None:
+def avoidance_in_flight(
+    mission: Mission, flight: fleet.SampledFlight
+) -> avoidance.AvoidanceArrays | None:
     """Avoidance at the ticks of the formation's law; None without [avoidance]."""
     settings, models = mission.avoidance, mission.vehicle_models
     if settings is None or models is None:

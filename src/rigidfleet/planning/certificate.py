@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rigidfleet.formation.assignment import FEW, closest_approach
+from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.kernel.problem import Reference, septic_polynomial
 from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import about
@@ -95,7 +95,7 @@ def _least(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[int, int], 
     """`closest_approach` of slots that blend or stay, cached because most phases have the slots of the one before."""
     start, ways = (np.frombuffer(x).reshape(-1, 3) for x in (p, dp))
     r = np.frombuffer(radius)
-    if ways.any() or len(start) <= FEW:
+    if ways.any():
         return closest_approach(start, start + ways, r)
     least, pairs = proximity.separation(start[None], r)
     return float(least[0]), (int(pairs[0, 0]), int(pairs[0, 1])), 0.0

@@ -159,7 +159,6 @@ def reference_kind(
     return _leads(before, target, edges, lengths)
 
 
-@kept
 def _leads(
     before: Floats, target: Floats, edges: Ints, lengths: Floats
 ) -> Literal["shape", "squares"]:
@@ -185,9 +184,4 @@ def align_slots(
     slots rotate back, so that the body axes keep their meaning; distances are not affected.
     """
     R = nearest_rotation(before, after, masses) if turn is None else turn
-    return _change_of_slots(before, after, R)
-
-
-@kept
-def _change_of_slots(before: Floats, after: Floats, R: Floats) -> tuple[Floats, Floats]:
     return after @ R.T - before, att.rotation_vector_from_dcm(R)  # log of R^T

@@ -15,7 +15,7 @@ import numpy as np
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
-from rigidfleet.math.margins import Feedback, Lag, overshoot
+from rigidfleet.math.margins import Lag, LoopGains, overshoot
 from rigidfleet.math.quadrotor import ROTORS
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import VehicleModel
@@ -46,7 +46,7 @@ _LEFT = 0.2
 _TURN_TIME = 3.0
 
 
-def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Flight:
+def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.SampledFlight:
     """Vehicles, air, sensing and rates of a mission with vehicles, where a user's force lasts two ``max_step`` [s]."""
     models = mission.vehicle_models
     assert models is not None
@@ -109,7 +109,7 @@ def reserves(mission: Mission) -> Floats:
     """
     times = np.zeros(mission.n_agents)
     c, tracking, lags = mission.constraint, mission.tracking, vehicle_lags(mission)
-    law = Feedback(c.alpha, c.beta, c.gamma, *mission.tracking_gains, tracking.integral)
+    law = LoopGains(c.alpha, c.beta, c.gamma, *mission.tracking_gains, tracking.integral)
     for i, model in enumerate(mission.vehicle_models or ()):
         if not model.point:
             left = _LEFT * max(model.linear_drag)
@@ -144,13 +144,15 @@ def jets(mission: Mission, r: Floats) -> Floats:
     return flow
 
 
-def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.Vehicle:
+def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.VehicleDynamics:
     """The kernel's form of a vehicle with a true mass [kg]."""
     if model.point:
-        return fleet.Vehicle(m=mass, drag=(model.drag,) * 3, point=True, limit=model.thrust_limit)
+        return fleet.VehicleDynamics(
+            m=mass, drag=(model.drag,) * 3, point=True, limit=model.thrust_limit
+        )
     up, down = model.motor_time
     k_R, k_omega = model.attitude_gains
-    return fleet.Vehicle(
+    return fleet.VehicleDynamics(
         m=mass,
         inertia=model.inertia,
         rotors=np.column_stack([model.arm * ROTORS[:, :2], np.zeros(4)]),
@@ -195,7 +197,7 @@ def _sensing(mission: Mission) -> fleet.Sensing:
 class TickTables:
     """Tables of a flight for ranges of ticks: references of the attitude control, noise, dropped measurements."""
 
-    def __init__(self, mission: Mission, flight: fleet.Flight) -> None:
+    def __init__(self, mission: Mission, flight: fleet.SampledFlight) -> None:
         d = mission.disturbances
         self.flight, self.n = flight, mission.n_agents
         self.rate = mission.autopilot.rate
@@ -229,7 +231,9 @@ class TickTables:
         states = slot_derivatives(self._source.reference, self._source.motion, time, 2)
         return np.concatenate([states[0, 0], states[0, 1]], axis=1)
 
-    def tables_for(self, first: int, last: int, problem: Problem, turn: YawTurn) -> fleet.Tables:
+    def tables_for(
+        self, first: int, last: int, problem: Problem, turn: YawTurn
+    ) -> fleet.TickInputs:
         """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase."""
         sensing = self.flight.sensing
         time = np.arange(first, last) / self.rate
@@ -254,10 +258,11 @@ class TickTables:
                 dropped = _random_rows(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
         if self.links is not None and self.links.dropped:
             rows = _rows(first, last, sensing.link_every)
-            unheard = (
-                _random_rows(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
-            )
-        return fleet.Tables(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard)
+            share = _random_rows(_UNHEARD, self.links.seed, rows, (self.n, self.n))
+            unheard = share < self.links.dropped
+        return fleet.TickInputs(
+            first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard
+        )
 
     def yaw_at(self, problem: Problem, t: float, turn: YawTurn) -> Floats:
         """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""

@@ -35,7 +35,7 @@ from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
 from rigidfleet.plotting.sketches import formations
 from rigidfleet.plotting.space import trajectory
-from rigidfleet.plotting.style import agent_colours, settings, shape
+from rigidfleet.plotting.style import agent_colours, figure_options, settings
 from rigidfleet.result import Result, as_result
 
 if TYPE_CHECKING:
@@ -181,37 +181,43 @@ def plot(
     """
     result = as_result(result)
     target = None if folder is None else as_path(folder)
-    formats = _known("format", formats, FORMATS)
-    names = _known("figure", figure_names(result) if names is None else names, _FIGURES)
+    formats = _check_names("format", formats, FORMATS)
+    names = _check_names("figure", figure_names(result) if names is None else names, _FIGURES)
     look: dict[str, Any] = {"titles": titles, "width": width}
     if target is None:
-        return Figures(_drawn(result, name, **look) for name in names)
+        return Figures(_draw_figure(result, name, **look) for name in names)
     paths = []
     for name in names:
-        paths += write_files(target / name, rendered(result, name, formats, **look))
+        paths += write_files(target / name, render_figure(result, name, formats, **look))
     return paths
 
 
-def _drawn(result: Result, name: str, *, titles: bool = True, width: float | None = None) -> Figure:
+def _draw_figure(
+    result: Result, name: str, *, titles: bool = True, width: float | None = None
+) -> Figure:
     if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
         raise ValueError(f"the width must be {WIDTHS[0]:g} to {WIDTHS[1]:g} mm, not {width:g}")
-    with shape(titles=titles, width=width):
+    with figure_options(titles=titles, width=width):
         return _FIGURES[name](result)
 
 
-def rendered(result: Result, name: str, formats: Iterable[str], **look: Any) -> dict[str, bytes]:
+def render_figure(
+    result: Result, name: str, formats: Iterable[str], **look: Any
+) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
-    figure = _drawn(result, name, **look)
+    figure = _draw_figure(result, name, **look)
     with settings():
         figure.set_layout_engine(None)  # it is laid out; with "none", matplotlib draws it once more
-    return contents(figure, formats, close=not look.get("titles", True))
+    return encode_figure(figure, formats, close=not look.get("titles", True))
 
 
-def contents(figure: Figure, formats: Iterable[str], *, close: bool = False) -> dict[str, bytes]:
+def encode_figure(
+    figure: Figure, formats: Iterable[str], *, close: bool = False
+) -> dict[str, bytes]:
     """Contents of a figure's files by format; with ``close``, cropped to what is drawn."""
     files = {}
     with settings():
-        box = _ink(figure) if close else None
+        box = _content_box(figure) if close else None
         for kind in formats:
             buffer = io.BytesIO()
             figure.savefig(buffer, format=kind, bbox_inches=box, **_OPTIONS[kind])
@@ -219,15 +225,15 @@ def contents(figure: Figure, formats: Iterable[str], *, close: bool = False) -> 
     return files
 
 
-def _known(what: str, asked: Iterable[str], known: Iterable[str]) -> list[str]:
-    asked = [asked] if isinstance(asked, str) else list(dict.fromkeys(asked))
-    for name in asked:
+def _check_names(what: str, names: Iterable[str], known: Iterable[str]) -> list[str]:
+    names = [names] if isinstance(names, str) else list(dict.fromkeys(names))
+    for name in names:
         if name not in known:
             raise ValueError(f"there is no {what} {name!r}; known: {', '.join(known)}")
-    return asked
+    return names
 
 
-def _ink(figure: Figure) -> Bbox:
+def _content_box(figure: Figure) -> Bbox:
     """Bounding box of the drawn content, with a margin [in]; matplotlib's own box includes empty axes."""
     from matplotlib.transforms import Bbox
 

@@ -11,7 +11,7 @@ from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, shown
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import peaks, quadrotors
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import styled
+from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Extremum, Result
 from rigidfleet.result.quantities import owner_name, samples
 from rigidfleet.typing import Floats
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 SINGLE = 6  # greatest number of edges with a colour each; more edges share one by length
 _PAIRS = 5e7  # greatest number of pair distances computed in all
 _SMALLEST = 1e-12  # least error drawn on a logarithmic axis [m]; smaller ones are rounding
-_LOW = 0.45  # height of a row in which nothing happens, as a share of the full height
-_TOLD = 0.7  # height of a row that holds only text
+_STILL_ROW = 0.45  # height of a row in which nothing happens, as a share of the full height
+_TEXT_ROW = 0.7  # height of a row that holds only text
 
 
 # -- edges -------------------------------------------------------------------------------------------
@@ -60,25 +60,25 @@ def edge_groups(result: Result) -> list[EdgeGroup]:
             tuple(f"{d:.4g}" for d in row) + ((str(k),) if m <= SINGLE else ()), []
         ).append(k)
     if m > st.MANY:
-        return _by_formation(result, lengths)
+        return _groups_by_formation(result, lengths)
     groups = list(keys.values())
     if m > SINGLE:
         groups.sort(key=lambda g: np.nan_to_num(lengths[g[0]], nan=0.0).tolist())
     return [
         EdgeGroup(g, tuple(lengths[g[0]].tolist()), colour, _edge_label(result, g, lengths[g[0]]))
-        for g, colour in zip(groups, st.scale(len(groups)), strict=True)
+        for g, colour in zip(groups, st.colour_scale(len(groups)), strict=True)
     ]
 
 
-def _by_formation(result: Result, lengths: Floats) -> list[EdgeGroup]:
+def _groups_by_formation(result: Result, lengths: Floats) -> list[EdgeGroup]:
     """Groups of many edges: one for each formation, or for each set of formations that share edges."""
     names = list(result.mission.formations)
     kinds, kind = np.unique(np.isfinite(lengths), axis=0, return_inverse=True)
     groups = []
-    for k, (held, colour) in enumerate(zip(kinds, st.scale(len(kinds)), strict=True)):
+    for k, (held, colour) in enumerate(zip(kinds, st.colour_scale(len(kinds)), strict=True)):
         edges = np.flatnonzero(kind.ravel() == k)
         own = lengths[edges][:, held]
-        of = " and ".join(st.clean(name, 20) for name, h in zip(names, held, strict=True) if h)
+        of = " and ".join(st.clean_name(name, 20) for name, h in zip(names, held, strict=True) if h)
         label = f"{len(edges)} edges of {of}: {own.min():.3g} to {own.max():.3g} m"
         groups.append(EdgeGroup(edges.tolist(), tuple(lengths[edges[0]].tolist()), colour, label))
     return groups
@@ -92,17 +92,17 @@ def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
     return f"{len(edges)} edge{'s' if len(edges) > 1 else ''}: {' → '.join(steps)} m"
 
 
-def edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
+def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
     """A line for each edge, values (K, m), in the colour of its group; for many edges, the spread of each group."""
     for group in edge_groups(result):
         if len(result.edges) > st.MANY:
             active = np.isfinite(result.constraint[:, group.edges])
-            st.spread(
+            st.draw_spread(
                 ax, result.time, np.where(active, values[:, group.edges], np.nan), group.colour
             )
             continue
         for k in group.edges:
-            st.line(ax, result.time, values[:, k], color=group.colour, **look)
+            st.draw_line(ax, result.time, values[:, k], color=group.colour, **look)
 
 
 def edge_handles(result: Result) -> list[Line2D]:
@@ -110,7 +110,7 @@ def edge_handles(result: Result) -> list[Line2D]:
     from matplotlib.lines import Line2D
 
     groups = edge_groups(result)
-    chosen = [groups[i] for i in st.some(len(groups), 9)]
+    chosen = [groups[i] for i in st.spaced_indices(len(groups), 9)]
     return [Line2D([], [], color=g.colour, label=g.label) for g in chosen]
 
 
@@ -127,23 +127,23 @@ def draw_distances(ax: Axes, result: Result) -> None:
     """Lengths of the edges, and their references."""
     ax.set_ylabel("distance [m]")
     if not len(result.edges):
-        st.note(ax, "no edges")
+        st.write_note(ax, "no edges")
         return
-    edge_lines(ax, result, result.distance, linewidth=1.9)
+    draw_edge_lines(ax, result, result.distance, linewidth=1.9)
     wanted = result.distance_reference
     if len(result.edges) > st.MANY:
         wanted = np.column_stack([np.fmin.reduce(wanted, axis=1), np.fmax.reduce(wanted, axis=1)])
-    for k in _distinct(wanted):
-        st.reference(ax, result.time, wanted[:, k])
+    for k in _distinct_columns(wanted):
+        st.draw_reference(ax, result.time, wanted[:, k])
 
 
-def _distinct(values: Floats) -> list[int]:
+def _distinct_columns(values: Floats) -> list[int]:
     """Columns of values (K, m), without those that look the same as an earlier one."""
     keys = np.round(np.nan_to_num(values[:: max(1, len(values) // 200)], nan=-1.0), 3)
     return sorted(np.unique(keys, axis=1, return_index=True)[1].tolist())
 
 
-@styled
+@in_style
 def distances(result: Result) -> Figure:
     """Distances between agents with their references."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
@@ -151,7 +151,9 @@ def distances(result: Result) -> Figure:
     draw_distances(ax, result)
     if len(result.edges):
         title = "edge" if len(result.edges) <= SINGLE else ""
-        st.legend(ax, [*edge_handles(result), *_reference_handle(result.distance_reference)], title)
+        st.draw_legend(
+            ax, [*edge_handles(result), *_reference_handle(result.distance_reference)], title
+        )
     st.name_phases([ax], result)
     return fig
 
@@ -159,7 +161,7 @@ def distances(result: Result) -> Figure:
 # -- the formation as a whole --------------------------------------------------------------------------
 
 
-def _components(
+def _draw_components(
     result: Result,
     axes: Any,
     flown: Floats,
@@ -170,27 +172,28 @@ def _components(
 ) -> None:
     """A row for each of three components: flown and reference (K, 3), targets (time, [3])."""
     for i, ax in enumerate(axes):
-        asked = np.array([goal[i] for _, goal in targets], dtype=float)
-        st.line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
-        st.reference(ax, result.time, wanted[:, i])
+        goals = np.array([goal[i] for _, goal in targets], dtype=float)
+        st.draw_line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
+        st.draw_reference(ax, result.time, wanted[:, i])
         for t, goal in targets:
             ax.plot(
                 t, goal[i], "o", markersize=5.5, markerfacecolor="white", markeredgecolor=st.INK,
                 markeredgewidth=1.0, zorder=4, clip_on=False,
             )  # fmt: skip
         ax.set_ylabel(f"{names[i]} [{unit}]")
-        if not st.still(ax, np.concatenate([flown[:, i], wanted[:, i], asked]), unit):
-            widen(ax, 0.1)
+        if not st.note_if_still(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit):
+            widen_limits(ax, 0.1)
 
 
-def _shares(*columns: tuple[Floats, Floats]) -> list[float]:
+def _row_shares(*columns: tuple[Floats, Floats]) -> list[float]:
     """Heights of three rows, smaller if nothing changes; each column is given as (flown, commanded)."""
     return [
-        _LOW if all(st.is_still(f[:, i], w[:, i]) for f, w in columns) else 1.0 for i in range(3)
+        _STILL_ROW if all(st.is_still(f[:, i], w[:, i]) for f, w in columns) else 1.0
+        for i in range(3)
     ]
 
 
-def widen(ax: Axes, least: float) -> None:
+def widen_limits(ax: Axes, least: float) -> None:
     """Widen the limits so that rounding errors do not fill the axes."""
     low, high = ax.get_ylim()
     if high - low < least:
@@ -198,7 +201,7 @@ def widen(ax: Axes, least: float) -> None:
         ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
-def _whole_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
+def _draw_body_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
     from matplotlib.lines import Line2D
 
     ring = Line2D(
@@ -206,30 +209,34 @@ def _whole_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
         markeredgecolor=st.INK, label="waypoint",
     )  # fmt: skip
     flown = Line2D([], [], color=st.FLOWN, linewidth=2.4, label="flown")
-    st.legend(ax, [flown, *references, *([ring] if targets else [])])
+    st.draw_legend(ax, [flown, *references, *([ring] if targets else [])])
 
 
-def _targets(result: Result, key: str) -> list[tuple[float, Any]]:
+def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
     """Time [s] and value of the waypoints that the flight reached."""
     targets = [p.target for p in result.phases if p.target is not None]
     moments = (at for target in targets for at in (*target.get("through", ()), target))
-    found = [(at["time"], at.get(key)) for at in moments]
-    return [(t, value) for t, value in found if value is not None and t <= result.time[-1] + 1e-9]
+    values = [(at["time"], at.get(key)) for at in moments]
+    return [(t, value) for t, value in values if value is not None and t <= result.time[-1] + 1e-9]
 
 
-@styled
+@in_style
 def cm(result: Result) -> Figure:
     """Position and velocity of the centre of mass with their references and waypoints."""
     columns = (result.cm, result.cm_reference), (result.cm_velocity, result.cm_velocity_reference)
-    fig, axes = st.time_figure(result, "Centre of mass", 3, 2, height=1.5, shares=_shares(*columns))
-    places, speeds = _targets(result, "position"), _targets(result, "velocity")
-    _components(result, axes[:, 0], result.cm, result.cm_reference, places, ("x", "y", "z"), "m")
-    _components(
+    fig, axes = st.time_figure(
+        result, "Centre of mass", 3, 2, height=1.5, shares=_row_shares(*columns)
+    )
+    places, speeds = _waypoint_values(result, "position"), _waypoint_values(result, "velocity")
+    _draw_components(
+        result, axes[:, 0], result.cm, result.cm_reference, places, ("x", "y", "z"), "m"
+    )
+    _draw_components(
         result, axes[:, 1], result.cm_velocity, result.cm_velocity_reference, speeds,
         ("ẋ", "ẏ", "ż"), "m/s",
     )  # fmt: skip
     references = _reference_handle(result.cm_reference, result.cm_velocity_reference)
-    _whole_legend(axes[0, 1], references, targets=bool(places or speeds))
+    _draw_body_legend(axes[0, 1], references, targets=bool(places or speeds))
     st.name_phases(axes[0], result)
     return fig
 
@@ -253,30 +260,30 @@ def flown_and_wanted_euler(result: Result) -> tuple[Floats, Floats, list[tuple[f
     flown = euler_deg(result.attitude)
     wanted = _nearest_turn(euler_deg(result.attitude_reference), flown)
     targets = []
-    for t, q in _targets(result, "attitude"):
+    for t, q in _waypoint_values(result, "attitude"):
         k = int(np.abs(result.time - t).argmin())
         targets.append((t, _nearest_turn(euler_deg(np.array([q], dtype=float)), flown[[k]])[0]))
     return flown, wanted, targets
 
 
-@styled
+@in_style
 def attitude(result: Result) -> Figure:
     """Euler angles (3-2-1) and body rates of the formation with their references and waypoints."""
     title = "Attitude of the formation"
     flown, wanted, targets = flown_and_wanted_euler(result)
     if not np.isfinite([flown, wanted]).any():
         fig, axes = st.time_figure(result, title, 1)
-        st.note(axes[0, 0], "no body frame attached")
+        st.write_note(axes[0, 0], "no body frame attached")
         st.name_phases(axes[0], result)
         return fig
     turned = np.degrees(result.rates), np.degrees(result.rates_reference)
-    shares = _shares((flown, wanted), turned)
+    shares = _row_shares((flown, wanted), turned)
     fig, axes = st.time_figure(result, title, 3, 2, height=1.5, shares=shares)
-    _components(result, axes[:, 0], flown, wanted, targets, ("roll", "pitch", "yaw"), "deg")
-    turning = [(t, np.degrees(rates)) for t, rates in _targets(result, "rates")]
-    _components(result, axes[:, 1], *turned, turning, ("p", "q", "r"), "deg/s")
+    _draw_components(result, axes[:, 0], flown, wanted, targets, ("roll", "pitch", "yaw"), "deg")
+    turning = [(t, np.degrees(rates)) for t, rates in _waypoint_values(result, "rates")]
+    _draw_components(result, axes[:, 1], *turned, turning, ("p", "q", "r"), "deg/s")
     references = _reference_handle(wanted, result.rates_reference)
-    _whole_legend(axes[0, 1], references, targets=bool(targets or turning))
+    _draw_body_legend(axes[0, 1], references, targets=bool(targets or turning))
     st.name_phases(axes[0], result)
     return fig
 
@@ -288,35 +295,39 @@ def draw_thrust(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero."""
     ax.set_ylabel("thrust [N]")
     if not np.isfinite(result.thrust).any():
-        st.note(ax, "forces are not known")
+        st.write_note(ax, "forces are not known")
         return
-    st.agent_lines(ax, result, result.thrust)
-    limits = peaks.limits(result.mission.fleet.thrust_limit)
+    st.draw_agent_lines(ax, result, result.thrust)
+    limits = peaks.distinct_limits(result.mission.fleet.thrust_limit)
     for value, label, colour in limits:
-        st.limit(ax, value, label, colour)
-    top = max([*(value for value, *_ in limits), peaks.sane(result, result.thrust)])
+        st.draw_limit(ax, value, label, colour)
+    top = max(
+        [*(value for value, *_ in limits), peaks.peak_before_breakdown(result, result.thrust)]
+    )
     ax.set_ylim(0, 1.12 * top if top > 0 else 1.0)
-    peaks.extremes(ax, result, result.thrust, "N", peaks.agent, name="thrust", always=False)
+    peaks.mark_extremes(
+        ax, result, result.thrust, "N", peaks.agent_name, name="thrust", always=False
+    )
 
 
-@styled
+@in_style
 def inputs(result: Result) -> Figure:
     """Thrust of each agent with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
     above, below = axes[:, 0]
     draw_thrust(above, result)
-    st.agent_lines(below, result, result.thrust)
+    st.draw_agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
-    if not st.still(below, result.thrust, "N"):
-        peaks.within(below, result, result.thrust)
-        widen(below, min(0.1, 0.1 * peaks.sane(result, result.thrust)))
-        peaks.extremes(below, result, result.thrust, "N", peaks.agent, name="thrust")
-    st.agents_legend(above, result.n_agents)
+    if not st.note_if_still(below, result.thrust, "N"):
+        peaks.leave_out_final_peak(below, result, result.thrust)
+        widen_limits(below, min(0.1, 0.1 * peaks.peak_before_breakdown(result, result.thrust)))
+        peaks.mark_extremes(below, result, result.thrust, "N", peaks.agent_name, name="thrust")
+    st.draw_agents_legend(above, result.n_agents)
     st.name_phases([above], result)
     return fig
 
 
-@styled
+@in_style
 def constraint_force(result: Result) -> Figure:
     """Constraint force |f_C| on each agent and tension of each edge."""
 
@@ -325,38 +336,39 @@ def constraint_force(result: Result) -> Figure:
 
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
     shares = [
-        _TOLD if np.nanmax(np.abs(v), initial=0.0) <= peaks.IDLE else 1.0 for v in (force, tension)
+        _TEXT_ROW if np.nanmax(np.abs(v), initial=0.0) <= peaks.IDLE else 1.0
+        for v in (force, tension)
     ]
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel("constraint force [N]")
-    if peaks.from_none(above, result, force, "N", "constraint_force"):
-        st.agents_legend(above, result.n_agents)
+    if peaks.draw_from_zero(above, result, force, "N", "constraint_force"):
+        st.draw_agents_legend(above, result.n_agents)
     below.set_ylabel("tension [N]")
     if not len(result.edges):
-        st.note(below, "no edges")
-    elif not peaks.idle(below, result, tension, "N", edge):
-        edge_lines(below, result, tension)
+        st.write_note(below, "no edges")
+    elif not peaks.note_if_idle(below, result, tension, "N", edge):
+        draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
-        peaks.within(below, result, tension)
-        peaks.extremes(below, result, tension, "N", edge, name="tension", always=False)
-        st.legend(below, edge_handles(result))
+        peaks.leave_out_final_peak(below, result, tension)
+        peaks.mark_extremes(below, result, tension, "N", edge, name="tension", always=False)
+        st.draw_legend(below, edge_handles(result))
     st.name_phases([above], result)
     return fig
 
 
-@styled
+@in_style
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force |f_D| on each agent, and distance of each agent from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
     above, below = axes[:, 0]
     above.set_ylabel("aerodynamic force [N]")
     if result.disturbance_force is None:
-        st.note(above, "still air")
+        st.write_note(above, "still air")
     else:
         force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-        if peaks.from_none(above, result, force, "N"):
-            st.agents_legend(above, result.n_agents)
+        if peaks.draw_from_zero(above, result, force, "N"):
+            st.draw_agents_legend(above, result.n_agents)
     quadrotors.draw_off_slot(below, result)
     st.name_phases([above], result)
     return fig
@@ -377,13 +389,13 @@ def shape_error(result: Result) -> Floats:
         if slots is None or len(slots) < 2 or rows.start == rows.stop:
             continue
         most = max(3, int(_PAIRS / len(slots) ** 2 / len(result.phases)))
-        at = rows.start + np.array(st.some(rows.stop - rows.start, most))
+        at = rows.start + np.array(st.spaced_indices(rows.stop - rows.start, most))
         r = np.where(result.left[at, :, None], result.position[at], np.nan)
         worst = np.full(len(r), np.nan)
         for i in range(len(slots) - 1):
             flown = np.linalg.norm(r[:, i + 1 :] - r[:, i : i + 1], axis=2)
-            asked = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
-            worst = np.fmax(worst, np.fmax.reduce(np.abs(flown - asked), axis=1))
+            intended = np.linalg.norm(slots[i + 1 :] - slots[i], axis=1)
+            worst = np.fmax(worst, np.fmax.reduce(np.abs(flown - intended), axis=1))
         error[at] = worst
     return error
 
@@ -398,15 +410,15 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     if np.isfinite(shape).any():
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
         known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
-        st.line(ax, result.time[known], shape[known], **look)
+        st.draw_line(ax, result.time[known], shape[known], **look)
         handles.append(Line2D([], [], label="greatest error of all pairs", **look))
     if np.isfinite(size).any():
-        edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
+        draw_edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
         look = {"color": st.INK, "linewidth": 1.3}
-        st.line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
+        st.draw_line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
         handles.append(Line2D([], [], label="greatest |c| of an edge", **look))
     if not handles:
-        st.note(ax, "neither edges nor slots")
+        st.write_note(ax, "neither edges nor slots")
         return []
     ax.set_yscale("log", nonpositive="clip")
     seen = np.concatenate([size.ravel(), shape])
@@ -418,16 +430,16 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
             st.annotate(
                 ax,
                 f"not drawn: below {_SMALLEST:g} m (rounding)",
-                st.corners()[::-1],
+                st.corner_places()[::-1],
                 color=st.GREY,
             )
     else:
         ax.set_ylim(_SMALLEST, 1.0)
-        st.note(ax, f"only rounding errors: at most {seen.max():.1g} m")
+        st.write_note(ax, f"only rounding errors: at most {seen.max():.1g} m")
     return handles
 
 
-@styled
+@in_style
 def constraint_error(result: Result) -> Figure:
     """Constraint errors |c| of the edges and their greatest, and the error of all pairs."""
     fig, axes = st.time_figure(
@@ -436,7 +448,7 @@ def constraint_error(result: Result) -> Figure:
     ax = axes[0, 0]
     handles = draw_error(ax, result)
     if handles:
-        st.legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
+        st.draw_legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
     st.name_phases([ax], result)
     return fig
 
@@ -461,18 +473,18 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     values = np.where(np.isfinite(values), values, np.nan)
     if not np.isfinite(values).any():
         known = {"separation": result.n_agents == 1, "clearance": not result.mission.obstacles}
-        st.note(ax, nothing if known.get(name, True) else "unknown")
+        st.write_note(ax, nothing if known.get(name, True) else "unknown")
         if limit:
             ax.set_ylim(0.0, 1.4 * limit)
-            st.limit(ax, limit, f"limit {limit:g} m")
+            st.draw_limit(ax, limit, f"limit {limit:g} m")
         return
-    st.line(ax, result.time, values, color=st.TONES[0])
-    st.limit(ax, limit, f"limit {limit:g} m" if limit else "contact")
+    st.draw_line(ax, result.time, values, color=st.TONES[0])
+    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit else "contact")
     if name == "separation":
         _draw_planned(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
             altitude = result.mission.limits.separation_altitude
-            st.limit(ax, flying, f"limit {flying:g} m from z = {altitude:g} m on")
+            st.draw_limit(ax, flying, f"limit {flying:g} m from z = {altitude:g} m on")
     k = int(np.nanargmin(values))
     x = result.extreme(name)
     if x is None or x.value > values[k]:
@@ -480,8 +492,10 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
         x = Extremum(float(values[k]), float(result.time[k]), *who[:2])
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
-    words = f"{x.value:.3g} m at {x.time:.2f} s, {st.clean(owner_name(result, q, x.who, x.other))}"
-    st.annotate(ax, words, st.around(x.time, x.value))
+    words = (
+        f"{x.value:.3g} m at {x.time:.2f} s, {st.clean_name(owner_name(result, q, x.who, x.other))}"
+    )
+    st.annotate(ax, words, st.places_around(x.time, x.value))
     low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
@@ -496,10 +510,10 @@ def _draw_planned(ax: Axes, result: Result) -> None:
     if proved:
         least, p = min(proved, key=lambda each: each[0])
         words = f"as planned, less {allowed:g} m"
-        st.annotate(ax, words, st.around(p.t_start, least), color=st.ALERT)
+        st.annotate(ax, words, st.places_around(p.t_start, least), color=st.ALERT)
 
 
-@styled
+@in_style
 def clearance(result: Result) -> Figure:
     """Least distances between agents, straight below an agent and to obstacles, with their limits."""
     mission, several = result.mission, result.n_agents > 1
@@ -525,7 +539,7 @@ def limited_motions(result: Result) -> list[Quantity]:
     return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
 
 
-@styled
+@in_style
 def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each agent, in all directions or one, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
@@ -533,6 +547,6 @@ def motion(result: Result) -> Figure:
     for q, ax in zip(drawn, axes[:, 0], strict=True):
         ax.set_ylabel(f"{q.called.replace(' ', chr(10))} [{shown(q.unit)}]")
         quadrotors.draw_limited(ax, result, q.name)
-    st.agents_legend(axes[0, 0], result.n_agents)
+    st.draw_agents_legend(axes[0, 0], result.n_agents)
     st.name_phases(axes[0], result)
     return fig

@@ -31,10 +31,10 @@ def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     names = list(mission.formations)
     with st.settings():
-        fig, rects = sketches.tiles(len(names), 3.6, 0.4, (0.1, 0.2))
+        fig, rects = sketches.tiled_figure(len(names), 3.6, 0.4, (0.1, 0.2))
         for (x, y, width, height), name in zip(rects, names, strict=True):
             ax = fig.add_axes((x + 0.04 * width, y, 0.92 * width, 0.8 * height))
-            _draw(ax, mission, name, judged.get(name))
+            _draw_formation(ax, mission, name, judged.get(name))
     return fig
 
 
@@ -47,18 +47,18 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
         The file's name does not end in .png, .svg or .pdf, or it cannot be written.
     """
     from rigidfleet.errors import ResultError
-    from rigidfleet.plotting import contents, write
+    from rigidfleet.plotting import encode_figure, write
 
     if path.suffix not in _FORMATS:
         known = ", ".join(_FORMATS)
         raise ResultError(
             f"{path}: the name has no figure format. Give a name that ends in {known}."
         )
-    (drawn,) = contents(graphs(mission, judged), [path.suffix[1:]]).values()
+    (drawn,) = encode_figure(graphs(mission, judged), [path.suffix[1:]]).values()
     write(path, drawn)
 
 
-def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:
+def _draw_formation(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:
     p, placed = sketches.sketch_places(mission, name)
     p = p - p.mean(axis=0)
     edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
@@ -75,18 +75,25 @@ def _draw(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> N
     sketches.draw_graph(
         ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed, lights=lit
     )
-    told = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
+    caption = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
     if rigidity is not None:
-        told = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {told}"
-        told += f", {len(redundant)} redundant" if redundant else ""
-        _arrows(ax, p, R, rigidity)
-    ax.set_title(f"{st.clean(name)}\n", fontweight="bold", parse_math=False)
+        caption = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {caption}"
+        caption += f", {len(redundant)} redundant" if redundant else ""
+        _draw_free_motions(ax, p, R, rigidity)
+    ax.set_title(f"{st.clean_name(name)}\n", fontweight="bold", parse_math=False)
     ax.text(
-        0.5, 1.02, told, transform=ax.transAxes, ha="center", va="bottom", fontsize=7, color=st.GREY
+        0.5,
+        1.02,
+        caption,
+        transform=ax.transAxes,
+        ha="center",
+        va="bottom",
+        fontsize=7,
+        color=st.GREY,
     )
 
 
-def _arrows(ax: Axes, p: Any, R: Any, rigidity: Rigidity) -> None:
+def _draw_free_motions(ax: Axes, p: Any, R: Any, rigidity: Rigidity) -> None:
     """Draw free motions, seen along the last row of R (3, 3)."""
     size = float(np.linalg.norm(p, axis=1).max()) or 1.0
     tones = (st.ALERT, st.PALETTE[0], st.PALETTE[2])

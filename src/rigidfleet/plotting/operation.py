@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.curves import draw_least
-from rigidfleet.plotting.style import styled
+from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -39,14 +39,14 @@ def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     if beyond := [i for i in agents if not 1 <= i <= n]:
         raise ValueError(f"there is no agent {beyond[0]}; agents are numbered from 1 to {n}")
 
-    @styled
+    @in_style
     def drawn(result: Result) -> Figure:
-        return _drawn(result, agents)
+        return _draw_operation(result, agents)
 
     return drawn(result)
 
 
-def _drawn(result: Result, agents: Sequence[int]) -> Figure:
+def _draw_operation(result: Result, agents: Sequence[int]) -> Figure:
     fig, axes = st.time_figure(result, "Operation", 5, height=1.6)
     above, fast, climb, apart, clear = axes[:, 0]
     v = result.velocity
@@ -57,27 +57,29 @@ def _drawn(result: Result, agents: Sequence[int]) -> Figure:
         (climb, "vertical [m/s]", v[..., 2]),
     ):
         ax.set_ylabel(words)
-        handles = _lines(ax, result, np.where(result.left, values, np.nan), agents)
+        handles = _draw_vehicle_lines(ax, result, np.where(result.left, values, np.nan), agents)
     # One legend for three panels; beside one of them it would push the others apart.
     fig.legend(handles=handles, loc="outside right center", labelspacing=0.3)
     if (fence := limits.geofence) is not None:
-        st.limit(above, fence.max[2], f"geofence {fence.max[2]:g} m")
+        st.draw_limit(above, fence.max[2], f"geofence {fence.max[2]:g} m")
     for ax, top in ((fast, limits.speed), (climb, limits.vertical_speed)):
         if top is not None:
-            st.limit(ax, top, f"limit {top:g} m/s")
+            st.draw_limit(ax, top, f"limit {top:g} m/s")
     draw_least(apart, result, "separation")
     draw_least(clear, result, "clearance")
     st.name_phases([above], result)
     return fig
 
 
-def _lines(ax: Axes, result: Result, values: Floats, agents: Sequence[int]) -> list[Any]:
+def _draw_vehicle_lines(
+    ax: Axes, result: Result, values: Floats, agents: Sequence[int]
+) -> list[Any]:
     """Lines of some vehicles, or of all; return what the legend has of them."""
     if not agents:
-        st.agent_lines(ax, result, values)
-        return st.agents_shown(result.n_agents)
+        st.draw_agent_lines(ax, result, values)
+        return st.agent_line_handles(result.n_agents)
     colours = st.agent_colours(len(agents))
     return [
-        st.line(ax, result.time, values[:, i - 1], color=colour, label=f"agent {i}")
+        st.draw_line(ax, result.time, values[:, i - 1], color=colour, label=f"agent {i}")
         for i, colour in zip(agents, colours, strict=True)
     ]

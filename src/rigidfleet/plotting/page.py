@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.plotting import curves, space
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import styled
+from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 
 if TYPE_CHECKING:
@@ -40,19 +40,19 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     handles = []
     for i, (name, width) in enumerate((("roll", 1.2), ("pitch", 1.8), ("yaw", 2.4))):
         look: dict[str, Any] = {"color": st.TONES[i], "linewidth": width, "zorder": 2.3 - 0.1 * i}
-        st.line(ax, result.time, flown[:, i], **look)
-        st.reference(ax, result.time, wanted[:, i])
+        st.draw_line(ax, result.time, flown[:, i], **look)
+        st.draw_reference(ax, result.time, wanted[:, i])
         handles.append(Line2D([], [], label=name, **look))
     _legend_above(ax, handles)
-    if not st.still(ax, np.concatenate([flown, wanted]), "deg"):
-        curves.widen(ax, 0.1)
+    if not st.note_if_still(ax, np.concatenate([flown, wanted]), "deg"):
+        curves.widen_limits(ax, 0.1)
 
 
-@styled
+@in_style
 def summary(result: Result) -> Figure:
     """Trajectory, top view, distances (without edges: separation), attitude, thrust and clearance on one page."""
-    fig = st.blank(11.4, 7.0)
-    st.head(fig, result, st.clean(result.mission.title, 80) or "Flight")
+    fig = st.blank_figure(11.4, 7.0)
+    st.draw_head(fig, result, st.clean_name(result.mission.title, 80) or "Flight")
     view = space.scene(result)
     space.draw_space(fig, result, view, (0.0, 0.49, 0.41, 0.47))
     space.draw_above(fig.add_axes((0.45, 0.56, 0.22, 0.36)), result, view)
@@ -60,7 +60,7 @@ def summary(result: Result) -> Figure:
     angles, thrust, apart = (fig.add_axes((x, 0.165, 0.27, 0.285)) for x in (0.05, 0.385, 0.715))
     over_time = (lengths, angles, thrust, apart)
     for ax in over_time:
-        st.over_time(ax, result)
+        st.draw_time_axis(ax, result)
         ax.set_xlabel("time [s]")
     if len(result.edges):
         curves.draw_distances(lengths, result)
@@ -74,7 +74,7 @@ def summary(result: Result) -> Figure:
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
     key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
-    entries = space.handles(result, view)
+    entries = space.legend_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
         bbox_to_anchor=(0.5, 0.058), labelspacing=0.2,

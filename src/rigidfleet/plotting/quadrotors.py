@@ -11,7 +11,7 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, shown
 from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import styled
+from rigidfleet.plotting.style import in_style
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.typing import Bools, Floats
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
 
 _ROWS = 12  # greatest number of vehicles with a bar each; of more, their number is drawn
-_TOLD = 0.35  # height of a row that holds only text
+_TEXT_ROW = 0.35  # height of a row that holds only text
 
 
 def rotor_limits(mission: Mission) -> Floats:
@@ -52,23 +52,23 @@ def tilt(result: Result) -> Floats:
     return np.where(known, samples(result, "tilt").values, np.nan)
 
 
-def _nearest(result: Result, limits: Floats) -> Extremum | None:
+def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
     """The rotor that comes nearest to its limit between samples; its ``other`` is the rotor."""
     every = [p.extremes["rotor_force"] for p in result.phases if "rotor_force" in p.extremes]
     return max(every, key=lambda x: x.value / limits[x.who], default=None)
 
 
-@styled
+@in_style
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle with its limit, and all rotors of the vehicle nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
     above, below = axes[:, 0]
     if not has_rotors(result):
         for ax in (above, below):
-            st.note(ax, "no rotors")
+            st.write_note(ax, "no rotors")
     else:
         _draw_greatest(above, result)
-        st.agents_legend(above, result.n_agents)
+        st.draw_agents_legend(above, result.n_agents)
         _draw_nearest(below, result)
     st.name_phases([above], result)
     return fig
@@ -77,8 +77,8 @@ def rotors(result: Result) -> Figure:
 def _draw_greatest(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle; as a share of the limit if limits differ."""
     limits, force = rotor_limits(result.mission), rotor_forces(result).max(axis=2)
-    between, unit = _nearest(result, limits), "N"
-    shown = peaks.limits(limits)
+    between, unit = _nearest_to_limit(result, limits), "N"
+    shown = peaks.distinct_limits(limits)
     ax.set_ylabel("greatest rotor force [N]")
     if len(shown) > 1:
         if between is not None:
@@ -86,11 +86,14 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
         force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
         ax.set_ylabel("share of the rotor limit [%]")
     between = None if between is None else between._replace(other=-1)
-    st.agent_lines(ax, result, force)
+    st.draw_agent_lines(ax, result, force)
     for value, label, colour in shown:
-        st.limit(ax, value, label, colour)
-    ax.set_ylim(0.0, 1.12 * max([*(value for value, *_ in shown), peaks.sane(result, force)]))
-    peaks.extremes(ax, result, force, unit, peaks.agent, between=between)
+        st.draw_limit(ax, value, label, colour)
+    ax.set_ylim(
+        0.0,
+        1.12 * max([*(value for value, *_ in shown), peaks.peak_before_breakdown(result, force)]),
+    )
+    peaks.mark_extremes(ax, result, force, unit, peaks.agent_name, between=between)
 
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
@@ -100,38 +103,38 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
     limits, force = rotor_limits(result.mission), rotor_forces(result)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits
     i = int(np.nanargmax(peak))
-    e = _nearest(result, limits)
+    e = _nearest_to_limit(result, limits)
     if e is not None and e.value / limits[e.who] > peak[i]:
         i = e.who
-    colours = st.scale(4)
+    colours = st.colour_scale(4)
     for k, colour in enumerate(colours):
-        st.line(ax, result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
-    peaks.within(ax, result, force[:, i])
+        st.draw_line(ax, result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
+    peaks.leave_out_final_peak(ax, result, force[:, i])
     low, high = ax.get_ylim()
     if limits[i] < high + 0.3 * (high - low):
-        st.limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
+        st.draw_limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
     ax.set_ylabel(f"rotors of agent {i + 1} [N]")
     entries = [
         Line2D([], [], color=colour, label=name)
         for name, colour in zip(LABELS["rotor"], colours, strict=True)
     ]
-    st.legend(ax, entries, "nearest to its limit")
+    st.draw_legend(ax, entries, "nearest to its limit")
 
 
-@styled
+@in_style
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it cannot give what is asked of it."""
-    saturated = _saturated(result)
-    shares = (1.0, 1.0, 0.6 if saturated.any() else _TOLD)
+    saturated = _saturation_mask(result)
+    shares = (1.0, 1.0, 0.6 if saturated.any() else _TEXT_ROW)
     title = "Tilt, tracking error and saturation of the vehicles"
     fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
     above, middle, below = axes[:, 0]
     above.set_ylabel("tilt [deg]")
     if not has_rotors(result):
-        st.note(above, "points do not tilt")
+        st.write_note(above, "points do not tilt")
     else:
         draw_limited(above, result, "tilt", tilt(result))
-        st.agents_legend(above, result.n_agents)
+        st.draw_agents_legend(above, result.n_agents)
     draw_off_slot(middle, result)
     _draw_saturation(below, result, saturated)
     st.name_phases([above], result)
@@ -149,18 +152,18 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
     q, between = QUANTITIES[name], result.extreme(name)
     values = samples(result, name).values if values is None else values
     if not np.isfinite(values).any():
-        st.note(ax, q.nothing)
+        st.write_note(ax, q.nothing)
         return
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
     limit, unit = q.limit_of(result.mission), shown(q.unit)
-    if peaks.from_none(ax, result, values, unit, between=between) and limit is not None:
+    if peaks.draw_from_zero(ax, result, values, unit, between=between) and limit is not None:
         top = max(ax.get_ylim()[1], 1.2 * limit)
         ax.set_ylim(-0.04 * top, top)
-        st.limit(ax, limit, f"limit {limit:g} {unit}")
+        st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
 
 
-def _saturated(result: Result) -> Bools:
+def _saturation_mask(result: Result) -> Bools:
     """Mask (K, N) of the vehicles that cannot give what is asked of them."""
     if result.saturated is None:
         return np.zeros(result.left.shape, dtype=np.bool_)
@@ -171,7 +174,7 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     """A bar for each vehicle while it is saturated; of many vehicles, how many are."""
     n, t = result.n_agents, result.time
     if not saturated.any():
-        st.note(ax, "no vehicle is asked for more than its rotors give")
+        st.write_note(ax, "no vehicle is asked for more than its rotors give")
         return
     if n > _ROWS:
         ax.fill_between(t, saturated.sum(axis=1), step="post", color=st.FLOWN, linewidth=0)
@@ -187,4 +190,4 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     ax.set_yticks(range(1, n + 1))
     ax.set_ylabel("saturated\nagent")
     limit = QUANTITIES["saturation"].limit_of(result.mission)
-    st.annotate(ax, f"limit {limit:.3g} % of a phase", st.corners(), color=st.ALERT)
+    st.annotate(ax, f"limit {limit:.3g} % of a phase", st.corner_places(), color=st.ALERT)

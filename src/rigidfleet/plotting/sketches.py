@@ -11,8 +11,8 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.space import camera, dot
-from rigidfleet.plotting.style import styled
+from rigidfleet.plotting.space import camera, marker_look
+from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.result.lights import seen_from
 from rigidfleet.typing import Floats
@@ -52,7 +52,7 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
 Rect = tuple[float, float, float, float]
 
 
-def tiles(
+def tiled_figure(
     n: int, high: float, more: float, beside: tuple[float, float]
 ) -> tuple[Figure, list[Rect]]:
     """A figure with places for n pictures, up to three side by side: ``high`` for each row, and ``more`` [in].
@@ -61,7 +61,7 @@ def tiles(
     """
     columns = min(max(n, 1), 3)
     rows = math.ceil(max(n, 1) / columns)
-    fig = st.blank(max(3.4 * columns, 6.0), more + high * rows)
+    fig = st.blank_figure(max(3.4 * columns, 6.0), more + high * rows)
     above, below = (room / fig.get_figheight() for room in beside)
     height = (1 - above - below) / rows
     places = (divmod(k, columns) for k in range(n))
@@ -70,13 +70,13 @@ def tiles(
     ]
 
 
-@styled
+@in_style
 def formations(result: Result) -> Figure:
     """Constraint graph and body axes of each formation of the mission."""
     names = list(result.mission.formations)
     legend = len(result.edges) > curves.SINGLE and bool(names)
-    fig, rects = tiles(len(names), 3.5, 0.5, (0.45, 0.7 * legend))
-    st.head(fig, result, "Formations with their body axes")
+    fig, rects = tiled_figure(len(names), 3.5, 0.5, (0.45, 0.7 * legend))
+    st.draw_head(fig, result, "Formations with their body axes")
     if not names:
         fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
     for rect, name in zip(rects, names, strict=True):
@@ -103,14 +103,19 @@ def _sketch(fig: Figure, rect: Rect, result: Result, name: str) -> None:
         1e-9, float(np.ptp(p))
     )
     x, y, w, h = rect
-    given = mission.formations[name]
-    words = given.shape or ("slots" if given.slots is not None else "by distances")
+    formation = mission.formations[name]
+    words = formation.shape or ("slots" if formation.slots is not None else "by distances")
     fig.text(
-        x + w / 2, y + 0.95 * h, st.clean(name), ha="center", fontweight="bold", parse_math=False
+        x + w / 2,
+        y + 0.95 * h,
+        st.clean_name(name),
+        ha="center",
+        fontweight="bold",
+        parse_math=False,
     )
-    told = f"{words}, {len(edges)} edge{'s' if len(edges) != 1 else ''}"
-    told += "" if placed else "; their distances fix no positions"
-    fig.text(x + w / 2, y + 0.89 * h, told, ha="center", fontsize=7.5, color=st.GREY)
+    caption = f"{words}, {len(edges)} edge{'s' if len(edges) != 1 else ''}"
+    caption += "" if placed else "; their distances fix no positions"
+    fig.text(x + w / 2, y + 0.89 * h, caption, ha="center", fontsize=7.5, color=st.GREY)
     ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
     turned = p - origin
     axes = np.eye(3)
@@ -165,7 +170,7 @@ def draw_graph(
         middle = a + (b - a) * (0.5 if np.hypot(*(a + b)[:2]) > 0.3 * room else 0.28)
         others = np.delete(p, [i, j], axis=0)
         path = np.array([a, b])[:, :2]
-        if len(others) and _distance_to(others, a, b).min() < 0.02 * room:
+        if len(others) and _distances_to_segment(others, a, b).min() < 0.02 * room:
             # A straight edge would run through another agent.
             across = np.array([a[1] - b[1], b[0] - a[0]]) * -0.22
             s = np.linspace(0, 1, 40)[:, None]
@@ -184,10 +189,10 @@ def draw_graph(
     for i in np.argsort(p[:, 2]):
         colour = shown[i]
         x, y = p[i, :2]
-        ax.plot(x, y, **dot(colour, size), zorder=5, gid=f"agent-{i + 1}")
+        ax.plot(x, y, **marker_look(colour, size), zorder=5, gid=f"agent-{i + 1}")
         if size > 7:
             ax.text(
-                x, y, str(i + 1), fontsize=0.6 * size, color=_readable_on(colour), ha="center",
+                x, y, str(i + 1), fontsize=0.6 * size, color=_letter_colour(colour), ha="center",
                 va="center_baseline", zorder=6, fontweight="bold",
             )  # fmt: skip
 
@@ -242,14 +247,14 @@ def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
         )  # fmt: skip
 
 
-def _distance_to(points: Floats, a: Floats, b: Floats) -> Floats:
+def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:
     """Distances of points (n, 3) from the segment a b."""
     along = b - a
     s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
     return np.linalg.norm(points - a - s[:, None] * along, axis=1)
 
 
-def _readable_on(colour: str) -> str:
+def _letter_colour(colour: str) -> str:
     from matplotlib.colors import to_rgb
 
     return "white" if float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114))) < 0.6 else st.INK

@@ -27,7 +27,7 @@ _WAY = 200
 
 
 @dataclass(frozen=True)
-class Shape:
+class DrawnObstacle:
     """An obstacle to draw."""
 
     name: str
@@ -47,9 +47,11 @@ class Shape:
         )
 
 
-def shapes(mission: Mission, begin: float, end: float, low: Floats, high: Floats) -> list[Shape]:
+def drawn_obstacles(
+    mission: Mission, begin: float, end: float, low: Floats, high: Floats
+) -> list[DrawnObstacle]:
     """Obstacles that are no plain boxes, over a time [s], as far as they come near the space from low to high (3,)."""
-    found = []
+    near_obstacles = []
     for thing in mission.solids:
         if thing.corners is not None and not thing.zone:
             continue
@@ -69,29 +71,31 @@ def shapes(mission: Mission, begin: float, end: float, low: Floats, high: Floats
                 for k, n in enumerate(solid.grid[0])
             )
             grid = x, y, solid.heights.reshape(solid.grid[0])
-        shape = Shape(thing.name, thing.zone, grid is not None, outline(solid), at, way, grid)
+        shape = DrawnObstacle(
+            thing.name, thing.zone, grid is not None, outline(solid), at, way, grid
+        )
         near = (shape.ends[1] >= low) & (shape.ends[0] <= high)
         if near.all():
-            found.append(shape)
-    return found
+            near_obstacles.append(shape)
+    return near_obstacles
 
 
-def _fading(shape: Shape) -> Floats:
+def _opacities(shape: DrawnObstacle) -> Floats:
     """Opacity of a shape at each of its places, as a share of the last one's."""
     n = len(shape.at)
     return np.linspace(_FIRST, 1.0, n) if n > 1 else np.ones(1)
 
 
-def draw_in_space(ax: Axes3D, shape: Shape) -> None:
+def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
     """Draw an obstacle in three dimensions: lit faces, the lines of its shape, and its way."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
     colour = st.ALERT if shape.zone else COLOUR
     dashes: Any = (0, (4, 2)) if shape.zone else "-"
-    for at, share in zip(shape.at, _fading(shape), strict=True):
+    for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = float(share) * (0.07 if shape.zone else 0.7 if shape.terrain else 0.6)
         faces = Poly3DCollection(
-            list(shape.surface.triangles + at), facecolors=_lit(shape, colour, opacity), edgecolors="none",
+            list(shape.surface.triangles + at), facecolors=_face_colours(shape, colour, opacity), edgecolors="none",
             linewidths=0, antialiaseds=shape.zone, zorder=0.5 if shape.terrain else 2, gid="obstacle",
         )  # fmt: skip
         ax.add_collection3d(faces)
@@ -106,7 +110,7 @@ def draw_in_space(ax: Axes3D, shape: Shape) -> None:
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2.2)
 
 
-def _lit(shape: Shape, colour: str, opacity: float) -> Floats:
+def _face_colours(shape: DrawnObstacle, colour: str, opacity: float) -> Floats:
     """Colours (T, 4) of the faces of a shape, lighter towards the light."""
     from matplotlib.colors import to_rgb
 
@@ -121,7 +125,7 @@ def _lit(shape: Shape, colour: str, opacity: float) -> Floats:
     return np.column_stack([np.clip(1.0 - opacity * dark, 0.0, 1.0), np.ones(len(dark))])
 
 
-def draw_from_above(ax: Axes, shape: Shape) -> None:
+def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     """Draw an obstacle from above: its outline at each place, its way, contours of a height map, and its name."""
     from matplotlib.patches import Polygon
     from scipy.spatial import ConvexHull
@@ -134,9 +138,9 @@ def draw_from_above(ax: Axes, shape: Shape) -> None:
         look |= {"edgecolor": colour, "linewidth": 0.8, "linestyle": (0, (4, 2))}
     if shape.grid is not None:
         x, y, z = shape.grid
-        ax.contourf(x, y, z.T, 8, cmap=_ramp(), alpha=0.5, zorder=0.8)
+        ax.contourf(x, y, z.T, 8, cmap=_height_colours(), alpha=0.5, zorder=0.8)
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
-    for at, share in zip(shape.at, _fading(shape), strict=True):
+    for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
         patch = ax.add_patch(Polygon(rim + at[:2], **look, alpha=opacity * float(share)))
         if shape.zone:
@@ -149,7 +153,7 @@ def draw_from_above(ax: Axes, shape: Shape) -> None:
     st.name_box(ax, patch, x + shape.at[-1, 0], y + shape.at[-1, 1], shape.name)
 
 
-def _ramp() -> Any:
+def _height_colours() -> Any:
     """Colours of a height map from its lowest to its highest."""
     from matplotlib.colors import LinearSegmentedColormap
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.plotting import solids
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import styled
+from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.result.lights import view as seen
@@ -47,7 +47,7 @@ class Scene:
     floor: float  # height of the plane that shadows fall on [m]
     ground: bool  # whether this plane is the ground
     boxes: list[tuple[str, Floats, Floats]]  # name and corners [m]
-    shapes: list[solids.Shape]  # all other obstacles
+    shapes: list[solids.DrawnObstacle]  # all other obstacles
     waypoints: list[tuple[str, Floats]]
 
 
@@ -55,7 +55,7 @@ def scene(result: Result) -> Scene:
     """Content of the trajectory figure."""
     mission, r = result.mission, result.position
     rows = np.flatnonzero(np.isfinite(r).all(axis=(1, 2)))
-    thin = rows[st.some(len(rows), _TRAIL if r.shape[1] <= st.MANY else _TRAIL // 10)]
+    thin = rows[st.spaced_indices(len(rows), _TRAIL if r.shape[1] <= st.MANY else _TRAIL // 10)]
     waypoints = _waypoints(result)
     seen = np.concatenate(
         [r[thin].reshape(-1, 3), *(w[1][None] for w in waypoints), np.zeros((0, 3))]
@@ -75,7 +75,7 @@ def scene(result: Result) -> Scene:
             if (b > a).all():
                 boxes.append((o.name, a, b))
     begin, end = float(result.time[0]), float(result.time[-1])
-    shapes = solids.shapes(mission, begin, end, low - near, high + near)
+    shapes = solids.drawn_obstacles(mission, begin, end, low - near, high + near)
     seen_too = [np.clip(shape.ends, low - near, high + near) for shape in shapes]
     low = np.minimum.reduce([low, *(a for _, a, _ in boxes), *(ends[0] for ends in seen_too)])
     high = np.maximum.reduce([high, *(b for _, _, b in boxes), *(ends[1] for ends in seen_too)])
@@ -88,7 +88,7 @@ def scene(result: Result) -> Scene:
     return Scene(
         r[thin],
         result.cm[thin],
-        _shots(result, rows),
+        _drawn_samples(result, rows),
         low,
         high,
         floor,
@@ -101,7 +101,7 @@ def scene(result: Result) -> Scene:
 
 def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     """Short name and position of each waypoint, once for each position."""
-    found: dict[tuple[float, ...], str] = {}
+    names: dict[tuple[float, ...], str] = {}
     for phase in result.phases:
         target = phase.target or {}
         for position in [
@@ -110,11 +110,11 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
         ]:
             if position is not None:
                 place = tuple(np.round(np.asarray(position, dtype=float), 6).tolist())
-                found.setdefault(place, st.clean(phase.name.split(":")[0], 12))
-    return [(name, np.array(place)) for place, name in found.items()]
+                names.setdefault(place, st.clean_name(phase.name.split(":")[0], 12))
+    return [(name, np.array(place)) for place, name in names.items()]
 
 
-def _shots(result: Result, rows: Any) -> list[int]:
+def _drawn_samples(result: Result, rows: Any) -> list[int]:
     """Samples at which the formation is drawn: start, end, ends of phases, and some in between.
 
     Samples whose drawing would cover an earlier one are left out.
@@ -139,17 +139,17 @@ def _shots(result: Result, rows: Any) -> list[int]:
 
     keep([int(rows[-1])], 1e-3 * size)
     keep(ends, 0.3 * size)
-    keep(rows[st.some(len(rows), 80)].tolist(), max(1.2 * size, path / 14))
+    keep(rows[st.spaced_indices(len(rows), 80)].tolist(), max(1.2 * size, path / 14))
     return sorted(kept)
 
 
-def _faces(low: Floats, high: Floats) -> list[Floats]:
+def _box_faces(low: Floats, high: Floats) -> list[Floats]:
     c = corners(low, high)
     sides = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
     return [c[list(side)] for side in sides]
 
 
-def _segments(result: Result, shots: list[int]) -> Floats:
+def _edge_segments(result: Result, shots: list[int]) -> Floats:
     """Edges active at samples as segments (n, 2, 3)."""
     drawn = [result.position[k][result.edges[np.isfinite(result.constraint[k])]] for k in shots]
     return np.concatenate([np.zeros((0, 2, 3)), *drawn])
@@ -163,7 +163,7 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     for _, place in view.waypoints:
         ax.plot(*place[:axes, None], **_CROSS, zorder=7)
     if has_lights(result):
-        for i in st.some(result.n_agents, st.MANY):
+        for i in st.spaced_indices(result.n_agents, st.MANY):
             path: dict[str, Any] = {"color": st.GREY, "linewidth": 0.4, "alpha": 0.3, "zorder": 3}
             ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
         r = result.position[view.shots, :, :axes].reshape(-1, axes)
@@ -178,15 +178,15 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         path: dict[str, Any] = {"color": colour, "linewidth": 0.8, "alpha": 0.9, "zorder": 3}
         ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
         r = result.position[view.shots, i, :axes].T
-        ax.plot(*r, **dot(colour, 3), zorder=5)
-        ax.plot(*r[:, :1], **dot(colour, 5, hollow=True), zorder=6, gid="start")
-        ax.plot(*r[:, -1:], **dot(colour, 5, marker="s"), zorder=6, gid="end")
+        ax.plot(*r, **marker_look(colour, 3), zorder=5)
+        ax.plot(*r[:, :1], **marker_look(colour, 5, hollow=True), zorder=6, gid="start")
+        ax.plot(*r[:, -1:], **marker_look(colour, 5, marker="s"), zorder=6, gid="end")
 
 
 def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Draw paths of some of many agents, and all agents at the drawn samples."""
     colours = np.array(st.agent_colours(result.n_agents))
-    for i in st.some(result.n_agents, st.MANY):
+    for i in st.spaced_indices(result.n_agents, st.MANY):
         ax.plot(*view.paths[:, i, :axes].T, color=colours[i], linewidth=0.4, alpha=0.5, zorder=3)
     first, last = view.shots[0], view.shots[-1]
     for k in view.shots:
@@ -197,7 +197,9 @@ def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         ax.scatter(*r, s=4 if k in (first, last) else 3, **look, zorder=6 if hollow else 5)
 
 
-def dot(colour: str, size: float, *, hollow: bool = False, marker: str = "o") -> dict[str, Any]:
+def marker_look(
+    colour: str, size: float, *, hollow: bool = False, marker: str = "o"
+) -> dict[str, Any]:
     """Look of a marker of a size [points], filled or hollow."""
     return {
         "linestyle": "", "marker": marker, "markersize": size,
@@ -225,7 +227,7 @@ def draw_space(
     ax.set_proj_type("ortho")
     low, high = view.low, view.high
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    _plain_axes(ax)
+    _set_ticks(ax)
     night = has_lights(result)
     if night:
         ax.grid(visible=False)
@@ -243,12 +245,12 @@ def draw_space(
             "linewidth": 0.5,
             "alpha": 0.22,
         }
-        ax.add_collection3d(Poly3DCollection(_faces(a, b), **faces, zorder=2, gid="obstacle"))
+        ax.add_collection3d(Poly3DCollection(_box_faces(a, b), **faces, zorder=2, gid="obstacle"))
     for shape in view.shapes:
         solids.draw_in_space(ax, shape)
     shadow = np.full(len(view.centre), view.floor)
     ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
-    edges = _segments(result, view.shots)
+    edges = _edge_segments(result, view.shots)
     if 0 < len(edges) <= _LINES:
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
@@ -263,12 +265,12 @@ def draw_space(
         ax.view_init(min(max(elevation, _LOW), _HIGH), azimuth + _ASIDE)
     else:
         ax.view_init(_ELEVATION, _azimuth(view))
-    _fit(fig, ax, view, rect)
+    _fit_axes(fig, ax, view, rect)
     _name_axes(fig, ax, view)
     return ax
 
 
-def _plain_axes(ax: Axes3D) -> None:
+def _set_ticks(ax: Axes3D) -> None:
     from matplotlib.ticker import MaxNLocator
 
     spans = [np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim()), np.ptp(ax.get_zlim())]
@@ -327,7 +329,9 @@ def _name_axes(fig: Figure, ax: Axes3D, view: Scene) -> None:
         fig.text(x, y, name, ha="center", va="center", rotation=angle, fontsize=8)
 
 
-def _fit(fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, float]) -> None:
+def _fit_axes(
+    fig: Figure, ax: Axes3D, view: Scene, rect: tuple[float, float, float, float]
+) -> None:
     """Zoom and shift so that the box of the axes with its labels fills `rect` (left, bottom, width, height)."""
     from matplotlib.transforms import Bbox
 
@@ -367,14 +371,14 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         ax.set_facecolor(st.NIGHT)
         ax.grid(visible=False)
     for name, low, high in view.boxes:
-        _outline(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
+        _draw_box(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
     for shape in view.shapes:
         solids.draw_from_above(ax, shape)
     fence = result.mission.limits.geofence
     if fence is not None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}
-        _outline(ax, np.array(fence.min), np.array(fence.max), "", **look, gid="geofence")
-    edges = _segments(result, view.shots)[..., :2]
+        _draw_box(ax, np.array(fence.min), np.array(fence.max), "", **look, gid="geofence")
+    edges = _edge_segments(result, view.shots)[..., :2]
     edges = edges if len(edges) <= _LINES else edges[:0]  # more would hide everything
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
@@ -388,7 +392,7 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         )  # fmt: skip
 
 
-def _outline(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> None:
+def _draw_box(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> None:
     """Draw a box from above, with its name if it fits."""
     from matplotlib.patches import Rectangle
 
@@ -397,7 +401,7 @@ def _outline(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> Non
     st.name_box(ax, box, x + width / 2, y, name)
 
 
-def handles(result: Result, view: Scene) -> list[Any]:
+def legend_handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
     from matplotlib.lines import Line2D
 
@@ -405,22 +409,22 @@ def handles(result: Result, view: Scene) -> list[Any]:
     if has_lights(result):
         return waypoints
     ends = [
-        Line2D([], [], **dot(st.GREY, 5, hollow=True), label="start"),
-        Line2D([], [], **dot(st.GREY, 5, marker="s"), label="end"),
+        Line2D([], [], **marker_look(st.GREY, 5, hollow=True), label="start"),
+        Line2D([], [], **marker_look(st.GREY, 5, marker="s"), label="end"),
     ]
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
-@styled
+@in_style
 def trajectory(result: Result) -> Figure:
     """Trajectory in three dimensions and from above, with the formation drawn at chosen times."""
-    wide = st.width(10.5)
-    fig = st.blank(wide, 2.2 * wide if st.narrow() else 6.2)
-    st.head(fig, result, "Trajectory")
+    wide = st.figure_width(10.5)
+    fig = st.blank_figure(wide, 2.2 * wide if st.is_narrow() else 6.2)
+    st.draw_head(fig, result, "Trajectory")
     view = scene(result)
-    entries = handles(result, view)
-    columns = max(1, min(len(entries), max(int(0.9 * wide), 2) if st.narrow() else 11))
-    if st.narrow():  # the view from above stands below
+    entries = legend_handles(result, view)
+    columns = max(1, min(len(entries), max(int(0.9 * wide), 2) if st.is_narrow() else 11))
+    if st.is_narrow():  # the view from above stands below
         draw_space(fig, result, view, (0.0, 0.5, 1.0, 0.44))
         low = (0.65 + 0.18 * math.ceil(len(entries) / columns)) / fig.get_figheight()
         above = fig.add_axes((0.55 / wide, low, 0.96 - 0.55 / wide, 0.48 - low))

@@ -128,21 +128,21 @@ def settings() -> Generator[None]:
         yield
 
 
-def styled(draw: Draw) -> Draw:
+def in_style(draw: Draw) -> Draw:
     """Draw a figure in our style."""
 
     @wraps(draw)
-    def drawn(result: Result) -> Figure:
+    def draw_in_style(result: Result) -> Figure:
         with settings():
             figure = draw(result)
             place_words(figure)
             return figure
 
-    return drawn
+    return draw_in_style
 
 
 @contextmanager
-def shape(*, titles: bool = True, width: float | None = None) -> Generator[None]:
+def figure_options(*, titles: bool = True, width: float | None = None) -> Generator[None]:
     """Draw figures in this context with a title and the mission's name, or without both; of another width [mm]."""
     before = _shape.set((titles, width))
     try:
@@ -151,15 +151,15 @@ def shape(*, titles: bool = True, width: float | None = None) -> Generator[None]
         _shape.reset(before)
 
 
-def width(usual: float) -> float:
+def figure_width(usual: float) -> float:
     """Width of a figure [in]: the one that is wanted, or the usual one."""
     wanted = _shape.get()[1]
     return usual if wanted is None else wanted / 25.4
 
 
-def narrow() -> bool:
+def is_narrow() -> bool:
     """Whether figures are to fit one column of a page."""
-    return width(WIDTH) < _COLUMN
+    return figure_width(WIDTH) < _COLUMN
 
 
 def agent_colours(n: int) -> list[str]:
@@ -167,10 +167,10 @@ def agent_colours(n: int) -> list[str]:
 
     Up to twelve agents have colours of their own; more agents have colours along viridis, by number.
     """
-    return list(PALETTE[:n]) if n <= len(PALETTE) else scale(n)
+    return list(PALETTE[:n]) if n <= len(PALETTE) else colour_scale(n)
 
 
-def scale(n: int) -> list[str]:
+def colour_scale(n: int) -> list[str]:
     """n colours from dark to light, in an order that colour-blind readers can see."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
@@ -181,7 +181,7 @@ def scale(n: int) -> list[str]:
 # -- figures over time -------------------------------------------------------------------------------
 
 
-def blank(wide: float, high: float, layout: Any = None) -> Figure:
+def blank_figure(wide: float, high: float, layout: Any = None) -> Figure:
     """An empty figure of a width and a height [in], which is drawn in our style."""
     from rigidfleet.plotting.figure import Figure
 
@@ -200,34 +200,36 @@ def time_figure(
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
     shares = [1.0] * rows if shares is None else shares
-    stacked = (columns, rows) if narrow() else None  # the second column then stands below the first
+    stacked = (
+        (columns, rows) if is_narrow() else None
+    )  # the second column then stands below the first
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)
-    fig = blank(width(WIDTH), whole, "constrained")
+    fig = blank_figure(figure_width(WIDTH), whole, "constrained")
     # Nearly the heights that the axes will have, as the number of their ticks depends on it
     inside = whole - 1.2 - 2 * _PAD * (rows - 1)
     grid = {"bottom": 0.5 / whole, "top": 1 - 0.7 / whole, "hspace": 2 * _PAD * rows / inside}
     axes = fig.subplots(
         rows, columns, sharex=True, squeeze=False, height_ratios=shares, gridspec_kw=grid
     )
-    head(fig, result, title)
+    draw_head(fig, result, title)
     for ax in axes.flat:
-        over_time(ax, result)
+        draw_time_axis(ax, result)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
     return fig, axes.reshape(stacked).T if stacked else axes
 
 
-def head(fig: Figure, result: Result, title: str) -> None:
+def draw_head(fig: Figure, result: Result, title: str) -> None:
     """Title at the left; at the right, the mission and, if the flight is incomplete, when it stopped."""
     words, colour = result.mission.name, GREY
     if not result.complete:
         words, colour = f"{words}: incomplete, stopped at {result.phases[-1].t_end:.2f} s", ALERT
-    heading(fig, title, words, colour)
+    draw_heading(fig, title, words, colour)
 
 
-def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
+def draw_heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
     """Title at the left, text at the right; without titles, only a warning text."""
     top = 1 - _PAD / fig.get_figheight()
     if not _shape.get()[0]:
@@ -243,11 +245,11 @@ def heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
     )
     if fig.get_layout_engine() is None:  # a layout engine places it itself, clear of the axes
         title_text.set_y(top)
-    words = words if colour == ALERT or not narrow() else ""
+    words = words if colour == ALERT or not is_narrow() else ""
     fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
 
 
-def over_time(ax: Axes, result: Result) -> None:
+def draw_time_axis(ax: Axes, result: Result) -> None:
     """Time axis with every second phase shaded."""
     t = result.time
     ax.set_xlim(t[0], t[-1] if t[-1] > t[0] else t[0] + 1.0)
@@ -257,12 +259,12 @@ def over_time(ax: Axes, result: Result) -> None:
         ax.axvline(t[-1], color=ALERT, linewidth=0.8)
 
 
-def line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
+def draw_line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
     """Line through samples y (K,) at t (K,), thinned if there are more than can be seen."""
-    return ax.plot(*thinned(t, y), **look)[0]
+    return ax.plot(*thin_out(t, y), **look)[0]
 
 
-def thinned(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
+def thin_out(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
     """About `most` samples or fewer that look the same: the first, least and greatest of each interval."""
     if len(t) <= most:
         return t, y
@@ -275,12 +277,12 @@ def thinned(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
     return t[kept], y[kept]
 
 
-def reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
+def draw_reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
     """Draw a reference as a dashed line."""
-    return line(ax, t, y, color=INK, linewidth=0.8, linestyle=DASHES, zorder=3)
+    return draw_line(ax, t, y, color=INK, linewidth=0.8, linestyle=DASHES, zorder=3)
 
 
-def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
+def draw_limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     """Draw a limit as a line with its name."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
     along: list[Place] = [
@@ -288,7 +290,7 @@ def limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
         for x, ha in _ALONG
         for va, away in (("bottom", 2), ("top", -2))
     ]
-    annotate(ax, label, [*along, *corners()], color=colour)
+    annotate(ax, label, [*along, *corner_places()], color=colour)
 
 
 # -- text that covers nothing --------------------------------------------------------------------------
@@ -305,7 +307,7 @@ def annotate(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
     _places[label] = places
 
 
-def corners() -> list[Place]:
+def corner_places() -> list[Place]:
     """Places along the top of an axes, then along its bottom."""
     return [
         ((x, y), "axes fraction", (0, -3 if va == "top" else 3), ha, va)
@@ -314,7 +316,7 @@ def corners() -> list[Place]:
     ]
 
 
-def around(x: float, y: float) -> list[Place]:
+def places_around(x: float, y: float) -> list[Place]:
     """Places around a data point, near ones first, those below first."""
     sides = (("center", 0.0), ("left", 1.0), ("right", -1.0))
     near: list[Place] = [
@@ -346,7 +348,7 @@ def place_words(fig: Figure) -> None:
             best, chosen = math.inf, places[0]
             for place in places:
                 _move(label, place)
-                covered = _covered(ax, label.get_window_extent().padded(2 * _DOT), others)
+                covered = _overlap_cost(ax, label.get_window_extent().padded(2 * _DOT), others)
                 if covered < best:
                     best, chosen = covered, place
                 if not covered:
@@ -364,7 +366,7 @@ def _move(label: Annotation, place: Place) -> None:
     label.set(ha=ha, va=va)
 
 
-def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
+def _overlap_cost(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
     """Cost of a box [pixels] for what it covers: lines, bands, other boxes; highest for parts outside the axes."""
     n = sum(box.overlaps(other) for other in others)
     for line in ax.lines:
@@ -383,19 +385,19 @@ def _covered(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
     return n
 
 
-def still(ax: Axes, values: Floats, unit: str) -> bool:
+def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
     """If values do not vary, write the value into the axes; return whether this is so."""
     known = values[np.isfinite(values)]
     if not len(known) or np.ptp(known) > STILL:
         return False
     value = round(float(known.max() + known.min()) / 2, 3) + 0.0
     off = float(np.abs(known - value).max())
-    told = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
+    caption = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
     ax.set_ylim(value - 1.0, value + 1.0)
     ax.set_yticks([value], [f"{value:.6g}"])
     annotate(
         ax,
-        told,
+        caption,
         [((0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom")],
         color=GREY,
     )
@@ -415,7 +417,7 @@ def halo() -> list[Any]:
     return [withStroke(linewidth=2.5, foreground="white")]
 
 
-def note(ax: Axes, words: str) -> None:
+def write_note(ax: Axes, words: str) -> None:
     """Write text in an axes that has nothing to show."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY)
     ax.tick_params(left=False, labelleft=False)
@@ -424,29 +426,29 @@ def note(ax: Axes, words: str) -> None:
 def name_box(ax: Axes, box: Artist, x: float, y: float, name: str) -> None:
     """Write the name of a box above its lower edge, if it fits."""
     label = ax.text(
-        x, y, clean(name, 20), fontsize=6.5, color=GREY, ha="center", va="bottom", zorder=1.5,
+        x, y, clean_name(name, 20), fontsize=6.5, color=GREY, ha="center", va="bottom", zorder=1.5,
         parse_math=False,
     )  # fmt: skip
     if label.get_window_extent().width > box.get_window_extent().width:
         label.remove()
 
 
-def spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
+def draw_spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
     """Draw many values (K, n) as a band from least to greatest, a band of nine in ten, and their median."""
     known = np.isfinite(values).any(axis=1)
     if not known.any():
         return
-    found = np.full((5, len(t)), np.nan)
-    found[:, known] = np.nanquantile(values[known], [0.0, 0.05, 0.5, 0.95, 1.0], axis=1)
-    least, low, middle, high, greatest = found
+    quantiles = np.full((5, len(t)), np.nan)
+    quantiles[:, known] = np.nanquantile(values[known], [0.0, 0.05, 0.5, 0.95, 1.0], axis=1)
+    least, low, middle, high, greatest = quantiles
     look: dict[str, Any] = {"color": colour, "linewidth": 0.0, "zorder": 2.0}
     ax.fill_between(t, least, greatest, alpha=0.25, **look, gid="spread")
     ax.fill_between(t, low, high, alpha=0.45, **look)
-    line(ax, t, middle, color=colour, linewidth=1.4, zorder=2.1)
+    draw_line(ax, t, middle, color=colour, linewidth=1.4, zorder=2.1)
 
 
 def spread_handles(what: str, colour: str) -> list[Any]:
-    """Legend entries of `spread`."""
+    """Legend entries of `draw_spread`."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -457,19 +459,19 @@ def spread_handles(what: str, colour: str) -> list[Any]:
     ]
 
 
-def agent_lines(ax: Axes, result: Result, values: Floats) -> None:
+def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
     """A line for each agent, values (K, N), in its colour; the first ones are widest, so that all are visible.
 
     For more than `MANY` agents, the spread is drawn.
     """
     n = result.n_agents
     if n > MANY:
-        spread(ax, result.time, values, FLOWN)
+        draw_spread(ax, result.time, values, FLOWN)
         return
     for i, colour in enumerate(agent_colours(n)):
         width = 1.0 + 1.6 * (n - 1 - i) / max(n - 1, 1)
         name = f"agent-{i + 1}"
-        line(ax, result.time, values[:, i], color=colour, linewidth=width, gid=name)
+        draw_line(ax, result.time, values[:, i], color=colour, linewidth=width, gid=name)
 
 
 def agent_handles(n: int, **look: Any) -> list[Line2D]:
@@ -479,35 +481,36 @@ def agent_handles(n: int, **look: Any) -> list[Line2D]:
     colours = agent_colours(n)
     entries = _ENTRIES if n <= MANY else 4
     return [
-        Line2D([], [], color=colours[i], label=f"agent {i + 1}", **look) for i in some(n, entries)
+        Line2D([], [], color=colours[i], label=f"agent {i + 1}", **look)
+        for i in spaced_indices(n, entries)
     ]
 
 
-def agents_legend(ax: Axes, n: int) -> None:
-    """Legend of `agent_lines`."""
-    legend(ax, agents_shown(n))
+def draw_agents_legend(ax: Axes, n: int) -> None:
+    """Legend of `draw_agent_lines`."""
+    draw_legend(ax, agent_line_handles(n))
 
 
-def agents_shown(n: int) -> list[Any]:
-    """What a legend has of `agent_lines`."""
+def agent_line_handles(n: int) -> list[Any]:
+    """What a legend has of `draw_agent_lines`."""
     return agent_handles(n) if n <= MANY else spread_handles(f"{n} agents", FLOWN)
 
 
-def some(n: int, most: int) -> list[int]:
+def spaced_indices(n: int, most: int) -> list[int]:
     """Indices of n things, or of `most` evenly spread ones with both ends."""
     return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most)).tolist()}) if n else []
 
 
-def legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
+def draw_legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
     """Legend to the right of an axes, in a narrow figure below."""
     look: dict[str, Any] = {"bbox_to_anchor": (1.012, 1.0)}
-    if narrow():  # clear of the numbers and the name of the time axis, which the last axes has
+    if is_narrow():  # clear of the numbers and the name of the time axis, which the last axes has
         last = (spec := ax.get_subplotspec()) is None or spec.is_last_row()
         longest = max((len(str(h.get_label())) for h in handles), default=1)
         look = {
             "bbox_to_anchor": (0, 0),
             "borderaxespad": 4.5 if last else 0.8,
-            "ncols": max(int(16 * (width(WIDTH) - 0.7)) // (longest + 7), 1),
+            "ncols": max(int(16 * (figure_width(WIDTH) - 0.7)) // (longest + 7), 1),
         }
     if handles:
         ax.legend(
@@ -519,7 +522,7 @@ def legend(ax: Axes, handles: Sequence[Any], title: str = "") -> None:
 # -- names of phases ---------------------------------------------------------------------------------
 
 
-def clean(name: str, longest: int = _LONGEST) -> str:
+def clean_name(name: str, longest: int = _LONGEST) -> str:
     """A user's name as one printable line, shortened if it is long."""
     words = " ".join("".join(c if c.isprintable() else " " for c in name).split())
     return words if len(words) <= longest else words[: longest - 1].rstrip() + "…"
@@ -531,7 +534,7 @@ def name_phases(axes: Iterable[Axes], result: Result) -> None:
     If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
     phases are short, with a line to their phase. If even this is too narrow, the shortest phases have no name.
     """
-    for ax in list(axes)[: 1 if narrow() else None]:
+    for ax in list(axes)[: 1 if is_narrow() else None]:
         labels = _upright(ax, result) or _slanting(ax, result)
         for label in labels:
             label.set_gid("phase")
@@ -544,7 +547,7 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
     """
     for ax in axes:
         right = -math.inf
-        for i, (_, start, end) in enumerate(_spans(ax, result)):
+        for i, (_, start, end) in enumerate(_phase_spans(ax, result)):
             label = ax.text(
                 (start + end) / 2, 1.01, str(i + 1), fontsize=6.5, color=GREY, ha="center",
                 va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
@@ -556,7 +559,7 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
                 right = box.x1
     # The default name of a phase is its kind and number.
     names = (
-        f"{i + 1} {clean(p.kind if p.name == f'{p.kind} {i + 1}' else p.name)}"
+        f"{i + 1} {clean_name(p.kind if p.name == f'{p.kind} {i + 1}' else p.name)}"
         for i, p in enumerate(result.phases)
     )
     return "  ·  ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
@@ -564,9 +567,9 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
 
 def _upright(ax: Axes, result: Result) -> list[Text]:
     labels = []
-    for name, start, end in _spans(ax, result):
+    for name, start, end in _phase_spans(ax, result):
         label = ax.text(
-            (start + end) / 2, 1.02, clean(name, 60), fontsize=8, color=GREY, ha="center",
+            (start + end) / 2, 1.02, clean_name(name, 60), fontsize=8, color=GREY, ha="center",
             va="bottom", transform=ax.get_xaxis_transform(), parse_math=False,
         )  # fmt: skip
         labels.append(label)
@@ -583,7 +586,7 @@ def _slanting(ax: Axes, result: Result) -> list[Text]:
     # Slanted texts need a distance that depends on their height and slant.
     pitch = 1.25 * size * ax.figure.dpi / 72 / math.sin(math.radians(_SLANT))
     room = int(scale * np.diff(ax.get_xlim())[0] / pitch)
-    longest = sorted(_spans(ax, result), key=lambda span: span[1] - span[2])[:room]
+    longest = sorted(_phase_spans(ax, result), key=lambda span: span[1] - span[2])[:room]
     spans = sorted(longest, key=lambda span: span[1])
     middle = np.array([(start + end) / 2 - t0 for _, start, end in spans]) * scale
     place = np.maximum(_apart(middle, pitch), pitch * np.arange(len(middle)))
@@ -592,7 +595,7 @@ def _slanting(ax: Axes, result: Result) -> list[Text]:
     middle, place = middle / scale + t0, place / scale + t0
     for (name, *_), at in zip(spans, place.tolist(), strict=True):
         label = ax.text(
-            at, 1 + above, clean(name), fontsize=size, color=GREY, ha="left", va="baseline",
+            at, 1 + above, clean_name(name), fontsize=size, color=GREY, ha="left", va="baseline",
             rotation=_SLANT, rotation_mode="anchor", transform=ax.get_xaxis_transform(),
             parse_math=False,
         )  # fmt: skip
@@ -605,7 +608,7 @@ def _slanting(ax: Axes, result: Result) -> list[Text]:
     return labels
 
 
-def _spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
+def _phase_spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
     """Name, start and end [s] of each phase that the axes show."""
     low, high = ax.get_xlim()
     return [

@@ -28,7 +28,7 @@ from rigidfleet.rigidity import (
     spectrum,
 )
 from rigidfleet.rigidity.analysis import WHERE, flatten
-from rigidfleet.rigidity.realisations import positions_led_to
+from rigidfleet.rigidity.realisations import lead_lengths
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
@@ -248,7 +248,7 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]
             pairs = complete_graph(len(r))
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-            led = None if torn else positions_led_to(r, edges, lengths, 1e-6 * apart.min(), slots)
+            led = None if torn else lead_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
             most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
             most *= mission.formations[name].greatest_error(apart.min())
             off, before = np.inf, out.get(name, (0, 0.0))

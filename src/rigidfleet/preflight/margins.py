@@ -10,9 +10,9 @@ import numpy as np
 
 from rigidfleet.math.margins import (
     GROWTH,
-    Feedback,
     Lag,
     Loop,
+    LoopGains,
     Margins,
     formation_loops,
     largest_pole,
@@ -66,7 +66,7 @@ class Looped:
 
     where: str
     loops: list[Loop]
-    law: Feedback
+    law: LoopGains
     growth: float
 
 
@@ -107,14 +107,14 @@ def formation_laws(
     return found, skipped
 
 
-def feedback(mission: Mission, phase: Phase | None, held: str | None) -> Feedback:
+def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGains:
     """The laws of a phase; ``held`` is the formation in which it begins, None if the shape changes."""
     c = mission.constraint
     k1, k2 = mission.tracking_gains
     on = float(c.stabilisation == "pid")
     d = mission.disturbances
     links = None if d is None else d.links
-    return Feedback(
+    return LoopGains(
         ki=mission.tracking.integral,
         # A state waits for half a period on average until it is sent.
         link=0.0 if links is None else links.delay + 0.5 / links.rate,
@@ -167,7 +167,7 @@ def _seen_from_above(r: Floats) -> tuple[bytes, bytes]:
 
 
 def _worse(
-    known: FormationMargins | None, loops: Sequence[Loop], law: Feedback, growth: float
+    known: FormationMargins | None, loops: Sequence[Loop], law: LoopGains, growth: float
 ) -> FormationMargins:
     """The smaller margins of those ``known`` and those of a further shape."""
     now = margins(loops, law, growth)

@@ -23,7 +23,7 @@ from rigidfleet.plotting.quadrotors import (
     rotor_limits,
     tilt,
 )
-from rigidfleet.plotting.style import clean
+from rigidfleet.plotting.style import clean_name
 from rigidfleet.reporting import gains, overlay
 from rigidfleet.result.quantities import samples
 
@@ -347,7 +347,7 @@ def _keys(missions: Sequence[Mission], labels: Sequence[str]) -> Table:
     for key in dict.fromkeys(key for one in flat for key in one):
         values = [one.get(key, "not set") for one in flat]
         if key != "name" and len(set(values)) > 1:
-            rows.append(Row((key, *(clean(v, 60) for v in values))))
+            rows.append(Row((key, *(clean_name(v, 60) for v in values))))
     if len(rows) > _KEYS:
         more = Row((f"and {len(rows) - _KEYS} more keys", *["…"] * len(missions)))
         rows = [*rows[:_KEYS], more]
@@ -393,7 +393,7 @@ def _figures(result: Result) -> list[dict[str, str]]:
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:
-    svg = plotting.rendered(result, name, ["svg"])["svg"]
+    svg = plotting.render_figure(result, name, ["svg"])["svg"]
     pairs = name == "constraint_error" and not len(result.edges)
     return _picture(name, svg, "Shape error of all pairs." if pairs else _CAPTIONS.get(name, ""))
 

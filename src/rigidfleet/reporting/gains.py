@@ -18,7 +18,7 @@ _SOLVERS = {
 }
 
 
-class Line(NamedTuple):
+class GainLine(NamedTuple):
     """One property of the gains: its name, its value and its meaning."""
 
     what: str
@@ -26,7 +26,7 @@ class Line(NamedTuple):
     meaning: str
 
 
-def explained(mission: Mission) -> list[Line]:
+def explained(mission: Mission) -> list[GainLine]:
     """The gains of a mission, one by one."""
     constraint = _constraint(mission) if len(mission.edges) else []
     return [*constraint, *_tracking(mission), *_regulators(mission)]
@@ -40,28 +40,30 @@ def response(mission: Mission, t: list[float]) -> list[float] | None:
     return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
 
 
-def _constraint(mission: Mission) -> list[Line]:
+def _constraint(mission: Mission) -> list[GainLine]:
     c = mission.constraint
     found = []
     if c.stabilisation == "none":
-        found.append(Line("constraint force", "no feedback", "distance errors remain and grow"))
+        found.append(GainLine("constraint force", "no feedback", "distance errors remain and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
         poles = ", ".join(_pole(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
         found += [
-            Line("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
-            Line("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
+            GainLine("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
+            GainLine("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
         ]  # fmt: skip
         if c.gamma > 0:
             margin = 2 * c.alpha * c.beta**2 / c.gamma
             meaning = f"errors decay until γ reaches {margin:.3g} times its value (2αβ² > γ)"
-            found.append(Line("stability margin", f"{margin:.3g}", meaning))
+            found.append(GainLine("stability margin", f"{margin:.3g}", meaning))
         if (settled := c.settling_time) is not None:
             beyond = 100 * pid.overshoot(c.alpha, c.beta, c.gamma)
             why = "the integral must return to zero" if c.gamma > 0 else "there is no integral term"
             found += [
-                Line("settling", f"{settled:.3g} s", "time until an error stays below 2 %"),
-                Line("overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"),
+                GainLine("settling", f"{settled:.3g} s", "time until an error stays below 2 %"),
+                GainLine(
+                    "overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"
+                ),
             ]
     setting = {
         "iterated": f"μ = {_damping(mission)}, {c.iterations} iterations",
@@ -70,11 +72,11 @@ def _constraint(mission: Mission) -> list[Line]:
         "pinv": f"cut-off at {c.cutoff:g} of the largest w",
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
-    found.append(Line("solver", value, _SOLVERS[c.solver]))
+    found.append(GainLine("solver", value, _SOLVERS[c.solver]))
     if any(phase.control != "tracking" for phase in mission.phases):
         rate = f"{c.deformation_damping:g} /s"
         meaning = "motions that change no distance decay at this rate while no slots are tracked"
-        found.append(Line("deformation damping", rate, meaning))
+        found.append(GainLine("deformation damping", rate, meaning))
     return found
 
 
@@ -85,34 +87,34 @@ def _damping(mission: Mission) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _tracking(mission: Mission) -> list[Line]:
+def _tracking(mission: Mission) -> list[GainLine]:
     if not any(phase.control == "tracking" for phase in mission.phases):
         return []
     t = mission.tracking
     k1, k2 = lqr.double_integrator_gains(t.Q, t.R)
     meaning = f"each vehicle follows its slot: {_second_order(k1, k2)}"
-    return [Line("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
+    return [GainLine("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
 
 
-def _regulators(mission: Mission) -> list[Line]:
+def _regulators(mission: Mission) -> list[GainLine]:
     if not any(phase.steering is not None for phase in mission.phases):
         return []
     pairs = (("centre of mass", mission.lqr), ("attitude", mission.lqr.attitude))
     return [_regulator(name, regulator) for name, regulator in pairs]
 
 
-def _regulator(name: str, regulator: Regulator) -> Line:
+def _regulator(name: str, regulator: Regulator) -> GainLine:
     if regulator.horizon == "infinite":
         k1, k2 = lqr.double_integrator_gains(regulator.Q, regulator.R)
         value = f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s"
-        return Line(f"{name}, infinite horizon", value, _second_order(k1, k2))
+        return GainLine(f"{name}, infinite horizon", value, _second_order(k1, k2))
     q, r, s = (_weights(w) for w in (regulator.Q, (regulator.R,), regulator.S))
     meaning = "gains rise towards arrival, where S weighs errors of position and velocity"
     if not any(regulator.Q):
         meaning = (
             "least acceleration to arrive; S weighs errors of position and velocity at arrival"
         )
-    return Line(f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
+    return GainLine(f"{name}, finite horizon", f"Q = {q}, R = {r}, S = {s}", meaning)
 
 
 def _second_order(k1: float, k2: float) -> str:

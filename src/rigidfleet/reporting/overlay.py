@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, shown
-from rigidfleet.plotting import contents
+from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting import style as st
 from rigidfleet.reporting import gains
 from rigidfleet.result.quantities import samples
@@ -28,11 +28,11 @@ _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible und
 def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Path of the centre of mass from above, and its height over time, as an SVG."""
     with st.settings():
-        fig = st.blank(st.WIDTH, 3.6, "constrained")
+        fig = st.blank_figure(st.WIDTH, 3.6, "constrained")
         above, height = fig.subplots(1, 2)
         for flight, look in zip(flights, _looks(flights), strict=True):
             above.plot(flight.cm[:, 0], flight.cm[:, 1], **look)
-            st.line(height, flight.time, flight.cm[:, 2], **look)
+            st.draw_line(height, flight.time, flight.cm[:, 2], **look)
         above.set(xlabel="x, east [m]", ylabel="y, north [m]", title="centre of mass from above")
         above.set_aspect("equal", adjustable="datalim")
         above.margins(0.05)
@@ -48,7 +48,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         panels.insert(1, "clearance")
     with st.settings():
         rows = (len(panels) + 1) // 2
-        fig = st.blank(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
+        fig = st.blank_figure(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for ax, name in zip(axes, panels, strict=False):
             known = [
@@ -58,7 +58,7 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
             ax.set_title(f"{'least' if q.at_least else 'greatest'} {q.called} [{shown(q.unit)}]")
             if not any(known):
-                st.note(ax, "nothing to show")
+                st.write_note(ax, "nothing to show")
             elif logarithmic:
                 ax.set_yscale("log", nonpositive="clip")
                 ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-12))
@@ -80,7 +80,7 @@ def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None
         return None
     t = np.linspace(0.0, 1.6 * max(times), 400)
     with st.settings():
-        fig = st.blank(st.WIDTH, 2.2, "constrained")
+        fig = st.blank_figure(st.WIDTH, 2.2, "constrained")
         ax = fig.subplots()
         ax.axhspan(-0.02, 0.02, color=st.BAND, linewidth=0)
         for mission, look in zip(missions, _looks(missions), strict=True):
@@ -96,7 +96,7 @@ def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None
 
 def _panel(ax: Axes, flight: Result, values: Floats, look: dict[str, Any]) -> bool:
     """Draw one flight's line; return whether there was anything to draw."""
-    st.line(ax, flight.time, values, **look)
+    st.draw_line(ax, flight.time, values, **look)
     return bool(np.isfinite(values).any())
 
 
@@ -111,11 +111,11 @@ def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], label=st.clean(label), **look)
+        Line2D([], [], label=st.clean_name(label), **look)
         for label, look in zip(labels, _looks(flights), strict=True)
     ]
     fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
 
 
 def _svg(fig: Figure) -> bytes:
-    return contents(fig, ["svg"])["svg"]
+    return encode_figure(fig, ["svg"])["svg"]

@@ -15,7 +15,7 @@ from rigidfleet.result.result import (
     VARIABLES,
     Result,
     as_result,
-    there,
+    presence,
 )
 
 __all__ = [
@@ -31,5 +31,5 @@ __all__ = [
     "Result",
     "Variable",
     "as_result",
-    "there",
+    "presence",
 ]

@@ -113,7 +113,9 @@ def file_content(
         for name, kind in ATTRIBUTES.items():
             # Attributes can be text or numbers, but not dict, bool or None: those are stored as JSON.
             value = attributes[name]
-            file.attrs[_stored(name)] = kind(value) if kind in (int, str) else plain_text(value)
+            file.attrs[_attribute_name(name)] = (
+                kind(value) if kind in (int, str) else plain_text(value)
+            )
         for name, names in labels.items():
             names_along = file.create_variable(name, (name,), text)
             if names:
@@ -168,14 +170,15 @@ def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
                 f"format {SCHEMA_VERSION}. Fly the mission again."
             )
         attributes = {
-            name: reader.attribute(file, _stored(name), kind) for name, kind in ATTRIBUTES.items()
+            name: reader.attribute(file, _attribute_name(name), kind)
+            for name, kind in ATTRIBUTES.items()
         }
         sizes = {dim: len(names) for dim, names in LABELS.items()}
         arrays = reader.arrays(file, due, sizes, len(data))
     return arrays | attributes | {"complete": bool(attributes["complete"])}
 
 
-def _stored(name: str) -> str:
+def _attribute_name(name: str) -> str:
     """Name of an attribute in the file."""
     return "mission" if name == "mission_text" else name
 

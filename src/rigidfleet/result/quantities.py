@@ -58,7 +58,7 @@ def owner_name(result: Result, q: Quantity, who: int, other: int = -1) -> str:
     return f"agent {who + 1}" if q.who == "agent" else ""
 
 
-def of_left(result: Result, values: Floats) -> Floats:
+def without_lost(result: Result, values: Floats) -> Floats:
     """Values (K, N), NaN for lost agents."""
     return values if result.left.all() else np.where(result.left, values, np.nan)
 
@@ -75,8 +75,8 @@ def samples(result: Result, name: str, close: proximity.Closeness | None = None)
     """Values of a quantity at samples, from positions and forces; ``close`` is `closeness`, if it is known."""
     if name in ("separation", "clearance"):
         close = closeness(result) if close is None else close
-        given = (close.separation, close.pair), (close.clearance, close.agent, close.obstacle)
-        values, *owners = given[name == "clearance"]
+        both = (close.separation, close.pair), (close.clearance, close.agent, close.obstacle)
+        values, *owners = both[name == "clearance"]
         columns = np.column_stack(owners)
         return Samples(QUANTITIES[name], values, lambda k: columns[k].tolist())
     return Samples(QUANTITIES[name], *SAMPLED[name](result))
@@ -87,16 +87,16 @@ def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
     x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
         return (np.full(result.left.shape, np.nan),)
-    return (of_left(result, SIZES[q.way](x) if q.way else length(x)),)
+    return (without_lost(result, SIZES[q.way](x) if q.way else length(x)),)
 
 
-def _below(result: Result) -> tuple[Floats, Owner]:
+def _headroom(result: Result) -> tuple[Floats, Owner]:
     """Least height (K,) [m] between two agents, one below the other."""
     least, pair = proximity.headroom(result.position, result.mission.agents.radius, result.left)
     return least, lambda k: pair[k]
 
 
-def _fallen(result: Result) -> tuple[Floats, Owner]:
+def _distance_to_lost(result: Result) -> tuple[Floats, Owner]:
     """Least distance (K,) [m] between a lost agent and one still flying; NaN if no agent is lost."""
     r, radius = result.position, result.mission.fleet.radius
     least, who = np.full(len(r), np.nan), np.zeros((len(r), 2), dtype=np.int64)
@@ -112,16 +112,16 @@ def _fallen(result: Result) -> tuple[Floats, Owner]:
     return least, lambda k: who[k]
 
 
-def _outside(result: Result) -> tuple[Floats, ...]:
+def _beyond_fence(result: Result) -> tuple[Floats, ...]:
     """Greatest distance (K, N) [m] of an agent's centre outside the geofence; negative inside."""
     r, fence = result.position, result.mission.limits.geofence
     if fence is None:
         return (np.full(result.left.shape, np.nan),)
-    return (of_left(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
+    return (without_lost(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
 
 
 def _altitude(result: Result) -> tuple[Floats, ...]:
-    return (of_left(result, result.position[..., 2]),)
+    return (without_lost(result, result.position[..., 2]),)
 
 
 def _tilt(result: Result) -> tuple[Floats, ...]:
@@ -134,7 +134,7 @@ def _tilt(result: Result) -> tuple[Floats, ...]:
         up = force[..., 2] / np.maximum(length(force), 1e-300)
     else:
         up = np.full(result.left.shape, np.nan)
-    return (of_left(result, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
+    return (without_lost(result, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
 
 
 def _thrust(result: Result) -> tuple[Floats, ...]:
@@ -144,10 +144,10 @@ def _thrust(result: Result) -> tuple[Floats, ...]:
         thrust = np.minimum(thrust, agents.thrust_limit)
     if result.rotor_force is not None:  # what was given, not what was asked
         thrust = result.rotor_force.sum(axis=2)
-    return (of_left(result, np.maximum(thrust, result.thrust)),)
+    return (without_lost(result, np.maximum(thrust, result.thrust)),)
 
 
-def _edges(result: Result, values: Floats) -> tuple[Floats, Owner]:
+def _of_edges(result: Result, values: Floats) -> tuple[Floats, Owner]:
     edges = result.edges
     return values, lambda _k, e: edges[e].tolist()
 
@@ -155,16 +155,16 @@ def _edges(result: Result, values: Floats) -> tuple[Floats, Owner]:
 #: Values of quantities at samples, with their owners where these are no single agents.
 SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     **{q.name: partial(_motion, q=q) for q in MOTIONS},
-    "separation_below": _below,
-    "lost": _fallen,
-    "geofence": _outside,
+    "separation_below": _headroom,
+    "lost": _distance_to_lost,
+    "geofence": _beyond_fence,
     "lowest": _altitude,
     "highest": _altitude,
     "thrust": _thrust,
     "tilt": _tilt,
-    "tracking_error": lambda r: (of_left(r, length(r.position - r.slot_position)),),
-    "constraint": lambda r: _edges(r, np.abs(r.constraint)),
-    "tension": lambda r: _edges(r, -r.multiplier),
-    "constraint_force": lambda r: (of_left(r, length(r.constraint_force)),),
+    "tracking_error": lambda r: (without_lost(r, length(r.position - r.slot_position)),),
+    "constraint": lambda r: _of_edges(r, np.abs(r.constraint)),
+    "tension": lambda r: _of_edges(r, -r.multiplier),
+    "constraint_force": lambda r: (without_lost(r, length(r.constraint_force)),),
     "singular_value": lambda r: (r.singular_value, lambda _k: (0,)),
 }

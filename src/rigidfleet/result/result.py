@@ -23,7 +23,7 @@ from rigidfleet._common.quantities import quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
-from rigidfleet.setpoints import Setpoints, at_rate, csv, of_motion
+from rigidfleet.setpoints import Setpoints, at_rate, csv_text, states_of_motion
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -46,21 +46,21 @@ Later = Sequence[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]]
 
 
 @cache
-def _versions_found() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+def _installed_versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
     for package in ("rigidfleet", "numpy", "scipy", "numba", "h5netcdf"):
         try:
-            found[package] = version(package)
+            versions[package] = version(package)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def _versions() -> dict[str, str]:
-    return dict(_versions_found())
+    return dict(_installed_versions())
 
 
-def _now() -> str:
+def _timestamp() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
@@ -266,23 +266,23 @@ class Result(Shown):
     statistics: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=_versions)
     platform: str = field(default_factory=platform.platform)
-    created: str = field(default_factory=_now)
+    created: str = field(default_factory=_timestamp)
 
     def __post_init__(self, later: Later) -> None:
-        given = self.__dict__
+        values = self.__dict__
         self._later = {name: make for names, make in later for name in names}
         for name in self._later:
-            del given[name]
+            del values[name]
         sizes: dict[str, int] = dict(_LABELLED)
         for key, dims in (
             ("time", ("time",)),
             ("position", ("time", "agent")),
             ("edges", ("edge",)),
         ):
-            if isinstance(given[key], np.ndarray):
-                sizes.update(zip(dims, given[key].shape, strict=False))
-        for name in [name for name in given if name in _CHECKED]:
-            value = given[name]
+            if isinstance(values[key], np.ndarray):
+                sizes.update(zip(dims, values[key].shape, strict=False))
+        for name in [name for name in values if name in _CHECKED]:
+            value = values[name]
             if value is not None or not VARIABLES[name].optional:
                 self._set(name, value, sizes)
         if not later:  # what a flight of this process has made is right
@@ -290,7 +290,7 @@ class Result(Shown):
 
     def _check(self, sizes: dict[str, int]) -> None:
         """Check values: they come from somewhere else."""
-        given = self.__dict__
+        values = self.__dict__
         if sizes["time"] == 0 or sizes["agent"] == 0:
             raise ValueError("a result needs at least one sample and one agent")
         time, phase = self.time, self.phase
@@ -305,7 +305,7 @@ class Result(Shown):
             raise ValueError("phase must not decrease")
         n = sizes["agent"]
         for name, least in (("edges", 0), ("separation_pair", -1), ("clearance_agent", -1)):
-            who = given.get(name)  # None if it is made later
+            who = values.get(name)  # None if it is made later
             if who is not None and who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         agents, rotors = range(n), range(4)
@@ -320,30 +320,30 @@ class Result(Shown):
                 if alone or x.who not in agents:
                     raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
-            q = given.get(name)  # most have a scalar part, which is found in a fifth of the time
+            q = values.get(name)  # most have a scalar part, which is found in a fifth of the time
             if q is not None and not q[..., 0].all() and not q.any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
         if (self.edges[:, 0] == self.edges[:, 1]).any():
             raise ValueError("an edge joins an agent to itself")
 
-    def _set(self, name: str, given: Any, sizes: dict[str, int]) -> None:
+    def _set(self, name: str, array: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims, dtype = _CHECKED[name]
         if (
-            type(given) is np.ndarray
-            and given.dtype is dtype
-            and given.shape == tuple([sizes.get(dim) for dim in dims])
-            and given.flags.c_contiguous
+            type(array) is np.ndarray
+            and array.dtype is dtype
+            and array.shape == tuple([sizes.get(dim) for dim in dims])
+            and array.flags.c_contiguous
         ):
-            self.__dict__[name] = given
+            self.__dict__[name] = array
             return
-        value = np.ascontiguousarray(given, dtype=dtype)
-        asked = tuple(sizes.get(dim, "any") for dim in dims)
-        if value.ndim != len(asked) or any(
+        value = np.ascontiguousarray(array, dtype=dtype)
+        expected = tuple(sizes.get(dim, "any") for dim in dims)
+        if value.ndim != len(expected) or any(
             sizes.setdefault(dim, n) != n for dim, n in zip(dims, value.shape, strict=True)
         ):
             raise ValueError(
-                f"{name} ({', '.join(dims)}) has shape {value.shape}, expected {asked}"
+                f"{name} ({', '.join(dims)}) has shape {value.shape}, expected {expected}"
             )
         setattr(self, name, value)
 
@@ -439,13 +439,13 @@ class Result(Shown):
                 f"the mission in the result cannot be read (written by rigidfleet {made}):\n{error}"
             )
             raise ResultError(message) from error
-        if wrong := self._foreign(mission):
+        if wrong := self._contradiction(mission):
             raise ResultError(
                 f"the mission in the result belongs to another flight: {wrong}. Fly it again or use another copy."
             )
         return mission
 
-    def _foreign(self, mission: Mission) -> str:
+    def _contradiction(self, mission: Mission) -> str:
         """Describe how the arrays contradict a mission; "" if they agree."""
         from rigidfleet.mission import KINDS
 
@@ -474,7 +474,7 @@ class Result(Shown):
     def left(self) -> Bools:
         """Mask (K, N) of the agents that are not lost at the time of each sample, or that a file has then."""
         if spans := self.statistics.get("spans"):
-            return there(self.time, spans, self.n_agents)
+            return presence(self.time, spans, self.n_agents)
         lost_at = self.mission.lost_at
         if self.time[-1] <= lost_at.min():
             return np.ones((len(self.time), len(lost_at)), dtype=np.bool_)
@@ -596,7 +596,7 @@ class Result(Shown):
             ends = [0, *jumps.tolist(), len(self.time)]
             parts = [slice(*pair) for pair in pairwise(ends)]
             state = np.concatenate(
-                [of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
+                [states_of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
             )
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
         return Setpoints(self.time, state, *yaw)
@@ -615,7 +615,7 @@ class Result(Shown):
         ValueError
             The rate is not positive, or gives too many setpoints.
         """
-        write_file(as_path(path), csv(self.setpoints(rate, flown=flown)).encode())
+        write_file(as_path(path), csv_text(self.setpoints(rate, flown=flown)).encode())
 
 
 #: Signature that `help` shows first. The forty arrays are left out: their units stand at their declarations.
@@ -665,7 +665,7 @@ _CHECKED = {
 _QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
 
 
-def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
+def presence(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
     """Mask (K, N) of n agents that are there at times (K,) [s], each after the begin of its span and up to its end [s].
 
     An agent that is there at the first time counts then, too; without spans, all agents always do.
@@ -674,7 +674,7 @@ def there(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
     return ((time[:, None] > begin) | (begin <= time[0])) & (time[:, None] <= end)
 
 
-def as_result(given: Result | str | Path) -> Result:
+def as_result(value: Result | str | Path) -> Result:
     """Return the `Result` that was given, or read it from its file.
 
     Raises
@@ -684,11 +684,11 @@ def as_result(given: Result | str | Path) -> Result:
     ResultError
         As `Result.load` does.
     """
-    if isinstance(given, Result):
-        return given
-    if isinstance(given, str | Path):
-        return Result.load(given)
-    raise wrong_type("a flight (a Result or the path of one that was saved)", given)
+    if isinstance(value, Result):
+        return value
+    if isinstance(value, str | Path):
+        return Result.load(value)
+    raise wrong_type("a flight (a Result or the path of one that was saved)", value)
 
 
 def _one_line(error: BaseException) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
@@ -102,24 +102,18 @@ class Rigidity:
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and edges counted from 1."""
-        return {
-            "agents": self.agents,
+        flexes = [
+            {"agents": [i + 1 for i in flex.agents], "motion": flex.motion.tolist()}
+            for flex in self.flexes
+        ]
+        return {field.name: getattr(self, field.name) for field in fields(self)} | {
             "edges": len(self.edges),
-            "dimension": self.dimension,
-            "space": self.space,
-            "rank": self.rank,
-            "reachable": self.reachable,
-            "needed": self.needed,
             "redundant": (self.edges[self.redundant] + 1).tolist(),
             "spare": (self.edges[self.spare] + 1).tolist(),
-            "flexes": [
-                {"agents": [i + 1 for i in flex.agents], "motion": flex.motion.tolist()}
-                for flex in self.flexes
-            ],
+            "flexes": flexes,
             "index": None if np.isnan(self.index) else self.index,
             "w": None if np.isnan(self.index) else self.w,
             "rigidity_class": str(self.rigidity_class),
-            "reason": self.reason,
             "stress": None if self.stress is None else self.stress.tolist(),
             "deformed": None if self.deformed is None else self.deformed.tolist(),
             "within": None if self.within is None else self.within.data(),
@@ -265,44 +259,32 @@ def classify(
             reason += f", but one motion hardly does (index {frame.s[-1]:.1e}): expect large forces"
         return RigidityClass.INFINITESIMALLY_RIGID, reason, None, None
     if within is not None and within.rigidity_class is RigidityClass.FLEXIBLE:
-        where = WHERE[within.dimension]
-        return (
-            RigidityClass.FLEXIBLE,
-            f"flexible already within its own {where}: {within.reason}",
-            None,
-            None,
-        )
+        reason = f"flexible already within its own {WHERE[within.dimension]}: {within.reason}"
+        return RigidityClass.FLEXIBLE, reason, None, None
+    free = f"{k} motion{'s' * (k != 1)} free"
     if frame.rank == _generic_rank(frame):
         reason = (
-            f"{_count_in_words(k, 'motion')} free, and {frame.rank} is the greatest rank that these edges have at any "
+            f"{free}, and {frame.rank} is the greatest rank that these edges have at any "
             "positions, so the motion is finite (Asimow and Roth)"
         )
         return RigidityClass.FLEXIBLE, reason, None, None
     energy = StressEnergy(frame)
     stress, open_flexes, none_exists = blocking_stress(energy)
     if stress is not None:
-        reason = (
-            f"{_count_in_words(k, 'motion')} free to first order; a self-stress blocks all of them"
-        )
+        reason = f"{free} to first order; a self-stress blocks all of them"
         return RigidityClass.PRESTRESS_STABLE, reason, stress, None
     bent, goes_on = finite_flex(StressEnergy(frame, frame.flexes @ open_flexes))
     if bent is not None:
         reason = "a finite motion that keeps all distances was found and followed"
         return RigidityClass.FLEXIBLE, reason, None, bent
-    reason = (
-        f"{_count_in_words(k, 'motion')} free to first order; "
-        + ("no self-stress blocks all of them" if none_exists else "no blocking stress was found")
-        + (
-            "; one extends to second order, but could not be followed further"
-            if goes_on
-            else "; none was found that extends to second order, so the shape is probably rigid, but soft"
+    blocked = "no self-stress blocks all of them" if none_exists else "no blocking stress was found"
+    extends = "one extends to second order, but could not be followed further"
+    if not goes_on:
+        extends = (
+            "none was found that extends to second order, so the shape is probably rigid, but soft"
         )
-    )
+    reason = f"{free} to first order; {blocked}; {extends}"
     return RigidityClass.UNDECIDED, reason, None, None
-
-
-def _count_in_words(k: int, what: str) -> str:
-    return f"{k} {what}{'s' * (k != 1)}"
 
 
 def _generic_rank(frame: Framework) -> int:

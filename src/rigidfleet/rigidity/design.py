@@ -8,6 +8,7 @@ drops the least useful of all candidates, and then exchanges edges as long as th
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from itertools import combinations
 from typing import Literal
@@ -20,6 +21,7 @@ from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_multilevel, neighbours
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
+from rigidfleet.rigidity.analysis import as_framework, flatten
 from rigidfleet.typing import Floats, Ints
 
 #: Positions of the exchange's barrier, as shares of the smallest eigenvalue, step by step.
@@ -67,8 +69,8 @@ def design(
     ValueError
         Two slots coincide; or no edges within range hold the shape (the message gives a sufficient range).
     """
-    p = numbers("slots [m]", slots)
-    flat = _in_own_axes(p)
+    p, _ = as_framework(numbers("slots [m]", slots), [])
+    flat, _ = flatten(p, max(1, dimension(p)))
     n, d = flat.shape
     edges = complete_graph(n)
     length = distances(p, edges)
@@ -86,8 +88,8 @@ def design(
         return near if extra == "complete" else near[:0]
     rows = _rows_of_jacobian(flat, edges)
     _assert_holds(rows, length, reach, rank)
-    wanted = len(near) if extra == "complete" else min(rank + extra, len(near))
-    if wanted == len(near):
+    wanted = len(near) if extra == "complete" else rank + extra
+    if wanted >= len(near):
         return near
     rows = rows[length <= reach]
     meshes = [np.arange(len(near)), *_edges_of_meshes(flat, near)]
@@ -156,15 +158,6 @@ def mission_fragment(
     return "\n".join([*lines, "]", ""])
 
 
-def _in_own_axes(p: Floats) -> Floats:
-    """Points (N, d) in axes of the shape's own dimension d."""
-    if p.ndim != 2 or p.shape[1] != 3 or not len(p) or not np.isfinite(p).all():
-        raise ValueError(f"slots must be (N, 3) finite numbers [m] with N >= 1, not {p.shape}")
-    x = p - p.mean(axis=0)
-    d = dimension(p)
-    return x if d == 3 else x @ np.linalg.svd(x)[2][:d].T
-
-
 def _rows_of_jacobian(flat: Floats, edges: Ints) -> Floats:
     """Rows of J (m, r) in coordinates of the non-rigid motions."""
     n, d = flat.shape
@@ -192,15 +185,10 @@ def _assert_holds(rows: Floats, length: Floats, reach: float, rank: int) -> None
     if got == rank:
         return
     steps = np.unique(np.round(length, 9))
-    low, high = -1, len(steps) - 1
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (
-            (low, middle) if rank_within(steps[middle] * (1 + 1e-8)) == rank else (middle, high)
-        )
+    enough = bisect_left(steps[:-1].tolist(), rank, key=lambda r: rank_within(r * (1 + 1e-8)))
     raise ValueError(
         f"a sensing range of {reach:.6g} m gives only {got} of the {rank} independent edges that "
-        f"hold this shape; {steps[high]:.6g} m is enough"
+        f"hold this shape; {steps[enough]:.6g} m is enough"
     )
 
 

@@ -6,7 +6,7 @@ k = (i, j) at i and -u at j, as in the constraint force (theory, section 1); J v
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cached_property
 from typing import NamedTuple
 
@@ -37,9 +37,8 @@ class Flex(NamedTuple):
     """Velocities (N, 3), the fastest of 1 m/s."""
 
 
-@dataclass(frozen=True)
 class Framework:
-    """Points (N, d) joined by edges (m, 2), with the singular value decomposition of J.
+    """Points p (N, d) joined by edges (m, 2), with the singular value decomposition of J.
 
     Attributes
     ----------
@@ -48,34 +47,14 @@ class Framework:
     null : (N d, .) orthonormal basis of all motions that change no distance, including rigid ones
     """
 
-    p: Floats
-    edges: Ints
-
-    @cached_property
-    def _decomposed(self) -> tuple[Floats, Floats, Floats]:
-        J = jacobian(self.p, self.edges)
-        m, size = J.shape
-        if m == 0:
-            return np.zeros((0, 0)), np.zeros(0), np.eye(size)
-        u, s, vt = np.linalg.svd(np.linalg.qr(J, mode="r") if m > size else J)
-        rank = int(np.count_nonzero(s > ZERO * s[0]))
-        U = u[:, :rank] if m <= size else (J @ vt[:rank].T) / s[:rank]
-        return U, s[:rank], vt[rank:].T
-
-    @property
-    def span(self) -> Floats:
-        """Range of J (m, rank)."""
-        return self._decomposed[0]
-
-    @property
-    def s(self) -> Floats:
-        """Non-zero singular values of J."""
-        return self._decomposed[1]
-
-    @property
-    def null(self) -> Floats:
-        """Null space of J (N d, N d - rank)."""
-        return self._decomposed[2]
+    def __init__(self, p: Floats, edges: Ints) -> None:
+        self.p, self.edges = p, edges
+        J = jacobian(p, edges)
+        tall = len(edges) > p.size
+        u, s, vt = np.linalg.svd(np.linalg.qr(J, mode="r") if tall else J)
+        rank = int(np.count_nonzero(s > ZERO * s.max(initial=0.0)))
+        self.s, self.null = s[:rank], vt[rank:].T
+        self.span = (J @ vt[:rank].T) / self.s if tall else u[:, :rank]
 
     @property
     def rank(self) -> int:
@@ -153,27 +132,37 @@ def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
     it moves (by iteratively reweighted least squares; this sum favours motions of few agents). The greedy choice among
     all candidates, fewest agents first, is the basis with the least total number of moving agents.
     """
-    n, d = frame.p.shape
     F = frame.flexes
-    k = F.shape[1]
-    if k == 0:
-        return []
-    basis = _Basis(F)
-    for motion in _motions_of_single_agents(frame):
-        basis.add(motion)
-    if basis.rank < k:
-        motions = sparse_flexes(F, frame.rigid, n)
-        for motion in sorted(motions, key=lambda f: int(np.count_nonzero(f.any(axis=1)))):
-            basis.add(motion)
-    for motion in F.T:
-        basis.add(motion.reshape(n, d))
-    return _without_common_parts(basis.chosen)
+    chosen: list[Floats] = []
+    parts = np.zeros((F.shape[1], 0))  # of the chosen motions in the flexes, orthonormal
+    for motion in _candidates(frame) if F.size else ():
+        part = F.T @ motion.ravel()
+        rest = part - parts @ (parts.T @ part)
+        rest -= parts @ (parts.T @ rest)
+        if np.linalg.norm(rest) > 1e-4 * np.linalg.norm(motion):
+            parts = np.column_stack([parts, rest / np.linalg.norm(rest)])
+            chosen.append(motion / np.linalg.norm(motion, axis=1).max())
+        if len(chosen) == F.shape[1]:
+            break
+    return _without_common_parts(chosen)
+
+
+def _candidates(frame: Framework) -> Iterator[Floats]:
+    """Flexes (N, d) among which there is a basis, those that move few agents first."""
+    yield from _motions_of_single_agents(frame)
+    few = sparse_flexes(frame.flexes, frame.rigid, len(frame.p))
+    yield from sorted(few, key=_number_of_movers)
+    yield from frame.flexes.T.reshape(-1, *frame.p.shape)
+
+
+def _number_of_movers(motion: Floats) -> int:
+    return int(np.count_nonzero(motion.any(axis=1)))
 
 
 def _without_common_parts(motions: list[Floats]) -> list[tuple[tuple[int, ...], Floats]]:
     """Motions (N, d) with their moving agents, fewest first, without parts that fewer agents already have."""
     out: list[tuple[tuple[int, ...], Floats]] = []
-    for motion in sorted(motions, key=lambda f: int(np.count_nonzero(np.any(f, axis=1)))):
+    for motion in sorted(motions, key=_number_of_movers):
         f, moves = motion.copy(), set(np.flatnonzero(np.any(motion, axis=1)).tolist())
         for who, g in out:
             if moves.issuperset(who):
@@ -183,43 +172,17 @@ def _without_common_parts(motions: list[Floats]) -> list[tuple[tuple[int, ...], 
     return sorted(out, key=lambda flex: (len(flex[0]), flex[0]))
 
 
-class _Basis:
-    """Motions that are independent of each other and of the rigid motions."""
-
-    def __init__(self, F: Floats) -> None:
-        self._F = F
-        self._q = np.zeros((F.shape[1], 0))
-        self.chosen: list[Floats] = []
-
-    @property
-    def rank(self) -> int:
-        return len(self.chosen)
-
-    def add(self, motion: Floats) -> None:
-        """Keep a motion if it is new."""
-        if self.rank == self._F.shape[1]:
-            return
-        part = self._F.T @ motion.ravel()
-        rest = part - self._q @ (self._q.T @ part)
-        rest -= self._q @ (self._q.T @ rest)
-        if np.linalg.norm(rest) > 1e-4 * np.linalg.norm(motion):
-            self._q = np.column_stack([self._q, rest / np.linalg.norm(rest)])
-            self.chosen.append(motion / np.linalg.norm(motion, axis=1).max())
-
-
-def _motions_of_single_agents(frame: Framework) -> list[Floats]:
+def _motions_of_single_agents(frame: Framework) -> Iterator[Floats]:
     """Motions of one agent that all its edges leave free; agents with few edges come first."""
     n, d = frame.p.shape
     J = jacobian(frame.p, frame.edges).reshape(-1, n, d)
     degree = np.bincount(frame.edges.ravel(), minlength=n)
-    motions = []
     for i in np.argsort(degree, kind="stable"):
         _, s, vt = np.linalg.svd(J[(frame.edges == i).any(axis=1), i], full_matrices=True)
         for direction in vt[np.count_nonzero(s > ZERO) :]:
             motion = np.zeros((n, d))
             motion[i] = direction
-            motions.append(motion)
-    return motions
+            yield motion
 
 
 def sparse_flexes(flexes: Floats, rigid: Floats, n: int, most: int = 1 << 30) -> list[Floats]:

@@ -28,6 +28,9 @@ _EQUAL = 1e-12
 #: A framework rigid at order n would be off by about the n-th power of it, which is far more than _EQUAL.
 _FINITE, _FAR = 0.01, 0.1
 
+#: Number of flexes that move few agents, and of random ones, near which finite ones are sought.
+_STARTS = 8
+
 #: Stride of a walk from one shape to another, as a share of the size for each agent, and the greatest number of them:
 #: few to the nearest shape of a family, and then enough to go round a closed curve.
 _STRIDE, STRIDES = 0.1, (20, 300)
@@ -140,7 +143,7 @@ def _search_blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats
     return None, vector[:, value > 1e-3], proven
 
 
-def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[Floats | None, bool]:
+def finite_flex(energy: StressEnergy) -> tuple[Floats | None, bool]:
     """The framework (N, d) deformed by a finite motion that keeps all lengths; None if none is found.
 
     Flexes that extend to second order are searched near those that move few agents and near random ones. Each is
@@ -150,9 +153,9 @@ def finite_flex(energy: StressEnergy, starts: int = 8, seed: int = 0) -> tuple[F
     frame = energy.frame
     if energy.k == 0:
         return None, False  # a stress nearly blocks every flex
-    few = sparse_flexes(energy.flexes, frame.rigid, energy.n, starts)
+    few = sparse_flexes(energy.flexes, frame.rigid, energy.n, _STARTS)
     candidates = [energy.flexes.T @ motion.ravel() for motion in few]
-    candidates += list(np.random.default_rng(seed).normal(size=(starts, energy.k)))
+    candidates += list(np.random.default_rng(0).normal(size=(_STARTS, energy.k)))
     goes_on = False
     for q in candidates:
         flex = _extend_to_second_order(energy, q)

@@ -165,20 +165,19 @@ def realisations(
             groups.add(end, 1)
     end = None
     if start is not None:
-        begin = align(_as_positions(start, n), drawn) @ axes[:dimension].T
-        end = positions_led_to(begin, e, length, _REACHED * size)
+        at = np.asarray(start, dtype=np.float64)
+        if at.shape != (n, 3) or not np.isfinite(at).all():
+            raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
+        begin = align(at, drawn) @ axes[:dimension].T
+        end = lead_lengths(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
     first = groups.families(e)
-    counts = np.bincount(first, [seen for _, seen in groups.shapes]).astype(int).tolist()
-    shapes = {k: _realisation(groups.shapes[k][0], p, e, counts[k], size, axes) for k in set(first)}
+    counts = np.bincount(first, groups.counts).astype(int).tolist()
+    shapes = {k: _realisation(groups.shapes[k], p, e, counts[k], size, axes) for k in set(first)}
     rank = {Kind.SAME: 0, Kind.MIRRORED: 1}
     order = sorted(shapes, key=lambda k: (rank.get(shapes[k].kind, 2), -shapes[k].starts, k))
-    return Realisations(
-        tuple(shapes[k] for k in order),
-        starts,
-        converged,
-        None if last is None else order.index(first[last]),
-    )
+    leads_to = None if last is None else order.index(first[last])
+    return Realisations(tuple(shapes[k] for k in order), starts, converged, leads_to)
 
 
 class _Groups:
@@ -187,23 +186,25 @@ class _Groups:
     def __init__(self, intended: Floats, tol: float) -> None:
         self._intended, self._tol = intended, tol
         self._pairs: list[Floats] = []
-        self.shapes: list[tuple[Floats, int]] = []
+        self.shapes: list[Floats] = []
+        self.counts: list[int] = []
 
     def add(self, p: Floats, count: int) -> int:
         """Count a shape; return its number."""
         pairs = _distances_of_pairs(p)
         alike = [np.abs(known - pairs).max() <= self._tol for known in self._pairs]
-        for k, (q, seen) in enumerate(self.shapes):
+        for k, q in enumerate(self.shapes):
             if alike[k] and (not alike[0] or self._fits(p, q)):
-                self.shapes[k] = (q, seen + count)
+                self.counts[k] += count
                 return k
         self._pairs.append(pairs)
-        self.shapes.append((align(p, self._intended), count))
+        self.shapes.append(align(p, self._intended))
+        self.counts.append(count)
         return len(self.shapes) - 1
 
     def families(self, e: Ints) -> list[int]:
         """Of each shape, the first one into which it bends while the edges (m, 2) keep their lengths; or itself."""
-        frames = [Framework(q, e) for q, _ in self.shapes]
+        frames = [Framework(q, e) for q in self.shapes]
         bend = [k for k, frame in enumerate(frames) if frame.flexes.size]
         first = list(range(len(frames)))
         for strides in STRIDES:
@@ -243,14 +244,7 @@ def _distances_of_pairs(p: Floats) -> Floats:
     return np.linalg.norm(p[i] - p[j], axis=1)
 
 
-def _as_positions(start: ArrayLike, n: int) -> Floats:
-    at = np.asarray(start, dtype=np.float64)
-    if at.shape != (n, 3) or not np.isfinite(at).all():
-        raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
-    return at
-
-
-def positions_led_to(
+def lead_lengths(
     start: Floats, e: Ints, length: Floats, tol: float, slots: Floats | None = None
 ) -> Floats | None:
     """Positions (N, d) to which lengths (m,) lead that go from those at the start to the desired ones in small steps.

@@ -356,7 +356,7 @@ class Extremes(CurveWatch):
         self._taking: Future[None] | None = None
         self._touching: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
-        self.avoidance: avoidance.Avoidance | None = None  # that of the phase under way
+        self.avoidance: avoidance.AvoidanceArrays | None = None  # that of the phase under way
         self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
 
     def among(self, obstacles: Sequence[Obstacle]) -> None:
@@ -513,7 +513,7 @@ class Extremes(CurveWatch):
         if error.max() > 0.0:
             rows["tracking_error"] = error, state.worst_time[:, fleet.ERROR]
         share = np.where(lost, 0.0, state.saturations / max(ticks, 1))
-        rows["saturation"] = share, np.full(self.n, state.clock[0])
+        rows["saturation"] = share, np.full(self.n, state.clock[fleet.TIME])
         for name, (values, times) in rows.items():
             i = int(values.argmax())
             self.of_vehicles[name] = Extremum(float(values[i]), float(times[i]), i, -1)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.avoidance import KNOWN, Avoidance, needed_rate
+from rigidfleet.kernel.avoidance import KNOWN, AvoidanceArrays, needed_rate
 from rigidfleet.kernel.problem import SHAPE, SQUARED, Motion, Problem
 from rigidfleet.math import lqr, series
 from rigidfleet.mission import Mission
@@ -115,7 +115,7 @@ class Leader:
         sample = round(end / step) * step
         return float(sample if abs(sample - end) < 1e-9 * max(1.0, end) else end)
 
-    def lead(self, t: float, end: float, a: Avoidance) -> Problem | None:
+    def lead(self, t: float, end: float, a: AvoidanceArrays) -> Problem | None:
         """Decide at t [s] until ``end`` [s]; returns the problem to fly, or None if it is the one flown already."""
         h = end - t
         acts = self._acts(t + h)
@@ -171,7 +171,7 @@ class Leader:
         reference = self.problem.reference
         return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
 
-    def _choose(self, t: float, a: Avoidance) -> tuple[float, float]:
+    def _choose(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
         """The rate to aim at, and the bandwidth of the clock.
 
         The greatest one at which the slots keep away from all that moves, as far as it is known, over the horizon; if
@@ -206,7 +206,7 @@ class Leader:
         bandwidth = _SLOWING * float(a.b.min()) / (STEEPEST * fastest)
         return _RATES[best], min(bandwidth, _FOLLOWED / max(float(a.lag.max()), 1e-9))
 
-    def _room(self, r: Floats, ahead: Floats, a: Avoidance, seen: Ints) -> float:
+    def _room(self, r: Floats, ahead: Floats, a: AvoidanceArrays, seen: Ints) -> float:
         """Least distance [m] of places r (K, N, 3) at times ahead (K,) [s] from what moves, beyond what is kept."""
         least = np.inf
         for o in seen:
@@ -299,7 +299,7 @@ class Leader:
 
     # -- the body -----------------------------------------------------------------------------------------
 
-    def _steer(self, t: float, a: Avoidance) -> Floats:
+    def _steer(self, t: float, a: AvoidanceArrays) -> Floats:
         """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
         accelerations, self.calm = self.deviation.decay(), True
         sight = a.sight
@@ -378,7 +378,14 @@ class Leader:
         return r, v, a, turned[0]
 
     def _cones(
-        self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
+        self,
+        o: int,
+        r: Floats,
+        v: Floats,
+        rise: Floats,
+        arms: Floats,
+        limit: float,
+        a: AvoidanceArrays,
     ) -> tuple[Floats, Floats, Ints]:
         """Rows (R, 7) of slots against obstacle o, which moves, what they need (R,), and the vehicles (R,).
 
@@ -403,7 +410,14 @@ class Leader:
         return rows, needed[some], some
 
     def _barriers(
-        self, o: int, r: Floats, v: Floats, rise: Floats, arms: Floats, limit: float, a: Avoidance
+        self,
+        o: int,
+        r: Floats,
+        v: Floats,
+        rise: Floats,
+        arms: Floats,
+        limit: float,
+        a: AvoidanceArrays,
     ) -> tuple[Floats, Floats, Ints]:
         """Barriers of slots against obstacle o, which stands still, that may act; see `_cones`."""
         solids = a.solids

@@ -33,7 +33,7 @@ from rigidfleet.math.piecewise import (
     refine,
 )
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.result import Extremum, PhaseRecord, Result, there
+from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
 from rigidfleet.simulation.extremes import CurveWatch
@@ -409,7 +409,7 @@ def _watch(
     share = np.diff(knots) / np.diff(way.time)[k]
     knots = _split(knots, np.ceil(_parts(way)[k] * share - 1e-9).astype(np.int64))
     together = max(1, _TOGETHER // (30 * way.pieces.shape[1]))
-    here = there(0.5 * (knots[:-1] + knots[1:]), spans, way.pieces.shape[1] if spans else 1)
+    here = presence(0.5 * (knots[:-1] + knots[1:]), spans, way.pieces.shape[1] if spans else 1)
     change = np.flatnonzero((here[1:] != here[:-1]).any(axis=1)) + 1
     starts = np.union1d(np.arange(0, len(here), together), change)
     for first, last in pairwise([*starts.tolist(), len(here)]):
@@ -462,7 +462,7 @@ def _result(
 ) -> Result:
     r, v, a, j = state
     k, n = r.shape[:2]
-    left = there(time, statistics["spans"], n)
+    left = presence(time, statistics["spans"], n)
     turned = np.nan_to_num(yaw, copy=False)
     sizes = {"time": k, "agent": n, "axis": 3, "quaternion": 4, "wrench": 6, "edge": 0}
     nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once

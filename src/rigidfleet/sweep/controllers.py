@@ -16,13 +16,13 @@ REMEDY = (
 )
 
 
-def search(folder: str | Path) -> None:
+def add_search_folder(folder: str | Path) -> None:
     """Search a folder for modules, after all others: it hides none."""
     if (place := str(Path(folder).resolve())) not in sys.path:
         sys.path.append(place)
 
 
-def imported(name: str) -> tuple[Any, str]:
+def import_law(name: str) -> tuple[Any, str]:
     """The function or class of a name MODULE:NAME, and a digest of the file of its module.
 
     Raises
@@ -31,7 +31,7 @@ def imported(name: str) -> tuple[Any, str]:
         There is none, its module fails, or no controller can be made of the class. The message says why.
     """
     module, _, inside = name.partition(":")
-    search("")
+    add_search_folder("")
     try:
         there = import_module(module)
         law = attrgetter(inside)(there)

@@ -65,7 +65,7 @@ def load(folder: str | Path) -> xarray.Dataset:
 
 def explained(sweep: Sweep, column: SweepColumn) -> tuple[str, str]:
     """Unit and meaning of the number that a column varies."""
-    text = keypaths.meaning(sweep.mission, column.keys)
+    text = keypaths.description_of(sweep.mission, column.keys)
     units = _UNIT.findall(text)
     unit = "1" if column.variation.change == "scale" or not units else units[-1].replace("-", "1")
     return unit, f"{_ROLE[column.variation.change]}{text}"

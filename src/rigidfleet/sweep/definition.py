@@ -188,7 +188,7 @@ class Sweep:
         data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(given := data.get("vary", []), list):
             data["vary"] = [*given, *more]
-        controllers.search(path.parent)
+        controllers.add_search_folder(path.parent)
         variations, header = _checked(data, origin, mission)
         assert mission is not None  # otherwise the check has raised
         return cls(mission, variations, header, path.stem)
@@ -225,7 +225,7 @@ class Sweep:
         if not (name := self.header.controller):
             return None, ""
         try:
-            return controllers.imported(name)
+            return controllers.import_law(name)
         except ImportError as error:
             raise RigidfleetError(f"controller: {error}\n    {controllers.REMEDY}") from error
 
@@ -343,17 +343,17 @@ def apply(
     document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
 ) -> None:
     """Apply a value of a column to a document; all numbers at its place change alike."""
-    there = keypaths.numbers(look_up(whole, column.keys))
+    there = keypaths.flatten(look_up(whole, column.keys))
     integral = all(isinstance(x, int) for x in there)
 
     def changed(there: Any) -> Any:
-        new = column.variation.changed(there, value)
+        new = column.variation.apply(there, value)
         return round(new) if integral and math.isfinite(new) else new
 
     def replaced(there: Any) -> Any:
-        return keypaths.mapped(there, changed) if is_number(value) else value
+        return keypaths.map_nested(there, changed) if is_number(value) else value
 
-    keypaths.change(document, whole, column.keys, replaced)
+    keypaths.replace_value(document, whole, column.keys, replaced)
 
 
 # -- the check ---------------------------------------------------------------------------------------
@@ -397,7 +397,7 @@ def _checked(
         _taken(collector, lacked, mission, whole)
     if header is not None and (name := header.controller):
         try:
-            controllers.imported(name)
+            controllers.import_law(name)
         except ImportError as error:
             collector.add(("controller",), str(error), controllers.REMEDY)
         if by_final_states:
@@ -456,7 +456,7 @@ def _fits(
         if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
             collector.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
     for keys in places:
-        leaves = keypaths.numbers(look_up(whole, keys))
+        leaves = keypaths.flatten(look_up(whole, keys))
         absent = any(x is None for x in leaves)
         table = next((x for x in leaves if isinstance(x, dict)), None)
         words = [x for x in leaves if not is_number(x)]
@@ -473,7 +473,7 @@ def _fits(
             problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
             remedy = f"remove it, or {_WHOLE}"
         else:
-            if absent or keypaths.lacking(whole, keys):
+            if absent or keypaths.is_absent(whole, keys):
                 lacked.append((k, SweepColumn(v, keys, None)))
             continue
         collector.add(where, problem, remedy, path)

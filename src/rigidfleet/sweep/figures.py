@@ -12,7 +12,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.plotting import contents, write_files
+from rigidfleet.plotting import encode_figure, write_files
 from rigidfleet.plotting import style as st
 from rigidfleet.sweep.dataset import explained
 from rigidfleet.sweep.metrics import METRICS, readable
@@ -75,13 +75,13 @@ def plot(
         "envelopes": envelopes,
         "outcome": outcome,
         "drivers": correlations,
-        "map": partial(over_two, over=over, metric=metric),
+        "map": partial(map_over_two, over=over, metric=metric),
     }
     files = []
     for name, drawn in draw.items():
-        with st.settings(), st.shape(titles=titles):
+        with st.settings(), st.figure_options(titles=titles):
             figure = drawn(table)
-        made = {} if figure is None else contents(figure, formats, close=not titles)
+        made = {} if figure is None else encode_figure(figure, formats, close=not titles)
         files += write_files(Path(folder, name), made)
     return files
 
@@ -91,7 +91,7 @@ def outcome(table: Table) -> Figure | None:
     if not len(table.run):
         return None
     reasons = failures(table)
-    fig = _figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
+    fig = _titled_figure(table, "Outcome", st.WIDTH, 2.9 + 0.14 * max(0, len(reasons) - 6))
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
     passed = np.cumsum(table.passed)[n - 1]
@@ -107,7 +107,7 @@ def outcome(table: Table) -> Figure | None:
     )
     right.set_title("failed checks", loc="left")
     if not reasons:
-        st.note(right, "no run failed")
+        st.write_note(right, "no run failed")
         right.grid(visible=False)
         right.tick_params(bottom=False, labelbottom=False)
         return fig
@@ -126,8 +126,8 @@ def histograms(table: Table) -> Figure | None:
     names = [name for name in outcomes(table) if name != "success"]
     if not names:
         return None
-    fig, axes = _small(table, "Metrics of all runs", names)
-    limits, shown = _limits(table), False
+    fig, axes = _small_axes(table, "Metrics of all runs", names)
+    limits, shown = _metric_limits(table), False
     for name, ax in zip(names, axes, strict=True):
         x = table.metrics[name]
         finite = np.isfinite(x)
@@ -142,14 +142,14 @@ def histograms(table: Table) -> Figure | None:
         ax.set_xscale(scale)
         ax.set_xlim(low, high)
         ax.grid(visible=False, axis="x")
-        _ticks(ax, scale)
-        ax.set_xlabel(_label(name))
+        _set_ticks(ax, scale)
+        ax.set_xlabel(_metric_label(name))
         if name in limits and low <= limits[name] <= high:
             ax.axvline(limits[name], color=st.ALERT, linewidth=1.0, linestyle=(0, (6, 2)))
             shown = True
     for ax in axes[::_COLUMNS]:
         ax.set_ylabel("runs")
-    _key(fig, table, limit=shown)
+    _draw_key(fig, table, limit=shown)
     return fig
 
 
@@ -161,14 +161,14 @@ def envelopes(table: Table) -> Figure | None:
             strongest.setdefault(d.outcome, d.varied)
     if not strongest:
         return None
-    fig, axes = _small(table, "Metrics over what drives them most", list(strongest))
+    fig, axes = _small_axes(table, "Metrics over what drives them most", list(strongest))
     numbers = varied(table)
     for (name, over), ax in zip(strongest.items(), axes, strict=True):
         x, y = numbers[over], table.metrics[name]
         for passed, colour in ((True, PASSED), (False, FAILED)):
             some = (table.passed == passed) & np.isfinite(y)
             ax.plot(x[some], y[some], ".", color=colour, markersize=2.5, alpha=0.5, rasterized=True)
-        centres, low, middle, high = _running(x[np.isfinite(y)], y[np.isfinite(y)])
+        centres, low, middle, high = _running_percentiles(x[np.isfinite(y)], y[np.isfinite(y)])
         ax.fill_between(centres, low, high, color=st.INK, alpha=0.12, linewidth=0)
         ax.plot(centres, middle, color=st.INK)
         scale = _scale(y[np.isfinite(y)])
@@ -177,26 +177,26 @@ def envelopes(table: Table) -> Figure | None:
             ax.set_xscale("log")
             _log_ticks(ax.xaxis, x)
         ax.margins(x=0.02)
-        ax.set_title(_label(name), loc="left", fontsize=8.5)
+        ax.set_title(_metric_label(name), loc="left", fontsize=8.5)
         ax.set_xlabel(_axis_label(table, over).replace(", ", ",\n"), fontsize=7.5)
-    _key(fig, table)
+    _draw_key(fig, table)
     return fig
 
 
 def correlations(table: Table) -> Figure | None:
     """Rank correlation of every varied number with success and every metric."""
-    found = drivers(table)
-    if not found:
+    correlated = drivers(table)
+    if not correlated:
         return None
-    rows = list(dict.fromkeys(d.varied for d in found))[:_ROWS]
+    rows = list(dict.fromkeys(d.varied for d in correlated))[:_ROWS]
     rows = [name for name in varied(table) if name in rows]
-    columns = [name for name in outcomes(table) if any(d.outcome == name for d in found)]
+    columns = [name for name in outcomes(table) if any(d.outcome == name for d in correlated)]
     values = np.full((len(rows), len(columns)), np.nan)
-    for d in found:
+    for d in correlated:
         if d.varied in rows:
             values[rows.index(d.varied), columns.index(d.outcome)] = d.correlation
     title = "What drives success and the metrics"
-    fig = _figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
+    fig = _titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
     ax = fig.subplots()
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
     ax.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns])
@@ -216,7 +216,7 @@ def correlations(table: Table) -> Figure | None:
     return fig
 
 
-def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:
+def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure | None:
     """Map of the success rate, or of the median of a metric, over two varied numbers.
 
     Raises
@@ -224,13 +224,13 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
     RigidfleetError
         The sweep has no such path or metric.
     """
-    numbers, found = varied(table), drivers(table)
+    numbers, correlated = varied(table), drivers(table)
     if not metric:
         judged = outcomes(table)
-        strongest = [d.outcome for d in found]
+        strongest = [d.outcome for d in correlated]
         metric = "success" if "success" in judged or not strongest else strongest[0]
     if not over:
-        ranked = [d.varied for d in found if d.outcome == metric]
+        ranked = [d.varied for d in correlated if d.outcome == metric]
         over = list(dict.fromkeys([*ranked, *numbers]))[:2]
         if len(over) < 2:
             return None
@@ -252,7 +252,7 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
         if len(inside):
             cells[i, j] = inside.mean() if metric == "success" else np.median(inside)
     title = "Success rate" if metric == "success" else f"Median: {metric.replace('_', ' ')}"
-    fig = _figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
+    fig = _titled_figure(table, title, 0.75 * st.WIDTH, 0.58 * st.WIDTH)
     ax = fig.subplots()
     wide = metric != "success" and _scale(cells[np.isfinite(cells)]) == "log"
     look: dict[str, Any] = {"vmin": 0, "vmax": 100} if metric == "success" else {}
@@ -277,27 +277,27 @@ def over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Figure
 # -- parts -------------------------------------------------------------------------------------------
 
 
-def _figure(table: Table, title: str, wide: float, high: float) -> Figure:
+def _titled_figure(table: Table, title: str, wide: float, high: float) -> Figure:
     """A figure of a size [in], with its title and what the sweep is."""
-    fig = st.blank(wide, high, "constrained")
+    fig = st.blank_figure(wide, high, "constrained")
     of = "" if table.complete else f" of {table.sweep.runs}"
     words = f"{table.sweep.name}: {len(table.run)}{of} runs"
-    st.heading(fig, title, words, st.GREY if table.complete else st.ALERT)
+    st.draw_heading(fig, title, words, st.GREY if table.complete else st.ALERT)
     return fig
 
 
-def _small(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
+def _small_axes(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
     """Figure with small axes, one for each metric."""
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = _figure(table, title, st.WIDTH, 0.9 + 1.75 * rows)
+    fig = _titled_figure(table, title, st.WIDTH, 0.9 + 1.75 * rows)
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(names) :]:
         ax.set_visible(False)
     return fig, axes[: len(names)]
 
 
-def _key(fig: Figure, table: Table, *, limit: bool = False) -> None:
+def _draw_key(fig: Figure, table: Table, *, limit: bool = False) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -309,7 +309,7 @@ def _key(fig: Figure, table: Table, *, limit: bool = False) -> None:
     fig.legend(handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8)
 
 
-def _label(metric: str) -> str:
+def _metric_label(metric: str) -> str:
     return f"{metric.replace('_', ' ')} [{_unit(metric)}]"
 
 
@@ -324,7 +324,7 @@ def _axis_label(table: Table, name: str) -> str:
     return f"{name}{how} [{readable(unit)}]"
 
 
-def _limits(table: Table) -> dict[str, float]:
+def _metric_limits(table: Table) -> dict[str, float]:
     """Limits of the mission for metrics, unless they vary."""
     moved = {key for column in table.sweep.columns for key in column.keys[:2]}
     limits = {q.name: q.limit_of(table.sweep.mission) for q in QUANTITIES.values() if q.checked}
@@ -342,7 +342,7 @@ def _scale(x: Floats) -> str:
     return "log" if wide else "linear"
 
 
-def _ticks(ax: Axes, scale: str) -> None:
+def _set_ticks(ax: Axes, scale: str) -> None:
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     if scale == "log":
@@ -376,7 +376,7 @@ def _cells(x: Floats, scale: str) -> tuple[Floats, Ints]:
     return edges, np.clip(np.searchsorted(edges, x, side="right") - 1, 0, _CELLS - 1)
 
 
-def _running(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _running_percentiles(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Centres in x, and 5th percentile, median and 95th percentile of y there.
 
     The centres are the values of x, or if there are many, intervals with equal numbers of runs.

@@ -48,16 +48,16 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     "handedness" are those of `rigidfleet.assess`. The metrics are those of the shape, and the number of evaluations,
     which the eight runs of a vector share.
     """
-    _prepare(sweep)
+    _compile_kernel(sweep)
     begun = perf_counter()
     values = [sweep.values(run) for run in runs]
-    r, v = starts(sweep, values)
-    refused = _refused(sweep, runs, r, v)
+    r, v = start_states(sweep, values)
+    refused = _refusals(sweep, runs, r, v)
     out = list(refused)
     r[out], v[out] = sweep.mission.agents.position, sweep.mission.agents.velocity
-    found = establish(sweep.mission, r, v)
-    wrong, metrics = _evaluated(sweep.mission, found)
-    failed = {"complete": ~found.finished} | {k: found.finished & x for k, x in wrong.items()}
+    ensemble = establish(sweep.mission, r, v)
+    wrong, metrics = _evaluate(sweep.mission, ensemble)
+    failed = {"complete": ~ensemble.finished} | {k: ensemble.finished & x for k, x in wrong.items()}
     wall = (perf_counter() - begun) / len(runs)
     rows = []
     for k, (run, drawn) in enumerate(zip(runs, values, strict=True)):
@@ -73,42 +73,44 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     return rows
 
 
-def starts(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
+def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats, Floats]:
     """Start positions and velocities (B, N, 3) [m, m/s] of runs with given values of the columns (B, D)."""
     agents, count = sweep.mission.agents, len(values)
     own = {"position": agents.position, "velocity": agents.velocity}
-    found = {name: np.tile(np.array(x, dtype=float), (count, 1, 1)) for name, x in own.items()}
-    with np.errstate(over="ignore", invalid="ignore"):  # `_refused` finds them
+    states = {name: np.tile(np.array(x, dtype=float), (count, 1, 1)) for name, x in own.items()}
+    with np.errstate(over="ignore", invalid="ignore"):  # `_refusals` has them
         for column, drawn in zip(sweep.columns, np.array(values, dtype=float).T, strict=True):
             _, name, *inner = column.keys
-            place = found[str(name)][(slice(None), *map(int, inner))]
+            place = states[str(name)][(slice(None), *map(int, inner))]
             by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
-            place[:] = column.variation.changed(place, by)
-    return found["position"], found["velocity"]
+            place[:] = column.variation.apply(place, by)
+    return states["position"], states["velocity"]
 
 
 @lru_cache(maxsize=4)
-def _prepare(sweep: Sweep) -> None:
+def _compile_kernel(sweep: Sweep) -> None:
     """Fly the unvaried mission once, so that the time of compiling does not count for any run."""
     agents = sweep.mission.agents
     establish(sweep.mission, [agents.position], [agents.velocity])
 
 
-def _refused(sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats) -> dict[int, tuple[str, str]]:
+def _refusals(
+    sweep: Sweep, runs: Sequence[int], r: Floats, v: Floats
+) -> dict[int, tuple[str, str]]:
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
     bounded = np.all((np.abs(r) <= LENGTH.most) & (np.abs(v) <= SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
     apart = [not any(coincident(points)) for points in r.tolist()]
-    found = {}
+    refusals = {}
     for k in np.flatnonzero(~(bounded & apart)):
         try:
             sweep.mission_of(runs[k])
         except MissionError as error:
-            found[int(k)] = refusal(error)
-    return found
+            refusals[int(k)] = refusal(error)
+    return refusals
 
 
-def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
+def _evaluate(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict[str, Floats]]:
     """Failed checks (B,) and metrics (B,), by name."""
     count = len(flown.finished)
     wrong = {name: np.zeros(count, dtype=bool) for name in ("distances", "shape", "handedness")}
@@ -123,15 +125,15 @@ def _evaluated(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dic
             continue
         judged = shaping is not None or index == last
         allowed = mission.formations[formation].greatest_error
-        asked = mission.formation_distances(formation)
-        wide = max_edge_error(r, mission.formation_edges(formation), asked)
+        lengths = mission.formation_distances(formation)
+        wide = max_edge_error(r, mission.formation_edges(formation), lengths)
         blending = (
             shaping is not None and shaping.reference != "step" and shaping.least_time > length
         )
-        if index == last and not blending and len(asked):
+        if index == last and not blending and len(lengths):
             metrics["constraint_end"] = wide
         if judged:
-            wrong["distances"] |= wide > allowed(asked.min(initial=math.inf))
+            wrong["distances"] |= wide > allowed(lengths.min(initial=math.inf))
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue

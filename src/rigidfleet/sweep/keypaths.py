@@ -59,20 +59,20 @@ def expand(whole: Mapping[str, Any], path: str) -> list[Keys]:
         remedy = "write agents.mass.2, or agents.position.*.3 for every agent"
         raise PathError("is not a valid path", remedy)
     steps = [quoted or index or word for quoted, index, word in _STEP.findall(path)]
-    found, depth = _matches(whole, steps)
+    places, depth = _matches(whole, steps)
     if depth < len(steps):
         problem = f"there is no '{steps[depth]}' in {'.'.join(steps[:depth]) or 'the mission'}"
-        raise PathError(problem, _remedy(whole, found[0][1], steps, depth))
-    return [keys for keys, _ in found]
+        raise PathError(problem, _remedy(whole, places[0][1], steps, depth))
+    return [keys for keys, _ in places]
 
 
 def whole_document(mission: Mission) -> dict[str, Any]:
     """A mission as plain data with all defaults; None for optional keys without a value."""
-    whole: dict[str, Any] = _filled(mission, mission.n_agents)
+    whole: dict[str, Any] = _with_defaults(mission, mission.n_agents)
     return whole
 
 
-def change(
+def replace_value(
     document: dict[str, Any], whole: Mapping[str, Any], keys: Keys, by: Callable[[Any], Any]
 ) -> None:
     """Replace a value in a document by a function of it, in place. A missing value is taken from ``whole``."""
@@ -89,22 +89,22 @@ def change(
         at = at[k]
 
 
-def lacking(whole: Mapping[str, Any], keys: Keys) -> bool:
+def is_absent(whole: Mapping[str, Any], keys: Keys) -> bool:
     """Whether a place is in a table that the mission does not have."""
     return any(isinstance(look_up(whole, keys[:k]), Absent) for k in range(1, len(keys)))
 
 
-def numbers(value: Any) -> list[Any]:
+def flatten(value: Any) -> list[Any]:
     """Entries of nested lists, in order."""
-    return [x for v in value for x in numbers(v)] if isinstance(value, list) else [value]
+    return [x for v in value for x in flatten(v)] if isinstance(value, list) else [value]
 
 
-def mapped(value: Any, function: Callable[[Any], Any]) -> Any:
+def map_nested(value: Any, function: Callable[[Any], Any]) -> Any:
     """Apply a function to all entries of nested lists."""
-    return [mapped(v, function) for v in value] if isinstance(value, list) else function(value)
+    return [map_nested(v, function) for v in value] if isinstance(value, list) else function(value)
 
 
-def meaning(mission: Mission, keys: Keys) -> str:
+def description_of(mission: Mission, keys: Keys) -> str:
     """Description of a key in the mission format, with its unit in brackets."""
     at: Any = mission
     text = ""
@@ -120,7 +120,7 @@ def meaning(mission: Mission, keys: Keys) -> str:
     return text
 
 
-def _filled(value: Any, n: int, field: FieldInfo | None = None) -> Any:
+def _with_defaults(value: Any, n: int, field: FieldInfo | None = None) -> Any:
     """Plain data of a value with all defaults, of a key with a type, in a mission of n agents."""
     kind = None if field is None else field.annotation
     if value is None and (model := model_of(kind)):
@@ -128,7 +128,7 @@ def _filled(value: Any, n: int, field: FieldInfo | None = None) -> Any:
         return Absent(
             (
                 k,
-                _filled(
+                _with_defaults(
                     None if f.is_required() else f.get_default(call_default_factory=True), n, f
                 ),
             )
@@ -137,24 +137,26 @@ def _filled(value: Any, n: int, field: FieldInfo | None = None) -> Any:
     if kind is not None and isinstance(value, float):
         return next(([value] * (count or n) for listed, count in _LISTS if listed == kind), value)
     if isinstance(value, Part):
-        return {k: _filled(getattr(value, k), n, f) for k, f in type(value).model_fields.items()}
+        return {
+            k: _with_defaults(getattr(value, k), n, f) for k, f in type(value).model_fields.items()
+        }
     if isinstance(value, Mapping):
-        return {key: _filled(inner, n) for key, inner in value.items()}
-    return [_filled(v, n) for v in value] if isinstance(value, tuple | list) else value
+        return {key: _with_defaults(inner, n) for key, inner in value.items()}
+    return [_with_defaults(v, n) for v in value] if isinstance(value, tuple | list) else value
 
 
 def _matches(whole: Mapping[str, Any], steps: list[str]) -> tuple[list[tuple[Keys, Any]], int]:
     """Places, with what is there, that match as many of the first steps as any place does, and how many these are."""
-    found: list[tuple[Keys, Any]] = [((), whole)]
+    places: list[tuple[Keys, Any]] = [((), whole)]
     for depth, step in enumerate(steps):
-        further = [(keys + (k,), inner) for keys, at in found for k, inner in _below(at, step)]
+        further = [(keys + (k,), inner) for keys, at in places for k, inner in _children(at, step)]
         if not further:
-            return found, depth
-        found = further
-    return found, len(steps)
+            return places, depth
+        places = further
+    return places, len(steps)
 
 
-def _below(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
+def _children(at: Any, step: str) -> Iterator[tuple[str | int, Any]]:
     if isinstance(at, dict) and step == ANY:
         yield from ((k, inner) for k, inner in at.items() if not isinstance(inner, Absent))
     elif isinstance(at, dict):

@@ -121,9 +121,9 @@ class _Sweeping:
         self, sweep: Sweep, store: Store, progress: Callable[[SweepProgress], None] | None
     ) -> None:
         self.sweep, self.store, self.progress = sweep, store, progress
-        self.there = store.there()
+        self.finished_runs = store.finished_runs()
         # A group is flown as a whole, so that its records do not depend on when the sweep was stopped.
-        self.missing = deque(np.unique(np.flatnonzero(~self.there) // GROUP).tolist())
+        self.missing = deque(np.unique(np.flatnonzero(~self.finished_runs) // GROUP).tolist())
         self.flown, self.failed = 0, 0
         self.begun = perf_counter()
         self.pace = 0.0  # [s] a run
@@ -147,7 +147,7 @@ class _Sweeping:
                 workers = capacity()
                 while self.missing and len(flying) < _AHEAD * workers:
                     runs = self.take(workers)
-                    flying[executor.submit(pools.chunk, *sweep, runs)] = runs
+                    flying[executor.submit(pools.fly_chunk, *sweep, runs)] = runs
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
                     self.keep(future.result())
                     del flying[future]
@@ -167,7 +167,7 @@ class _Sweeping:
     def keep(self, rows: list[RunRecord]) -> None:
         """Store the records of a chunk."""
         self.store.add(rows)
-        self.there[[row.run for row in rows]] = True
+        self.finished_runs[[row.run for row in rows]] = True
         self.flown += len(rows)
         self.failed += sum(not row.passed for row in rows)
         self.pace = max(median(row.wall for row in rows), 1e-9)
@@ -175,6 +175,6 @@ class _Sweeping:
     def report(self, workers: int) -> None:
         """Tell the progress."""
         if self.progress is not None:
-            done, wall = int(self.there.sum()), perf_counter() - self.begun
+            done, wall = int(self.finished_runs.sum()), perf_counter() - self.begun
             now = SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, workers)
             self.progress(now)

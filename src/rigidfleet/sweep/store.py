@@ -81,7 +81,7 @@ class Store:
 
     def __init__(self, folder: Path, sweep: Sweep, *, replace: bool = False) -> None:
         self.path = folder / FILE
-        with _explained(self.path), ExitStack() as opened:
+        with _as_result_errors(self.path), ExitStack() as opened:
             folder.mkdir(parents=True, exist_ok=True)
             lock = sqlite3.connect(folder / _LOCK, timeout=0.0, isolation_level=None)
             opened.enter_context(closing(lock)).execute("BEGIN EXCLUSIVE")
@@ -111,17 +111,17 @@ class Store:
         ]  # fmt: skip
         columns = ("run", *_COLUMNS)
         names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
-        with _explained(self.path), self.db:
+        with _as_result_errors(self.path), self.db:
             self.db.execute("BEGIN IMMEDIATE")
             self.db.executemany(f"INSERT OR REPLACE INTO runs ({names}) VALUES ({marks})", entries)
 
-    def there(self) -> Bools:
+    def finished_runs(self) -> Bools:
         """Mask (runs,) of the finished runs."""
-        found = np.zeros(self.runs, dtype=bool)
-        with _explained(self.path):
+        mask = np.zeros(self.runs, dtype=bool)
+        with _as_result_errors(self.path):
             numbers = self.db.execute("SELECT run FROM runs WHERE run < ?", (self.runs,))
-            found[[n for (n,) in numbers]] = True
-        return found
+            mask[[n for (n,) in numbers]] = True
+        return mask
 
     def _open(self, sweep: Sweep) -> None:
         self.runs = sweep.runs
@@ -130,11 +130,11 @@ class Store:
         identity = json.dumps(sweep.identity, ensure_ascii=False, sort_keys=True)
         with self.db:
             self.db.execute("BEGIN IMMEDIATE")
-            _readable(self.db, self.path.parent)
+            _check_format(self.db, self.path.parent)
             self.db.execute(f"PRAGMA user_version = {_FORMAT}")
             self.db.execute("CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT)")
             self.db.execute("CREATE TABLE IF NOT EXISTS runs (run INTEGER PRIMARY KEY)")
-            for name in sorted(set(_COLUMNS) - _stored(self.db), key=_COLUMNS.index):
+            for name in sorted(set(_COLUMNS) - _column_names(self.db), key=_COLUMNS.index):
                 self.db.execute(f'ALTER TABLE runs ADD "{name}" {_KINDS.get(name, "REAL")}')
             there = dict(self.db.execute("SELECT key, value FROM sweep"))
             if there and there.get("identity") != identity:
@@ -148,7 +148,7 @@ class Store:
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
 
 
-def _stored(db: sqlite3.Connection) -> set[str]:
+def _column_names(db: sqlite3.Connection) -> set[str]:
     """Columns of a store: one that an earlier version wrote may lack metrics."""
     return {name for _, name, *_ in db.execute("PRAGMA table_info(runs)")}
 
@@ -166,7 +166,7 @@ def read_sweep(folder: Path) -> Sweep:
     ResultError
         The folder does not contain a sweep.
     """
-    with _reading(folder) as db:
+    with _open_to_read(folder) as db:
         entries = dict(db.execute("SELECT key, value FROM sweep"))
         return Sweep.from_json(entries["sweep"])
 
@@ -181,8 +181,8 @@ def read(folder: str | Path) -> Table:
     """
     folder = Path(folder)
     sweep = read_sweep(folder)
-    with _reading(folder) as db:
-        known = _stored(db)
+    with _open_to_read(folder) as db:
+        known = _column_names(db)
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
         rows = db.execute(f"SELECT run, {names} FROM runs ORDER BY run").fetchall()
     run, passed, reason, detail, wall, codes, *metrics = list(zip(*rows, strict=True)) or [
@@ -201,16 +201,16 @@ def read(folder: str | Path) -> Table:
 
 
 @contextmanager
-def _reading(folder: Path) -> Generator[sqlite3.Connection]:
+def _open_to_read(folder: Path) -> Generator[sqlite3.Connection]:
     path = folder / FILE
     if not path.is_file():
         raise ResultError(f"{folder}: contains no sweep. `rigidfleet sweep` creates one.")
-    with _explained(path), closing(sqlite3.connect(path)) as db:
-        _readable(db, folder)
+    with _as_result_errors(path), closing(sqlite3.connect(path)) as db:
+        _check_format(db, folder)
         yield db
 
 
-def _readable(db: sqlite3.Connection, folder: Path) -> None:
+def _check_format(db: sqlite3.Connection, folder: Path) -> None:
     """Raise ResultError if a store has another format."""
     if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is None:
         return  # a new file
@@ -228,7 +228,7 @@ def _readable(db: sqlite3.Connection, folder: Path) -> None:
 
 
 @contextmanager
-def _explained(path: Path) -> Generator[None]:
+def _as_result_errors(path: Path) -> Generator[None]:
     """Turn errors of SQLite and of the operating system into ResultError."""
     try:
         yield

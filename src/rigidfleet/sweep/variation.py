@@ -44,7 +44,7 @@ class Variation(Part):
         description="set: replaces the value in the mission; add: is added to it; scale: multiplies it",
     )
 
-    def changed(self, there: Any, value: Any) -> Any:
+    def apply(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
         match self.change:
             case "add":
@@ -110,7 +110,7 @@ class Uniform(Variation):
 
     def wrong(self) -> tuple[str, str, str] | None:
         """Ends in the wrong order."""
-        return _ordered(self.low, self.high)
+        return _order_error(self.low, self.high)
 
 
 class LogUniform(Variation):
@@ -126,7 +126,7 @@ class LogUniform(Variation):
 
     def wrong(self) -> tuple[str, str, str] | None:
         """Ends in the wrong order."""
-        return _ordered(self.low, self.high)
+        return _order_error(self.low, self.high)
 
 
 class _Listed(Variation):
@@ -254,7 +254,7 @@ def from_line(line: str) -> dict[str, Any] | WrongLine:
     if kind not in KINDS:
         remedy = near(kind, KINDS) or f"use one of {', '.join(KINDS)}"
         return WrongLine(f"there is no distribution or grid '{kind}'", remedy)
-    values = [_value(word) for word in _words(inside)]
+    values = [_parse_word(word) for word in _split_words(inside)]
     if kind not in _KEYS:
         return data | {"values": values}
     keys = _KEYS[kind]
@@ -276,7 +276,7 @@ def _usable(value: object) -> bool:
     return isinstance(value, str) or (isinstance(value, int | float) and abs(value) <= _MOST)
 
 
-def _words(text: str) -> list[str]:
+def _split_words(text: str) -> list[str]:
     """Split text at commas outside of brackets."""
     words, depth = [""], 0
     for letter in text:
@@ -288,7 +288,7 @@ def _words(text: str) -> list[str]:
     return [word.strip() for word in words] if text.strip() else []
 
 
-def _value(word: str) -> Any:
+def _parse_word(word: str) -> Any:
     """Convert a word to a number, true, false or a list; otherwise return it without quotes."""
     for read in (json.loads, float):
         try:
@@ -298,7 +298,7 @@ def _value(word: str) -> Any:
     return word.strip("'\"")
 
 
-def _ordered(low: float, high: float) -> tuple[str, str, str] | None:
+def _order_error(low: float, high: float) -> tuple[str, str, str] | None:
     if low < high:
         return None
     return "high", f"must be above low = {low:g}", "swap the two, or set a single value by grid"

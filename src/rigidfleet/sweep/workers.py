@@ -33,7 +33,7 @@ _KEPT = {-1: 256 << 20, -3: 32 << 20}
 _CONNECT = 20.0
 
 
-def chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
+def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     """Fly a chunk of a sweep, given as JSON, for another process.
 
     Raises
@@ -61,10 +61,10 @@ def processes(count: int) -> Generator[Pool]:
 
     before = set(multiprocessing.active_children())
     forked = _has_one_thread()
-    context: Any = _forks() if forked else _Context()
+    context: Any = _fork_context() if forked else _Context()
     own = None if forked else bequeath()
     with safe_path():  # for multiprocessing's resource tracker
-        pool = ProcessPoolExecutor(count, context, _begin, (own,))
+        pool = ProcessPoolExecutor(count, context, _begin_worker, (own,))
     try:
         yield pool, lambda: count
     finally:
@@ -84,7 +84,7 @@ def _has_one_thread() -> bool:
         return False
 
 
-def _forks() -> Any:
+def _fork_context() -> Any:
     """Context of forks, for which Ctrl-C waits from the start."""
     from multiprocessing.context import ForkContext, ForkProcess
 
@@ -119,17 +119,17 @@ class _Context(SpawnContext):
     Process = _Process
 
 
-def _begin(given: Inheritance | None) -> None:
+def _begin_worker(inheritance: Inheritance | None) -> None:
     """Prepare a worker: ignore Ctrl-C, end with the parent process, and take compiled code that it gives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_follow, daemon=True).start()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     # A run makes thousands of arrays and leaves hardly any cycle: to search for them takes a twentieth of its time.
     gc.freeze()
     gc.set_threshold(100_000)
-    if given is not None:
+    if inheritance is not None:
         from rigidfleet.kernel.engine.native import inherit
 
-        inherit(given)
+        inherit(inheritance)
     keep_memory()
 
 
@@ -145,7 +145,7 @@ def keep_memory() -> None:
             mallopt(parameter, size)
 
 
-def _follow() -> None:
+def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet._common.toml import to_toml
 from rigidfleet.math import lqr, pid
-from rigidfleet.math.margins import Feedback, Loop, Margins, margins
+from rigidfleet.math.margins import Loop, LoopGains, Margins, margins
 from rigidfleet.mission import Mission
 from rigidfleet.mission.files import digests
 from rigidfleet.mission.schema import Tracking
@@ -50,17 +50,17 @@ TRACKING, CONSTRAINT = "tracking", "constraint law"
 def own_gains(mission: Mission) -> Gains:
     """The gains of a mission that can be tuned: those that act on its flight and are not 0."""
     c, t = mission.constraint, mission.tracking
-    found: Gains = {}
+    own: Gains = {}
     if c.stabilisation == "pid" and len(mission.edges):
-        found |= {
+        own |= {
             "constraint.alpha": c.alpha, "constraint.beta": c.beta, "constraint.gamma": c.gamma
         }  # fmt: skip
     if any(phase.control == "tracking" for phase in mission.phases):
-        found |= {"tracking.Q.1": t.Q[0], "tracking.Q.2": t.Q[1], "tracking.integral": t.integral}
-    return {path: gain for path, gain in found.items() if gain > 0}
+        own |= {"tracking.Q.1": t.Q[0], "tracking.Q.2": t.Q[1], "tracking.integral": t.integral}
+    return {path: gain for path, gain in own.items() if gain > 0}
 
 
-class Space:
+class GainSpace:
     """The box in which gains are searched: one axis for each, from 0 to 1, on a logarithmic scale."""
 
     def __init__(self, own: Gains) -> None:
@@ -69,11 +69,11 @@ class Space:
 
     def gains(self, x: Sequence[float] | Floats) -> Gains:
         """The gains at a point x (D,), to four digits; there, the mission's own are whole."""
-        found = {}
+        gains = {}
         for u, (path, (low, high)) in zip(x, self.ends.items(), strict=True):
-            gain, own = _rounded(low * (high / low) ** u), self.own[path]
-            found[path] = own if gain == _rounded(own) else gain
-        return found
+            gain, own = _to_four_digits(low * (high / low) ** u), self.own[path]
+            gains[path] = own if gain == _to_four_digits(own) else gain
+        return gains
 
     @property
     def start(self) -> Floats:
@@ -83,7 +83,7 @@ class Space:
         )
 
 
-def _rounded(gain: float) -> float:
+def _to_four_digits(gain: float) -> float:
     return float(f"{gain:.4g}")
 
 
@@ -93,7 +93,7 @@ class _Part:
 
     name: str
     loop: Loop
-    law: Feedback
+    law: LoopGains
     growth: float
 
 
@@ -114,17 +114,17 @@ class Screen:
         if lags:
             tracking = tracking_law(mission, lags)
             laws += [] if tracking is None else [(TRACKING, tracking)]
-            found, _ = formation_laws(mission, preview(mission)[0], lags)
-            laws += [(CONSTRAINT, law) for law in found]
-        self.parts = _distinct(laws)
+            looped, _ = formation_laws(mission, preview(mission)[0], lags)
+            laws += [(CONSTRAINT, law) for law in looped]
+        self.parts = _distinct_parts(laws)
         self.own = self.margins(self.gains)
 
     def margins(self, gains: Gains) -> dict[str, Margins]:
         """The smallest margins of each law with some gains."""
-        found: dict[str, Margins] = {}
-        for name, m in self._each(gains):
-            found[name] = _smaller(found[name], m) if name in found else m
-        return found
+        smallest: dict[str, Margins] = {}
+        for name, m in self._margins_of_parts(gains):
+            smallest[name] = _smaller_margins(smallest[name], m) if name in smallest else m
+        return smallest
 
     def slack(self, gains: Gains) -> float:
         """By how much the margins exceed what is asked, as a share of the mission's own; negative if they are worse."""
@@ -132,39 +132,41 @@ class Screen:
         if "constraint.alpha" in self.gains and not pid.is_stable(**c):
             return -1.0
         least = math.inf
-        for name, m in self._each(gains):
+        for name, m in self._margins_of_parts(gains):
             if not m.stable:
                 return -1.0
-            least = min(least, _ratio(m, self.own[name]) - self.share * (1 - _ROUNDING))
+            least = min(least, _least_ratio(m, self.own[name]) - self.share * (1 - _ROUNDING))
             if least < 0:
                 break
         return min(least, 1.0)
 
-    def _each(self, gains: Gains) -> Iterator[tuple[str, Margins]]:
+    def _margins_of_parts(self, gains: Gains) -> Iterator[tuple[str, Margins]]:
         """Margins of all parts, with the name of the law of each."""
-        given = self.gains | gains
-        Q = [given.get(f"tracking.Q.{k}", self.mission.tracking.Q[k - 1]) for k in (1, 2)]
+        combined = self.gains | gains
+        Q = [combined.get(f"tracking.Q.{k}", self.mission.tracking.Q[k - 1]) for k in (1, 2)]
         k1, k2 = lqr.double_integrator_gains(Q, self.mission.tracking.R)
-        new: dict[str, Any] = {"k1": k1, "k2": k2, "ki": given.get("tracking.integral", 0.0)}
+        new: dict[str, Any] = {"k1": k1, "k2": k2, "ki": combined.get("tracking.integral", 0.0)}
         if "constraint.alpha" in self.gains:
-            new |= {key: given.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")}
+            new |= {
+                key: combined.get(f"constraint.{key}", 0.0) for key in ("alpha", "beta", "gamma")
+            }
         for part in self.parts:
             yield part.name, margins([part.loop], replace(part.law, **new), part.growth)
 
 
-def _distinct(laws: Sequence[tuple[str, Looped]]) -> list[_Part]:
+def _distinct_parts(laws: Sequence[tuple[str, Looped]]) -> list[_Part]:
     """The distinct parts of all loops: most shapes have the same, and what decays on the longest way counts."""
-    found: dict[object, _Part] = {}
+    parts: dict[object, _Part] = {}
     for name, looped in laws:
         for loop in looped.loops:
             rounded = ((np.round(x, 9) + 0.0).tobytes() for x in (loop.S, loop.Q, loop.P))
             key = (name, *rounded, loop.channels, looped.law)
-            if key not in found or looped.growth < found[key].growth:
-                found[key] = _Part(name, loop, looped.law, looped.growth)
-    return sorted(found.values(), key=lambda part: part.loop.S.size)  # the quick ones first
+            if key not in parts or looped.growth < parts[key].growth:
+                parts[key] = _Part(name, loop, looped.law, looped.growth)
+    return sorted(parts.values(), key=lambda part: part.loop.S.size)  # the quick ones first
 
 
-def _smaller(a: Margins, b: Margins) -> Margins:
+def _smaller_margins(a: Margins, b: Margins) -> Margins:
     """The smaller margins of two loops."""
     if not (a.stable and b.stable):
         return Margins(stable=False)
@@ -172,7 +174,7 @@ def _smaller(a: Margins, b: Margins) -> Margins:
     return Margins(True, gain, min(a.phase, b.phase), min(a.delay, b.delay))
 
 
-def _ratio(now: Margins, was: Margins) -> float:
+def _least_ratio(now: Margins, was: Margins) -> float:
     """The least ratio of margins to those that were, at most 1; 1 if that was unstable."""
     if not was.stable:
         return 1.0
@@ -183,23 +185,23 @@ def _ratio(now: Margins, was: Margins) -> float:
 
 
 def feasible_points(
-    space: Space, slack: Callable[[Gains], float], count: int, rng: np.random.Generator
+    space: GainSpace, slack: Callable[[Gains], float], count: int, rng: np.random.Generator
 ) -> Floats:
     """Points (count, D) whose gains are not refused: the mission's own, and random ones.
 
     Where margins refuse `_TRIES` points in a row, the next one is drawn towards the mission's own gains.
     """
     start = space.start
-    found = [start]
-    while len(found) < count:
+    points = [start]
+    while len(points) < count:
         for _ in range(_TRIES):
             x = rng.random(len(start))
             if slack(space.gains(x)) >= 0:
                 break
         while slack(space.gains(x)) < 0 and np.abs(x - start).max() > 1e-3:
             x = start + 0.7 * (x - start)
-        found.append(x)
-    return np.array(found)
+        points.append(x)
+    return np.array(points)
 
 
 # -- in a file ---------------------------------------------------------------------------------------
@@ -212,7 +214,7 @@ def with_gains(text: str, gains: Gains) -> str:
     new = text
     for table, key, value in _entries(document, gains):
         wanted.setdefault(table, {})[key] = value
-        new = _with_line(new, table, key, to_toml({key: value}).strip())
+        new = _replace_line(new, table, key, to_toml({key: value}).strip())
     try:
         same = tomllib.loads(new) == wanted
     except tomllib.TOMLDecodeError:
@@ -233,7 +235,7 @@ def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str,
         yield "tracking", "Q", [float(q) for q in Q]
 
 
-def _with_line(text: str, table: str, key: str, line: str) -> str:
+def _replace_line(text: str, table: str, key: str, line: str) -> str:
     """The text with ``line`` in place of a key's, below the table's header, or in a new table at the end."""
     lines = text.splitlines()
     head = re.compile(rf"\s*\[\s*{table}\s*\]\s*(#.*)?")
@@ -245,7 +247,7 @@ def _with_line(text: str, table: str, key: str, line: str) -> str:
         if lines[k].lstrip().startswith("["):
             break
         last = k if lines[k].strip() and not lines[k].lstrip().startswith("#") else last
-        if found := re.fullmatch(rf"\s*{key}\s*=[^#]*?(\s*#.*)?", lines[k]):
-            lines[k] = line + (found[1] or "")
+        if entry := re.fullmatch(rf"\s*{key}\s*=[^#]*?(\s*#.*)?", lines[k]):
+            lines[k] = line + (entry[1] or "")
             return "\n".join([*lines, ""])
     return "\n".join([*lines[: last + 1], line, *lines[last + 1 :], ""])

@@ -32,7 +32,7 @@ from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
 from rigidfleet.sweep.workers import Pool, processes
-from rigidfleet.tuning.gains import Gains, Screen, Space, feasible_points, own_gains, with_gains
+from rigidfleet.tuning.gains import Gains, GainSpace, Screen, feasible_points, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown, Tuned
 from rigidfleet.typing import Floats
 
@@ -108,38 +108,40 @@ def tune(
     KeyboardInterrupt
         On Ctrl-C. What was flown is kept, and the same call goes on.
     """
-    given = as_mission(mission)
-    flown = given.rewritten(_merged(given.to_dict(), assume or {}))
+    own_mission = as_mission(mission)
+    flown = own_mission.rewritten(_merge(own_mission.to_dict(), assume or {}))
     paths = _seed_paths(flown)
     seeds, validation = (seeds, validation) if paths else (1, 0)
-    if objective == "shape" and True not in _tracks(flown):
+    if objective == "shape" and True not in _tracking_of_phases(flown):
         objective = "shape-forces"
     options = {
         "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
         "margin_share": margin_share,
     }  # fmt: skip
-    _check(flown, budget, options)
+    _check_options(flown, budget, options)
     folder = as_path(folder)
-    claim = _Claim(folder, {"version": __version__, "mission": flown.text, **options}, given.name)
+    claim = _Claim(
+        folder, {"version": __version__, "mission": flown.text, **options}, own_mission.name
+    )
     claim.take(replace=replace)
     count = cores() if workers is None else workers
-    flights = _Flights(paths, budget, count, progress)
+    flights = _StudySweeps(paths, budget, count, progress)
     study = _Study(flown, folder, objective, budget, margin_share, seed, flights)
     with flights.stack:
-        found = study.search(range(seed, seed + seeds))
-        study.validate(found, range(seed + seeds, seed + seeds + validation))
-        chosen = found.before if found.worse else found.after
-        found.text = with_gains(given.text, chosen.gains)
-    claim.write(found)
-    return found
+        tuned = study.search(range(seed, seed + seeds))
+        study.validate(tuned, range(seed + seeds, seed + seeds + validation))
+        chosen = tuned.before if tuned.worse else tuned.after
+        tuned.text = with_gains(own_mission.text, chosen.gains)
+    claim.write(tuned)
+    return tuned
 
 
-def _tracks(mission: Mission) -> set[bool]:
+def _tracking_of_phases(mission: Mission) -> set[bool]:
     """Whether phases track slots: what is true of any of them."""
     return {phase.control == "tracking" for phase in mission.phases}
 
 
-def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
+def _check_options(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
     """Refuse wrong options, and missions in which there is nothing to tune."""
     if options["objective"] not in OBJECTIVES:
         known = ", ".join(OBJECTIVES)
@@ -162,7 +164,7 @@ def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
             f"{mission.name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
         )
     slots = options["objective"] != "shape-forces"
-    if slots not in _tracks(mission):
+    if slots not in _tracking_of_phases(mission):
         which, other = ("no", "shape-forces") if slots else ("every", "shape")
         raise RigidfleetError(
             f"objective = {options['objective']!r}: {which} phase of {mission.name} tracks slots. Use {other}."
@@ -174,14 +176,14 @@ def _check(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
         )
 
 
-def _merged(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any]:
+def _merge(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any]:
     """A document with some of its keys replaced; tables are merged."""
-    found = dict(document)
+    merged = dict(document)
     for key, value in assume.items():
-        there = found.get(key)
+        there = merged.get(key)
         both = isinstance(there, dict) and isinstance(value, Mapping)
-        found[key] = _merged(there, value) if both else value
-    return found
+        merged[key] = _merge(there, value) if both else value
+    return merged
 
 
 def _seed_paths(mission: Mission) -> list[str]:
@@ -198,7 +200,7 @@ def _seed_paths(mission: Mission) -> list[str]:
     return [f"disturbances.{name}.seed" for name, acts in acting.items() if acts]
 
 
-class _Flights:
+class _StudySweeps:
     """Sweeps of a study, one after the other, by at most ``count`` processes, which end with the context ``stack``.
 
     Seeds are the same for noise, gusts and links, at their ``paths``: each draws its own numbers from them.
@@ -248,7 +250,7 @@ class _Flights:
         )  # fmt: skip
         if first and np.median(table.wall) * self.total < _WORTH:
             self.count = 1
-        return _measured(table, candidates, len(seeds))
+        return _measurements(table, candidates, len(seeds))
 
     def _processes(self) -> Pool:
         if self.pool is None:
@@ -263,17 +265,19 @@ class _Flights:
             self.progress(SweepProgress(done, self.total, flown, failed, wall, self.count))
 
 
-def _measured(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
+def _measurements(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
     """What was measured of each candidate; its flights are consecutive runs."""
-    found = []
+    measurements = []
     for k, gains in enumerate(candidates):
         rows = slice(k * seeds, (k + 1) * seeds)
         reasons = [reason.split(", ") for reason in table.reason[rows] if reason]
         ended = sum(not _NOT_FLOWN.isdisjoint(failed) for failed in reasons)
         failed = dict(Counter(reason for failed in reasons for reason in failed).most_common())
         values = {name: table.metrics[name][rows].tolist() for name in OBJECTIVES.values()}
-        found.append(Flown(gains, int(table.passed[rows].sum()), ended, seeds, values, failed))
-    return found
+        measurements.append(
+            Flown(gains, int(table.passed[rows].sum()), ended, seeds, values, failed)
+        )
+    return measurements
 
 
 class _SpentError(Exception):
@@ -291,12 +295,12 @@ class _Study:
         budget: int,
         margin_share: float,
         seed: int,
-        flights: _Flights,
+        flights: _StudySweeps,
     ) -> None:
         self.mission, self.folder, self.objective = mission, folder, objective
         self.budget, self.seed, self.flights = budget, seed, flights
         self.screen = Screen(mission, margin_share)
-        self.space = Space(self.screen.gains)
+        self.space = GainSpace(self.screen.gains)
         #: Candidates that were flown, and slack of the margins of all that were proposed.
         self.flown: dict[tuple[float, ...], Flown] = {}
         self.slacks: dict[tuple[float, ...], float] = {}
@@ -332,24 +336,24 @@ class _Study:
             len(self.flown) * len(seeds), len(self.flown), refused,
         )  # fmt: skip
 
-    def validate(self, found: Tuned, seeds: range) -> None:
+    def validate(self, tuned: Tuned, seeds: range) -> None:
         """Fly the mission's own gains and the best ones on seeds that the search has not seen."""
         if not seeds:
             return
         every, judged = list(self.flown), []
-        pair = {_key(f.gains): f.gains for f in (found.before, found.after)}
+        pair = {_gain_values(f.gains): f.gains for f in (tuned.before, tuned.after)}
         self.flights.total = self.flights.done + len(pair) * len(seeds)
         for key, gains in pair.items():
             folder = self.folder / _VALIDATION / f"{every.index(key):04}"
             judged += self.flights.fly(self.mission, [gains], seeds, folder)
-        found.validation = judged[0], judged[-1]
+        tuned.validation = judged[0], judged[-1]
 
     def _cost(self, flown: Flown) -> float:
         return cost(flown, OBJECTIVES[self.objective])
 
     def slack(self, gains: Gains) -> float:
         """Slack of the margins; computed once."""
-        key = _key(gains)
+        key = _gain_values(gains)
         if key not in self.slacks:
             self.slacks[key] = self.screen.slack(gains)
         return self.slacks[key]
@@ -357,20 +361,20 @@ class _Study:
     def _costs(self, points: Iterable[Floats], seeds: range) -> list[float]:
         """Costs of a generation."""
         every = [self.space.gains(x) for x in points]
-        new = {_key(g): g for g in every if _key(g) not in self.flown}
+        new = {_gain_values(g): g for g in every if _gain_values(g) not in self.flown}
         if (len(self.flown) + len(new)) * len(seeds) > self.budget:
             raise _SpentError
         if new:
             self._fly(list(new.values()), seeds)
-        return [self._cost(self.flown[_key(g)]) for g in every]
+        return [self._cost(self.flown[_gain_values(g)]) for g in every]
 
     def _fly(self, candidates: list[Gains], seeds: range) -> list[Flown]:
         """Fly new candidates as the next round."""
         folder = self.folder / _ROUNDS / f"{self.rounds:03}"
-        found = self.flights.fly(self.mission, candidates, seeds, folder)
+        flown = self.flights.fly(self.mission, candidates, seeds, folder)
         self.rounds += 1
-        self.flown |= {_key(f.gains): f for f in found}
-        return found
+        self.flown |= {_gain_values(f.gains): f for f in flown}
+        return flown
 
 
 def cost(flown: Flown, metric: str) -> float:
@@ -380,7 +384,7 @@ def cost(flown: Flown, metric: str) -> float:
     return float(np.minimum(errors, _FAILED).mean()) + _FAILED * failed + _ENDED * flown.ended
 
 
-def _key(gains: Gains) -> tuple[float, ...]:
+def _gain_values(gains: Gains) -> tuple[float, ...]:
     return tuple(gains.values())
 
 
@@ -417,11 +421,11 @@ class _Claim:
         if not before:
             self._write({"definition": self.definition})
 
-    def write(self, found: Tuned) -> None:
+    def write(self, tuned: Tuned) -> None:
         """Write the result of the study, and the tuned mission."""
-        write_file(self.tuned, found.text.encode())
-        found.file = self.tuned
-        self._write({"definition": self.definition, **found.to_dict(), "text": found.text})
+        write_file(self.tuned, tuned.text.encode())
+        tuned.file = self.tuned
+        self._write({"definition": self.definition, **tuned.to_dict(), "text": tuned.text})
 
     def _before(self) -> dict[str, Any]:
         """What is in the folder."""

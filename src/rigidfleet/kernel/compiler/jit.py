@@ -87,7 +87,7 @@ def _copy(function: FunctionType, name: str, instead: dict[str, Any]) -> Functio
     return copy
 
 
-class _Place(UserProvidedCacheLocator):
+class _CacheFolder(UserProvidedCacheLocator):
     """The cache folder of a function: that of the kernel."""
 
     def __init__(self, function: FunctionType) -> None:
@@ -106,7 +106,7 @@ class _Form(CompileResultCacheImpl):
 
     def __init__(self, function: FunctionType) -> None:
         self._lineno = function.__code__.co_firstlineno
-        self._locator = _Place(function)
+        self._locator = _CacheFolder(function)
         name = f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"
         self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
 

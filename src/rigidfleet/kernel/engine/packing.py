@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import Avoidance, avoidance
+from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance
 from rigidfleet.kernel.measured import (
     Measured,
     Nearest,
-    Spectrum,
+    SingularValues,
     measurement_of,
     nearest_of,
     spectrum_of,
@@ -238,13 +238,13 @@ def examples() -> tuple[
     Segment,
     Record,
     Monitor,
-    fleet.Flight,
+    fleet.SampledFlight,
     fleet.SampledState,
     fleet.SampledSegment,
     fleet.Evaluation,
-    Avoidance,
+    AvoidanceArrays,
     Measured,
-    Spectrum,
+    SingularValues,
     Nearest,
     Recursion,
 ]:
@@ -269,7 +269,7 @@ def examples() -> tuple[
     nowhere = np.zeros((0, 6))
     watching = monitor(one, nowhere, nowhere, 6, 3)
     work = kernel_workspace(1, 0)
-    vehicles = fleet.quadrotors([fleet.Vehicle(1.0, point=True)])
+    vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)])
     flight = fleet.flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
     rotors, rows = np.zeros((1, 4)), np.zeros((0, 1, 3))

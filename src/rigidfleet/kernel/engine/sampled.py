@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet.kernel.avoidance import Avoidance
+from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.packing import UNRECORDED, Packed, pack, pack_anew
-from rigidfleet.kernel.fleet import ENDLESS, Evaluation, Flight, SampledSegment, SampledState
+from rigidfleet.kernel.fleet import ENDLESS, Evaluation, SampledFlight, SampledSegment, SampledState
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import Segment
 from rigidfleet.typing import Floats
@@ -19,10 +19,10 @@ from rigidfleet.typing import Floats
 def fly_ticks(
     problem: Problem,
     workspace: Workspace,
-    flight: Flight,
+    flight: SampledFlight,
     state: SampledState,
     segment: SampledSegment,
-    avoidance: Avoidance | None = None,
+    avoidance: AvoidanceArrays | None = None,
 ) -> int:
     """Fly to the end of the segment, see `rigidfleet.kernel.sampled_flight.fly_ticks`.
 
@@ -38,7 +38,7 @@ def fly_ticks(
     return native.sampled_library().fly_ticks(*(a.address for a in _last.packed[:5]))
 
 
-class _Last(threading.local):
+class _LastCall(threading.local):
     """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
 
     def __init__(self) -> None:
@@ -46,16 +46,16 @@ class _Last(threading.local):
         self.packed: tuple[Packed, ...] = ()
 
 
-_last = _Last()
+_last = _LastCall()
 
 
 def _pack(
     problem: Problem,
     workspace: Workspace,
-    flight: Flight,
+    flight: SampledFlight,
     state: SampledState,
     segment: SampledSegment,
-    avoidance: Avoidance | None,
+    avoidance: AvoidanceArrays | None,
 ) -> tuple[Packed, ...]:
     """The arguments of the machine code, and what they point to."""
     work = state.work
@@ -82,9 +82,9 @@ def _pack(
 def avoid(
     problem: Problem,
     workspace: Workspace,
-    flight: Flight,
+    flight: SampledFlight,
     state: SampledState,
-    avoidance: Avoidance,
+    avoidance: AvoidanceArrays,
 ) -> int:
     """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
     kept = _of(avoidance, problem, workspace)
@@ -93,13 +93,13 @@ def avoid(
     )
 
 
-def _of(avoidance: Avoidance, problem: Problem, workspace: Workspace) -> Packed:
+def _of(avoidance: AvoidanceArrays, problem: Problem, workspace: Workspace) -> Packed:
     """Avoidance that knows the law whose forces it changes."""
     avoidance.law[:] = pack(problem).address, pack(workspace).address
     return pack(avoidance)
 
 
-def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
+def _check(flight: SampledFlight, state: SampledState, workspace: Workspace) -> None:
     """Refuse arrays too short for what the machine code reads.
 
     Raises
@@ -129,7 +129,7 @@ def _check(flight: Flight, state: SampledState, workspace: Workspace) -> None:
 
 
 def derivatives(
-    flight: Flight,
+    flight: SampledFlight,
     S: Floats,
     command: Floats,
     air: Floats | None = None,

@@ -43,7 +43,7 @@ class Archive:
         self.phases: dict[tuple[int, int], ArchivedPhase] = {}  # by phase and number of edges
         self.size = 0.0
 
-    def add(self, pieces: Sequence[Piece], told: Result) -> None:
+    def add(self, pieces: Sequence[Piece], record: Result) -> None:
         """Store the samples of a tick; ``told`` is the record of its end."""
         for piece in pieces:
             key = (piece.phase, len(piece.edges))
@@ -53,35 +53,35 @@ class Archive:
             keep[0] |= fresh
             if keep.any():
                 archived.pieces.append(rows(piece, keep))
-                self.size += _numbers(archived.pieces[-1])
+                self.size += _count_numbers(archived.pieces[-1])
             if len(archived.pieces) >= _JOINED and len(archived.pieces[-1].time) < _JOINED:
-                archived.pieces = _joined(archived.pieces)
+                archived.pieces = _as_one(archived.pieces)
         if pieces:
-            self._note(self.phases[pieces[-1].phase, len(pieces[-1].edges)], told)
+            self._note(self.phases[pieces[-1].phase, len(pieces[-1].edges)], record)
         while self.size > self.most:
             self._thin()
 
     def pieces(self) -> list[Piece]:
         """All stored samples, in order of time."""
-        found = []
+        pieces_by_phase = []
         for archived in self.phases.values():
             extra = [archived.last, *(piece for _, piece in archived.worst.values())]
             pieces = [*archived.pieces, *(piece for piece in extra if piece is not None)]
-            found.append(_sorted(_join(pieces)))
-        return found
+            pieces_by_phase.append(_in_order(_join(pieces)))
+        return pieces_by_phase
 
     def begun(self, phase: int) -> bool:
         """Whether there is a sample of a phase."""
         return any(key[0] == phase for key in self.phases)
 
-    def _note(self, archived: ArchivedPhase, told: Result) -> None:
+    def _note(self, archived: ArchivedPhase, record: Result) -> None:
         """Keep the moment of a tick's end if it is a worst one of its phase."""
         assert archived.last is not None
         worst = {
-            "separation": -float(told.separation[-1]),
-            "clearance": -float(told.clearance[-1]),
-            "thrust": float(np.max(told.thrust[-1])),
-            "speed": float(np.linalg.norm(told.velocity[-1], axis=1).max()),
+            "separation": -float(record.separation[-1]),
+            "clearance": -float(record.clearance[-1]),
+            "thrust": float(np.max(record.thrust[-1])),
+            "speed": float(np.linalg.norm(record.velocity[-1], axis=1).max()),
         }
         for name, value in worst.items():
             if value > archived.worst.get(name, (-np.inf, None))[0]:
@@ -97,15 +97,15 @@ class Archive:
         self.step *= 2.0
         self.size = 0.0
         for archived in self.phases.values():
-            pieces = _joined(archived.pieces)
+            pieces = _as_one(archived.pieces)
             keep = self._even(pieces[0].time)
             keep[0] = True  # the start
             archived.pieces = [rows(pieces[0], keep)]
-            self.size += _numbers(archived.pieces[0])
+            self.size += _count_numbers(archived.pieces[0])
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
 
-def _numbers(piece: Piece) -> float:
+def _count_numbers(piece: Piece) -> float:
     arrays = (
         *piece.record,
         piece.integral,
@@ -118,22 +118,22 @@ def _numbers(piece: Piece) -> float:
 
 def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
-    return _made([piece], lambda x: x[0][which])
+    return _combine([piece], lambda x: x[0][which])
 
 
-def _joined(pieces: list[Piece]) -> list[Piece]:
+def _as_one(pieces: list[Piece]) -> list[Piece]:
     return [_join(pieces)] if len(pieces) > 1 else pieces
 
 
 def _join(pieces: list[Piece]) -> Piece:
     """Pieces of one phase as one."""
-    return _made(pieces, np.concatenate)
+    return _combine(pieces, np.concatenate)
 
 
-def _made(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Piece:
+def _combine(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Piece:
     """A piece of which each ``array`` is made of those of pieces of one phase."""
 
-    def made(each: Sequence[Any]) -> Any:
+    def combine(each: Sequence[Any]) -> Any:
         if each[0] is None:
             return None
         return type(each[0])(*map(array, zip(*each, strict=True)))
@@ -143,15 +143,15 @@ def _made(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Pie
         array([getattr(p, name) for p in pieces]) for name in ("time", "integral", "frame")
     )
     record, vehicles, layers = (
-        made([getattr(p, name) for p in pieces]) for name in ("record", "vehicles", "layers")
+        combine([getattr(p, name) for p in pieces]) for name in ("record", "vehicles", "layers")
     )
-    led = tuple(led for p in pieces for led in p.followed)
+    leading = tuple(leading for p in pieces for leading in p.followed)
     return Piece(
-        first.phase, time, record, integral, frame, first.edges, first.attached, led, vehicles, layers
+        first.phase, time, record, integral, frame, first.edges, first.attached, leading, vehicles, layers
     )  # fmt: skip
 
 
-def _sorted(piece: Piece) -> Piece:
+def _in_order(piece: Piece) -> Piece:
     """The piece with its samples sorted by time, without duplicates."""
     _, first = np.unique(piece.time, return_index=True)
     return rows(piece, first.tolist())

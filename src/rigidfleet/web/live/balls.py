@@ -44,7 +44,7 @@ class Ball:
         """Its name in messages and in the record."""
         return f"ball {self.number}"
 
-    def lead(self) -> None:
+    def follow_goal(self) -> None:
         """Choose the velocity of the next tick; a ball that is drawn follows its goal."""
         if self.goal is None:
             return
@@ -58,7 +58,7 @@ class Ball:
         if not np.array_equal(velocity, self.velocity):
             self.velocity, self.changed = velocity, True
 
-    def tell(self, t: float) -> None:
+    def note_turn(self, t: float) -> None:
         """Note where its velocity changes, at t [s]."""
         if self.turns and self.turns[-1][0] >= t:
             self.turns.pop()
@@ -69,11 +69,11 @@ class Ball:
         """Move on for h [s]."""
         self.place = self.place + h * self.velocity
 
-    def ahead(self, t: float) -> obstacles.Sphere:
+    def predicted_sphere(self, t: float) -> obstacles.Sphere:
         """The obstacle from t [s] on, if nobody pushes it."""
         return self._sphere([(t, self.place), (t + 1e3, self.place + 1e3 * self.velocity)])
 
-    def flown(self, t: float) -> obstacles.Sphere:
+    def flown_sphere(self, t: float) -> obstacles.Sphere:
         """The obstacle as it was up to t [s], for the record."""
         end = t if self.until is None else self.until
         ways = [*self.turns, (end, self.place)] if end > self.turns[-1][0] + 1e-6 else self.turns
@@ -82,7 +82,7 @@ class Ball:
     def _sphere(self, ways: list[tuple[float, Floats]]) -> obstacles.Sphere:
         if len(ways) == 1:
             ways = [*ways, (ways[0][0] + 1.0, ways[0][1])]
-        given: dict[str, Any] = {} if self.until is None else {"vanishes": self.until}
+        vanishing: dict[str, Any] = {} if self.until is None else {"vanishes": self.until}
         return obstacles.Sphere(
             kind="sphere",
             name=self.name,
@@ -90,5 +90,5 @@ class Ball:
             waypoints=tuple(tuple(place.tolist()) for _, place in ways),
             times=tuple(float(t) for t, _ in ways),
             appears=self.since,
-            **given,
+            **vanishing,
         )

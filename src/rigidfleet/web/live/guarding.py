@@ -16,7 +16,7 @@ _MOST = 100
 _CLEARANCE = 0.1
 
 
-def guarded(mission: Mission) -> tuple[Mission, str]:
+def with_avoidance(mission: Mission) -> tuple[Mission, str]:
     """The mission with [avoidance], and why not if that is impossible.
 
     Points fly as vehicles of the model "point", with the same mass, thrust limit and drag. The mission's text then has
@@ -48,12 +48,14 @@ def _as_vehicles(mission: Mission, data: dict[str, Any]) -> dict[str, Any]:
     """Tables in which the points of a mission are vehicles of their own."""
     kinds: dict[tuple[float, ...], str] = {}
     names = []
-    for given in zip(mission.agents.mass, mission.agents.thrust_limit, mission.drag, strict=True):
-        names.append(kinds.setdefault(given, f"point {len(kinds) + 1}"))
+    for properties in zip(
+        mission.agents.mass, mission.agents.thrust_limit, mission.drag, strict=True
+    ):
+        names.append(kinds.setdefault(properties, f"point {len(kinds) + 1}"))
     agents = {
         k: x for k, x in data["agents"].items() if k not in ("mass", "thrust_limit", "saturate")
     }
-    found: dict[str, Any] = {
+    tables: dict[str, Any] = {
         "agents": agents | {"vehicle": names},
         "vehicles": {
             name: {"model": "point", "mass": mass, "thrust_limit": float(limit), "drag": float(drag)}
@@ -61,5 +63,5 @@ def _as_vehicles(mission: Mission, data: dict[str, Any]) -> dict[str, Any]:
         },
     }  # fmt: skip
     if "disturbances" in data:
-        found["disturbances"] = {k: x for k, x in data["disturbances"].items() if k != "drag"}
-    return found
+        tables["disturbances"] = {k: x for k, x in data["disturbances"].items() if k != "drag"}
+    return tables

@@ -42,7 +42,7 @@ _LOOK = 0.1  # greatest way of the target between two looks at obstacles [m]
 
 
 @dataclass
-class Target:
+class PilotTarget:
     """The target pose of the body, and its commanded rates."""
 
     r: Floats  # (3,) [m]
@@ -106,7 +106,9 @@ class Pilot:
         self.mission = mission
         self.masses = mission.fleet.mass
         self.archive = Archive(max(mission.output_step, _FINEST))
-        self.flight = Flight(mission, force=self._wind, sampler=self._samples, flips=True)
+        self.flight = Flight(
+            mission, force=self._wind_force, sampler=self._sample_times, flips=True
+        )
         self.gusts: list[Gust] = []
         self.gusted = False  # whether there was any
         self.balls: list[Ball] = []
@@ -116,12 +118,14 @@ class Pilot:
         self.waiting: str | None = None
         self.by_body = mission.architecture == "body"
         self.fastest = 0.7 * mission.limits.speed if mission.limits.speed else math.inf
-        self.asked: list[Phase] = []  # each phase as it was begun
+        self.commanded: list[Phase] = []  # each phase as it was begun
         self.ticks = 0
-        self._take(self._first(), establish=True)
+        self._begin_formation(self._first_formation(), establish=True)
         self.pose = self._reference()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
-        self.target = Target(self._up(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1])
+        self.target = PilotTarget(
+            self._raised(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1]
+        )
         self.last: Result | None = None
 
     @property
@@ -147,7 +151,7 @@ class Pilot:
     @property
     def busy(self) -> bool:
         """Whether the formation is changing."""
-        phase, settle = self.asked[-1], 0.0
+        phase, settle = self.commanded[-1], 0.0
         if phase.control == "open":
             settle = _STEADY
         blend = phase.shaping.least_time if phase.shaping is not None else 0.0
@@ -175,7 +179,7 @@ class Pilot:
         far = float(np.linalg.norm(slots - before, axis=1).max())
         share = np.linspace(0.0, 1.0, math.ceil(far / _LOOK) + 2)[1:, None, None]
         way = before + share * (slots - before)  # straight and in step
-        room, agent, which = self._room(self.target.r + way @ self.target.attitude)
+        room, agent, which = self._least_room(self.target.r + way @ self.target.attitude)
         k = int(room.argmin())
         if formation != self.formation and room[k] < 0.0:
             name = self.at_rest[which[k]].name
@@ -190,7 +194,7 @@ class Pilot:
             return
         d = direction / np.linalg.norm(direction)
         self.gusted = True
-        self.gusts.append(Gust(self.t, float((self._places() @ d).min()), d, strength))
+        self.gusts.append(Gust(self.t, float((self._positions() @ d).min()), d, strength))
 
     def push_in(self, place: Floats, radius: float, velocity: Floats) -> Ball:
         """Add a ball at ``place`` (3,) [m] that flies with a constant velocity (3,) [m/s].
@@ -212,7 +216,9 @@ class Pilot:
             )
         if speed > balls.FASTEST:
             raise ValueError(f"a ball flies at up to {balls.FASTEST:g} m/s, not {speed:.3g} m/s")
-        away = np.linalg.norm(self._places() - place, axis=1) - self.mission.fleet.radius - radius
+        away = (
+            np.linalg.norm(self._positions() - place, axis=1) - self.mission.fleet.radius - radius
+        )
         i = int(away.argmin())
         if away[i] < balls.ROOM:
             raise ValueError(
@@ -267,18 +273,18 @@ class Pilot:
         self.ticks += 1
         if not self.busy:
             if self.waiting is not None:
-                self._take(self.waiting)
+                self._begin_formation(self.waiting)
                 self.waiting = None
-            elif self.asked[-1].control == "open":
-                self._hold()
+            elif self.commanded[-1].control == "open":
+                self._begin_hold()
         if not flight.ending:
-            self._follow(TICK)
-            self._push()
+            self._follow_target(TICK)
+            self._update_obstacles()
             t = self.t
             flight.advance(self.ticks * TICK - t)
             for ball in self.flying:
                 ball.move(self.t - t)
-            self._touch()
+            self._end_on_contact()
         if flight.pieces or self.last is None:
             end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
             # A record of one moment has no extremes
@@ -299,12 +305,12 @@ class Pilot:
         if not ending and self.busy:
             ending = f"ended by hand on the way to '{self.formation}'"
         now = self.flight.mission.obstacles
-        flown = [ball.flown(self.t) for ball in self.balls if ball.turns]
+        flown = [ball.flown_sphere(self.t) for ball in self.balls if ball.turns]
         self.flight.mission = self.flight.mission.model_copy(
             update={"obstacles": (*self.mission.obstacles, *flown)}
         )
         result = self.flight.record(
-            self.archive.pieces(), self.asked, step=self.archive.step, ending=ending
+            self.archive.pieces(), self.commanded, step=self.archive.step, ending=ending
         )
         self.flight.mission = self.flight.mission.model_copy(update={"obstacles": now})
         if not self.gusted:
@@ -314,31 +320,31 @@ class Pilot:
 
     # -- phases -----------------------------------------------------------------------------------
 
-    def _first(self) -> str:
+    def _first_formation(self) -> str:
         names = [p.shaping.formation for p in self.mission.phases if p.shaping is not None]
         return next((n for n in names if n in self.formations), self.formations[0])
 
-    def _take(self, formation: str, *, establish: bool = False) -> None:
+    def _begin_formation(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
         common: dict[str, Any] = {"formation": formation, "blend": _BLEND, "duration": _ENDLESS}
         if establish:
             common["control"] = "open" if self.by_body else "tracking"
-            self._begin(Establish(kind="establish", name=f"establish {formation}", **common))
+            self._begin_phase(Establish(kind="establish", name=f"establish {formation}", **common))
         else:
             common["control"] = "body" if self.by_body else "tracking"
-            self._begin(Reshape(kind="reshape", name=f"change to {formation}", **common))
+            self._begin_phase(Reshape(kind="reshape", name=f"change to {formation}", **common))
 
-    def _hold(self) -> None:
-        self._begin(Hold(kind="hold", name="by hand", duration=_ENDLESS, control="body"))
+    def _begin_hold(self) -> None:
+        self._begin_phase(Hold(kind="hold", name="by hand", duration=_ENDLESS, control="body"))
         if not self.ending:
             self.pose = self.flight.pose()
             self.a, self.alpha = np.zeros(3), np.zeros(3)
 
-    def _begin(self, phase: Phase) -> None:
+    def _begin_phase(self, phase: Phase) -> None:
         if self.flight.begin(phase):
-            self.asked.append(phase)
+            self.commanded.append(phase)
 
-    def _samples(self, _plan: PhasePlan, t: float, t_end: float, **_: Any) -> Floats:
+    def _sample_times(self, _plan: PhasePlan, t: float, t_end: float, **_: Any) -> Floats:
         """Multiples of the archive's step in (t, t_end], the end, and the start of a phase."""
         step = self.archive.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
@@ -347,7 +353,7 @@ class Pilot:
         start = [] if begun else [t and np.nextafter(t, math.inf)]
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 
-    def _places(self) -> Floats:
+    def _positions(self) -> Floats:
         """Positions (N, 3) [m] of the vehicles."""
         return self.flight.observe().position
 
@@ -364,7 +370,7 @@ class Pilot:
         cm, v = self.masses @ seen.position / total, self.masses @ seen.velocity / total
         return Pose(cm, v, frame if frame is not None else np.eye(3), np.zeros(3))
 
-    def _up(self, r: Floats) -> Floats:
+    def _raised(self, r: Floats) -> Floats:
         """A point (3,) [m] at or above ``r``, high enough for the first formation to rotate about it."""
         slots = self.flight.plan.slots
         assert slots is not None  # every formation flown has slots
@@ -372,15 +378,15 @@ class Pilot:
         ground = float(self.mission.height_at(*r))
         return np.array([r[0], r[1], max(r[2], ground + size + 0.5)])
 
-    def _follow(self, h: float) -> None:
+    def _follow_target(self, h: float) -> None:
         """Move the target as commanded, and the reference after it, over the next tick."""
         target, pose = self.target, self.pose
         if self.t - target.held <= _GRIP:
-            self._shift(h)
+            self._move_target(h)
         away = att.rotation_vector_from_dcm(target.attitude @ pose.T.T)  # body axes
-        r, v, a = _pulled(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
-        phi, omega, alpha = _pulled(away, pose.omega, self.alpha, h, _TURN)
-        if self.asked[-1].control != "open":
+        r, v, a = _step_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
+        phi, omega, alpha = _step_towards(away, pose.omega, self.alpha, h, _TURN)
+        if self.commanded[-1].control != "open":
             self.flight.steer(
                 h,
                 pose,
@@ -388,21 +394,23 @@ class Pilot:
                 (phi, omega, alpha),
                 a=self.a,
                 alpha=self.alpha,
-                force=self._windy(),
+                force=self._drop_passed_gusts(),
             )
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)
             self.a, self.alpha = a, alpha
 
-    def _shift(self, h: float) -> None:
+    def _move_target(self, h: float) -> None:
         """Move and turn the target as commanded, but no slot deeper into an obstacle or the ground."""
         target, held_off = self.target, ""
         turned = target.euler + h * target.turn
         turned[1] = np.clip(turned[1], -1.2, 1.2)  # clear of the poles
-        room, _, _ = self._room(self._slots_at(target.r[None], target.attitude))
+        room, _, _ = self._least_room(self._slots_at(target.r[None], target.attitude))
         least = min(float(room[0]), 0.0)
         if target.turn.any():
-            after, _, which = self._room(self._slots_at(target.r[None], att.dcm_from_euler(turned)))
+            after, _, which = self._least_room(
+                self._slots_at(target.r[None], att.dcm_from_euler(turned))
+            )
             if after[0] >= least:
                 target.euler = turned
             else:
@@ -414,7 +422,7 @@ class Pilot:
             if not looks:
                 continue
             path = target.r + np.linspace(0.0, 1.0, looks + 1)[1:, None] * part
-            after, _, which = self._room(self._slots_at(path, target.attitude))
+            after, _, which = self._least_room(self._slots_at(path, target.attitude))
             if (after >= least).all():
                 target.r = target.r + part
                 if k == 0:
@@ -423,7 +431,7 @@ class Pilot:
                 held_off = self.at_rest[which[int(after.argmin())]].name
         self.held_off = held_off
 
-    def _room(self, places: Floats) -> tuple[Floats, Ints, Ints]:
+    def _least_room(self, places: Floats) -> tuple[Floats, Ints, Ints]:
         """Least room (K,) [m] of vehicles at places (K, N, 3) beside obstacles at rest, agent and obstacle (K,)."""
         return proximity.clearance(places, self.mission.fleet.radius, self.at_rest)
 
@@ -435,22 +443,22 @@ class Pilot:
 
     # -- obstacles --------------------------------------------------------------------------------
 
-    def _push(self) -> None:
+    def _update_obstacles(self) -> None:
         """Tell the flight of balls that are new, gone, or fly another way."""
         for ball in self.flying:
-            ball.lead()
+            ball.follow_goal()
         fresh = [ball for ball in self.flying if ball.changed]
         for ball in fresh:
-            ball.tell(self.t)
+            ball.note_turn(self.t)
         if fresh or self.moved:
             self.moved = False
             seen = [
-                ball.ahead(self.t) if ball.until is None else ball.flown(self.t)
+                ball.predicted_sphere(self.t) if ball.until is None else ball.flown_sphere(self.t)
                 for ball in self.balls
             ]
             self.flight.among((*self.mission.obstacles, *seen))
 
-    def _touch(self) -> None:
+    def _end_on_contact(self) -> None:
         """End the flight if a vehicle has met an obstacle."""
         met = None if self.flight.ending else self.flight.contact()
         if met is not None:
@@ -459,11 +467,11 @@ class Pilot:
 
     # -- wind -------------------------------------------------------------------------------------
 
-    def _windy(self) -> bool:
+    def _drop_passed_gusts(self) -> bool:
         """Remove gusts that have passed; return whether one remains."""
         if not self.gusts:
             return False
-        r, t = self._places(), self.t
+        r, t = self._positions(), self.t
         self.gusts = [
             g
             for g in self.gusts
@@ -471,14 +479,14 @@ class Pilot:
         ]
         return bool(self.gusts)
 
-    def _wind(self, t: float, r: Floats, _v: Floats) -> Floats:
+    def _wind_force(self, t: float, r: Floats, _v: Floats) -> Floats:
         force = np.zeros_like(r)
         for gust in self.gusts:
             force += gust.force(t, r, self.masses)
         return force
 
 
-def _pulled(
+def _step_towards(
     away: Floats, v: Floats, a: Floats, h: float, most: float
 ) -> tuple[Floats, Floats, Floats]:
     """Displacement over h [s], and final velocity and acceleration, of a reference drawn to a point ``away``.

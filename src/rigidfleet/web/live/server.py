@@ -103,10 +103,10 @@ class _Handler(BaseHTTPRequestHandler):
             length = int(self.headers.get("Content-Length", ""))
             if not 0 < length <= _LARGEST:
                 raise ValueError(f"a command has 1 to {_LARGEST} bytes")
-            asked = json.loads(self.rfile.read(length))
-            if not isinstance(asked, dict):
+            command = json.loads(self.rfile.read(length))
+            if not isinstance(command, dict):
                 raise ValueError("a command must be an object")
-            self.session.command(asked)
+            self.session.command(command)
         except RecursionError:
             self._answer(HTTPStatus.BAD_REQUEST, "the command is nested too deeply")
         except (ValueError, RigidfleetError) as error:
@@ -119,11 +119,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _ours(self) -> bool:
         """Whether our page sends the request, to our own address; a command also names its origin."""
-        asked, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
+        hosts_named, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
-        if len(asked) != 1 or asked[0] not in hosts or not self.path.startswith(self.base):
+        if (
+            len(hosts_named) != 1
+            or hosts_named[0] not in hosts
+            or not self.path.startswith(self.base)
+        ):
             return False
-        return origins == [f"http://{asked[0]}"] or (not origins and self.command == "GET")
+        return origins == [f"http://{hosts_named[0]}"] or (not origins and self.command == "GET")
 
     def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
         data = text.encode()

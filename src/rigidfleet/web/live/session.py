@@ -18,10 +18,10 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
-from rigidfleet.web.live.guarding import guarded
+from rigidfleet.web.live.guarding import with_avoidance
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import page, read
-from rigidfleet.web.replay.scene import describe, observe, sight, weight
+from rigidfleet.web.replay.scene import describe, observe, sight_points, weight
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -46,7 +46,7 @@ class Session:
     """
 
     def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
-        self.mission, self.unguarded = guarded(mission)
+        self.mission, self.unguarded = with_avoidance(mission)
         self.landed = landed
         self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
@@ -81,7 +81,9 @@ class Session:
                 for name, c in columns.items()
             ]
             start = self.mission.fleet.position
-            near = sight(self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND)
+            near = sight_points(
+                self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND
+            )
             info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
                 "columns": [
                     *widths,
@@ -143,7 +145,7 @@ class Session:
             if not self.pages:
                 self.left = time.monotonic()
 
-    def _tell(self, message: bytes) -> None:
+    def _send_to_pages(self, message: bytes) -> None:
         with self.lock:
             for messages in self.pages:
                 try:
@@ -151,7 +153,7 @@ class Session:
                 except queue.Full:
                     continue
 
-    def _picture(self) -> bytes:
+    def _sample_event(self) -> bytes:
         """The last sample as numbers: time and the columns of the page, one after the other."""
         target = self.pilot.target
         columns = observe(self.result, self.shown, self.tension).values()
@@ -160,21 +162,21 @@ class Session:
             *(c.values.ravel() for c in columns),
             target.r,
             att.quaternion_from_dcm(target.attitude),
-            self._balls(),
+            self._ball_numbers(),
         ]
         numbers = np.concatenate(values).astype("<f4")
         return _event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
 
-    def _balls(self) -> np.ndarray:
+    def _ball_numbers(self) -> np.ndarray:
         """Place and radius of each ball of the page; nan where there is none."""
-        found = np.full((AT_ONCE, 4), np.nan)
+        numbers = np.full((AT_ONCE, 4), np.nan)
         for ball in self.pilot.flying:
-            found[ball.slot] = *ball.place, ball.radius
-        return found.ravel()
+            numbers[ball.slot] = *ball.place, ball.radius
+        return numbers.ravel()
 
     # -- commands ---------------------------------------------------------------------------------
 
-    def command(self, asked: Mapping[str, Any]) -> None:
+    def command(self, order: Mapping[str, Any]) -> None:
         """Execute a command of a page.
 
         Raises
@@ -183,7 +185,7 @@ class Session:
             The command is unknown or invalid.
         """
         with self.lock:
-            match asked:
+            match order:
                 case {"move": move, "turn": turn}:
                     self.pilot.steer(_vector(move, _FASTEST), _vector(turn, _TURNING))
                 case {"formation": str(name)} if name in self.pilot.formations:
@@ -213,7 +215,7 @@ class Session:
                 case {"stop": True}:
                     self.stop()
                 case _:
-                    raise ValueError(f"unknown command: {json.dumps(asked)[:100]}")
+                    raise ValueError(f"unknown command: {json.dumps(order)[:100]}")
 
     def stop(self) -> None:
         """End the flight."""
@@ -224,7 +226,7 @@ class Session:
     def run(self) -> None:
         """Fly until stopped, or until the last page has been closed for a while."""
         try:
-            self._run()
+            self._fly()
         finally:
             self.stop()
             try:
@@ -243,8 +245,8 @@ class Session:
         while self.pages and time.monotonic() < end:
             time.sleep(0.02)
 
-    def _run(self) -> None:
-        told: dict[str, Any] = {}
+    def _fly(self) -> None:
+        sent: dict[str, Any] = {}
         due = measured = time.monotonic()
         flown = 0
         while not self.stopped.is_set():
@@ -258,15 +260,15 @@ class Session:
                 if self.pages and not (self.paused or self.pilot.ending):
                     self.result = self.pilot.step()
                     flown += 1
-                    self._tell(self._picture())
+                    self._send_to_pages(self._sample_event())
                 else:
                     self.pace = 1.0
                 story = self.story()
             # The end of the phase under way moves all the time; it alone is no reason to send an update.
             news = story | {"phases": len(story["phases"])}
-            if news != told:
-                told = news
-                self._tell(_event("story", json.dumps(plain(story))))
+            if news != sent:
+                sent = news
+                self._send_to_pages(_event("story", json.dumps(plain(story))))
             due = max(due + TICK / self.speed, now - _LATE)
             self.stopped.wait(max(0.0, due - time.monotonic()))
 

@@ -22,7 +22,7 @@ from rigidfleet.result.lights import has_lights, view
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import page
-from rigidfleet.web.replay.scene import describe, observe, sight, size, weight
+from rigidfleet.web.replay.scene import describe, observe, sight_points, typical_reach, weight
 
 __all__ = ["Replay", "html_page", "replay"]
 
@@ -91,7 +91,7 @@ def replay(result: Result | str | Path, path: str | Path | None = None) -> Repla
 
 def html_page(result: Result) -> str:
     """The page that `replay` writes."""
-    time, shown = _times(result), _edges(result)
+    time, shown = _page_times(result), _drawn_edges(result)
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
     scale = weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
@@ -100,7 +100,7 @@ def html_page(result: Result) -> str:
         columns = {k: c for k, c in columns.items() if k not in _SHAPES}
     described, data = pack(
         {
-            name: PackedColumn(_sampled(result, c.values, time), c.step)
+            name: PackedColumn(_interpolate(result, c.values, time), c.step)
             for name, c in columns.items()
         }
     )
@@ -115,7 +115,7 @@ def html_page(result: Result) -> str:
     return page(info, start="replay/replay.js", data=data)
 
 
-def _times(result: Result) -> Floats:
+def _page_times(result: Result) -> Floats:
     """Even times (K,) [s] from start to end, about as dense as the result if its samples are sparse."""
     first, last = float(result.time[0]), float(result.time[-1])
     gaps = np.diff(result.time)
@@ -127,7 +127,7 @@ def _times(result: Result) -> Floats:
     return np.linspace(first, last, count + 1)
 
 
-def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
+def _interpolate(result: Result, values: Floats, time: Floats) -> Floats:
     """Values (K, ...) of the result at other times, by linear interpolation between samples.
 
     Between a value and a missing one, the earlier sample counts.
@@ -143,7 +143,7 @@ def _sampled(result: Result, values: Floats, time: Floats) -> Floats:
     return np.where(np.isfinite(between), between, np.where(share < 1.0, low, high))
 
 
-def _edges(result: Result) -> Ints:
+def _drawn_edges(result: Result) -> Ints:
     """Indices of the edges drawn: all, or the shortest if there are too many."""
     if len(result.edges) <= _EDGES:
         return np.arange(len(result.edges))
@@ -154,8 +154,8 @@ def _edges(result: Result) -> Ints:
 def _story(result: Result, time: Floats) -> dict[str, Any]:
     """Information on the page about a finished flight."""
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
-    extent, reach = float(np.linalg.norm(high - low)) / 2, size(result)
-    seen = sight(result.mission, low, high, float(result.time[0]), float(result.time[-1]))
+    extent, reach = float(np.linalg.norm(high - low)) / 2, typical_reach(result)
+    seen = sight_points(result.mission, low, high, float(result.time[0]), float(result.time[-1]))
     least, most = seen.min(axis=0), seen.max(axis=0)
     way = (result.cm[-1] - result.cm[0])[:2]
     far = float(np.linalg.norm(way)) > 2 * reach

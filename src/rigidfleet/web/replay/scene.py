@@ -80,18 +80,18 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
     """Samples for the page, at the result's times; ``shown`` are the edges drawn."""
     mission = result.mission
     # Fine enough for a vehicle that fills the screen.
-    fine = max(size(result), *mission.agents.radius, 1e-9) / 20_000
+    fine = max(typical_reach(result), *mission.agents.radius, 1e-9) / 20_000
     return {
         "position": PackedColumn(result.position, fine),
-        **_turned(result),
-        **_avoiding(result),
-        **_lit(result),
+        **_attitude_columns(result),
+        **_avoidance_columns(result),
+        **_light_columns(result),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
         "reference": PackedColumn(result.attitude_reference, 1e-4),
         "tension": PackedColumn(-result.multiplier[:, shown], tension / 1000),
-        **_plotted(result),
+        **_plot_columns(result),
     }
 
 
@@ -101,27 +101,27 @@ def _rotors(mission: Mission) -> dict[str, Any]:
     return {"rotors": known.tolist()} if known.any() else {}
 
 
-def _turned(result: Result) -> dict[str, PackedColumn]:
+def _attitude_columns(result: Result) -> dict[str, PackedColumn]:
     """Samples that turn vehicles: attitudes and shares of the rotors' limits, and of points the thrust's direction."""
-    mission, found = result.mission, {}
+    mission, columns = result.mission, {}
     limits = rotor_limits(mission)
     known = np.isfinite(limits)
     if not known.all():
         force = result.input_force + result.constraint_force
-        found["thrust"] = PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
+        columns["thrust"] = PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
     if known.any():
         q, force, saturated = result.vehicle_attitude, result.rotor_force, result.saturated
         assert q is not None
         assert force is not None
         assert saturated is not None
         share = np.where(known[:, None], force / np.where(known, limits, 1.0)[:, None], 0.0)
-        found["turn"] = PackedColumn(_continuous(q), 1e-3)
-        found["rotors"] = PackedColumn(share, 0.01)
-        found["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
-    return found
+        columns["turn"] = PackedColumn(_continuous_signs(q), 1e-3)
+        columns["rotors"] = PackedColumn(share, 0.01)
+        columns["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
+    return columns
 
 
-def _avoiding(result: Result) -> dict[str, PackedColumn]:
+def _avoidance_columns(result: Result) -> dict[str, PackedColumn]:
     """Samples of the layers of avoidance: the clock's rate, the body's way [m]; 1 where barriers act, 2 the guard."""
     layers, rate, way = result.avoidance_layers, result.clock_rate, result.body_displacement
     if layers is None or rate is None or way is None:
@@ -134,20 +134,20 @@ def _avoiding(result: Result) -> dict[str, PackedColumn]:
     }
 
 
-def _lit(result: Result) -> dict[str, PackedColumn]:
+def _light_columns(result: Result) -> dict[str, PackedColumn]:
     """Samples of each vehicle's light: red, green and blue; nothing by day."""
     if not has_lights(result):
         return {}
     return {"light": PackedColumn(lights(result, result.time), 1 / 255)}
 
 
-def _continuous(q: Floats) -> Floats:
+def _continuous_signs(q: Floats) -> Floats:
     """Quaternions (K, N, 4) with signs such that neighbours in time can be mixed."""
     turned = (q[1:] * q[:-1]).sum(axis=2) < 0.0
     return q * np.cumprod(np.where(np.pad(turned, ((1, 0), (0, 0))), -1.0, 1.0), axis=0)[..., None]
 
 
-def sight(
+def sight_points(
     mission: Mission, low: Floats, high: Floats, begin: float = 0.0, end: float = 0.0
 ) -> Floats:
     """Points (P, 3) [m] that an overview shows: 8 corners of the flight's box, then those of obstacles near it.
@@ -164,7 +164,7 @@ def sight(
             ends[0, 2] = box.solid.heights.min()
         far = reach
         if box.solid.moves:
-            ends, far = _passing(box.solid, low, high, begin, end), _BESIDE * reach
+            ends, far = _box_of_passing(box.solid, low, high, begin, end), _BESIDE * reach
         near = np.maximum(ends[0], low - far), np.minimum(ends[1], high + far)
         seen += [near] if (near[0] <= near[1]).all() else []
     if len(seen) > _BOXES:
@@ -174,7 +174,7 @@ def sight(
     return np.stack([ends[:, pick[a], a] for a in range(3)], axis=2).reshape(-1, 3)
 
 
-def _passing(solid: Solids, low: Floats, high: Floats, begin: float, end: float) -> Floats:
+def _box_of_passing(solid: Solids, low: Floats, high: Floats, begin: float, end: float) -> Floats:
     """Lowest and highest corner (2, 3) [m] of a solid that moves, where it is near a box while it is there."""
     since, until = np.clip(solid.there[0], begin, end)
     still = extent(solid._replace(times=np.zeros(0), ways=np.zeros((0, 3))))
@@ -198,7 +198,7 @@ def thrust_directions(force: Floats, mass: Floats) -> Floats:
     return force / np.maximum(np.linalg.norm(force, axis=-1, keepdims=True), 1e-300)
 
 
-def size(result: Result) -> float:
+def typical_reach(result: Result) -> float:
     """Typical greatest distance [m] of an agent from the centre of mass."""
     reach = np.linalg.norm(result.position - result.cm[:, None], axis=2).max(axis=1)
     return float(np.median(reach))
@@ -237,7 +237,7 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
     return [basic | plot for plot in plots]
 
 
-def _alike(mission: Mission) -> list[Ints] | None:
+def _groups_by_limit(mission: Mission) -> list[Ints] | None:
     """Groups of vehicles with the same limit, whose greatest thrust is one line; None if there are too many limits."""
     limits = mission.fleet.thrust_limit
     if len(limits) <= _LINES:
@@ -248,7 +248,7 @@ def _alike(mission: Mission) -> list[Ints] | None:
 
 def _thrust_plot(mission: Mission) -> dict[str, Any]:
     """Lines of thrust, each with its own limit."""
-    alike, limits = _alike(mission), mission.agents.thrust_limit
+    alike, limits = _groups_by_limit(mission), mission.agents.thrust_limit
     title, grey = "Greatest thrust", ["#8FA3B8", "#20262D"]
     if alike is None:  # too many limits: thrust as a share of the limit
         limit: dict[str, Any] = {"unit": "%", "colours": grey, "limits": [None, 100.0]}
@@ -282,7 +282,7 @@ def _rotor_lines(result: Result) -> Floats:
 
 def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
     """Samples (K, lines) of `_thrust_plot`."""
-    alike = _alike(mission)
+    alike = _groups_by_limit(mission)
     if alike is None:
         thrust = 100.0 * thrust / mission.fleet.thrust_limit
     elif len(alike) > 1 or thrust.shape[1] == 1:
@@ -290,7 +290,7 @@ def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
     return np.stack([thrust.min(axis=1), thrust.max(axis=1)], axis=1)
 
 
-def _plotted(result: Result) -> dict[str, PackedColumn]:
+def _plot_columns(result: Result) -> dict[str, PackedColumn]:
     """Samples of each plot."""
     thrust = _thrust_lines(result.mission, result.thrust)
     # Without active edges there is no error.
