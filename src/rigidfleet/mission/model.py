@@ -573,6 +573,7 @@ def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     return min(max(w / 4, least), most)
 
 
+# Saves a twentieth of a short flight, such as narrow-passage.
 @kept
 def _smallest(slots: Floats, edges: Ints, masses: Floats | None) -> float:
     """The smallest non-zero eigenvalue w of mbar J M^-1 J^T, or of J J^T without masses."""
