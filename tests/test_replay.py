@@ -311,3 +311,12 @@ def test_no_such_folder(tmp_path):
     """A file that cannot be written is an error that names it."""
     with pytest.raises(ResultError, match="there is no folder"):
         replay(EIGHT, tmp_path / "missing" / "flight.html")
+
+
+def test_thrust_of_many_is_its_least_and_greatest():
+    """Of twelve vehicles each has a line of thrust; of more, the plot has the least and the greatest of all."""
+    few, many = swarm(12, 3.0), swarm(13, 3.0)
+    assert parts(html_page(few))[1]["thrust plot"].shape[1] == 12
+    column = parts(html_page(many))[1]["thrust plot"]
+    ends = np.sort(many.thrust[0])[[0, -1]]
+    np.testing.assert_allclose(column[0], ends, atol=1e-3)

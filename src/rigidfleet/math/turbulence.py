@@ -7,7 +7,6 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.kept import kept
 from rigidfleet.typing import Floats
 
 _FOOT = 0.3048  # [m]
@@ -45,7 +44,6 @@ def correlate_by_distance(white: Floats, points: ArrayLike, length: float) -> Fl
     return np.moveaxis(mixed.reshape(by_axis.shape), 0, -1)
 
 
-@kept
 def _mixing(points: Floats, length: float) -> Floats:
     """The lower root (N, N) of the correlations."""
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)

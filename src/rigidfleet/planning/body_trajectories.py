@@ -50,6 +50,7 @@ def regulated_motion(
     return as_motion(t0 + times, pieces, goal.T)
 
 
+# Saves a quarter of a short flight with regulated ways, such as narrow-passage.
 @kept
 def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
     """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.

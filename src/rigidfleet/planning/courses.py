@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.kept import kept
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.kernel.problem import NO_KNOTS, NO_WAYS, Motion
 from rigidfleet.math import attitude as att
@@ -120,16 +119,10 @@ def _steer(
     assert now.goal is not None  # a steering phase has a goal
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
-    T = now.goal.T if angles is None else _attitude(angles)
+    T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
     named = now.goal.named or angles is not None
     goal = Pose(r, v, T, np.deg2rad(phase.rates_deg_s), named)
     return _course_to(mission, phase, now, goal, arrival, t_end)
-
-
-@kept
-def _attitude(angles: tuple[float, ...]) -> Floats:
-    """Direction cosines (3, 3) of roll, pitch and yaw [deg]."""
-    return att.dcm_from_euler(np.deg2rad(angles))
 
 
 def _orbit(mission: Mission, phase: Orbit, now: PhaseState, t_end: float) -> Course:

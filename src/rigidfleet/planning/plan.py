@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.kept import kept
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
@@ -54,7 +53,6 @@ from rigidfleet.planning.reference import PhaseState, Pose, copy_as, copy_with, 
 from rigidfleet.planning.tolerances import (
     absolute_tolerances,
     tolerance_of_velocity,
-    tolerances_of_small,
 )
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -113,7 +111,7 @@ class PhasePlan(Leg):
             "time": max(self.arrival, shaped) if lies else self.arrival,
             "position": goal.r.tolist() if "position" in meets else None,
             "velocity": goal.v.tolist() if "velocity" in meets else None,
-            "attitude": [*_quaternion(goal.T)] if turns else None,
+            "attitude": att.quaternion_from_dcm(goal.T).tolist() if turns else None,
             "rates": goal.omega.tolist() if turns and not lies else None,
             **({"through": list(self.through)} if self.through else {}),
         }
@@ -138,7 +136,7 @@ class PhasePlan(Leg):
             T = goal.T
             if goal.omega.any():
                 T = att.dcm_from_rotation_vector(goal.omega * since) @ T
-            table |= {"attitude": [*_quaternion(T)], "rates": goal.omega.tolist()}
+            table |= {"attitude": att.quaternion_from_dcm(T).tolist(), "rates": goal.omega.tolist()}
         return table if len(table) > 1 else None
 
     def state(self) -> Floats:
@@ -147,7 +145,7 @@ class PhasePlan(Leg):
         integral = now.integral.of(self.edges, 0.0)
         if self.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
-        q = np.array(_quaternion(self.frame))
+        q = att.quaternion_from_dcm(self.frame)
         if not self.problem.body_formulation:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral, q])
         x, y = about_cm(now.r, masses) @ self.frame.T, about_cm(now.v, masses) @ self.frame.T
@@ -160,10 +158,10 @@ class PhasePlan(Leg):
         n, m = len(self.masses), len(self.edges)
         size = 6 * n + m
         size += 0 if self.frame is None else 10 if self.problem.body_formulation else 4
-        if not self.large:
-            return tolerances_of_small(self.integrator, n, m, size)
         velocity = self.velocity_tolerance()
-        return absolute_tolerances(self.integrator, size, velocity, self.distances, large=True)
+        return absolute_tolerances(
+            self.integrator, size, velocity, self.distances, large=self.large
+        )
 
     def velocity_tolerance(self) -> Floats:
         """Absolute tolerance (N,) of velocities [m/s]."""
@@ -329,7 +327,6 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         )
 
 
-@kept
 def _vehicles(masses: Floats, limit: Floats, saturate: bool, gravity: float) -> Vehicles:
     return Vehicles(
         masses.copy(), 1.0 / masses, float(masses.sum()), float(masses.mean()), limit.copy(), saturate, gravity
@@ -352,31 +349,16 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs, most = _pair_distances(slots)
-    x = r.tolist()
-    near = all(abs(math.dist(x[i], x[j]) - wanted) <= most for i, j, wanted in pairs)
-    return name if near else None
-
-
-@kept
-def _pair_distances(slots: Floats) -> tuple[list[tuple[int, int, float]], float]:
-    """All pairs of slots (N, 3) with their distance [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
-    wanted = distance_geometry.distances(slots, pairs).tolist()
-    listed = [(i, j, d) for (i, j), d in zip(pairs.tolist(), wanted, strict=True)]
-    return listed, _NEAR * min(wanted)
+    wanted = distance_geometry.distances(slots, pairs)
+    off = np.abs(distance_geometry.distances(r, pairs) - wanted)
+    return name if (off <= _NEAR * wanted.min()).all() else None
 
 
-@kept
 def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
     own = distance_geometry.distances(slots, edges)
     return bool((np.abs(lengths - own) <= _ROUNDED + 1e-12 * own).all())
-
-
-@kept
-def _quaternion(T: Floats) -> tuple[float, ...]:
-    return tuple(att.quaternion_from_dcm(T).tolist())
 
 
 def _law(mission: Mission, mu: float, *, damped: bool) -> ConstraintLaw:

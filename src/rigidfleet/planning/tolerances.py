@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.kept import kept
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.typing import Floats
 
@@ -50,13 +49,6 @@ def absolute_tolerances(
     if options.atol_attitude is not None:
         atol[6 * n + m : 6 * n + m + 4] = options.atol_attitude
     return atol
-
-
-@kept
-def tolerances_of_small(options: IntegratorOptions, n: int, m: int, size: int) -> Floats:
-    """`absolute_tolerances` of n agents with m edges that are not solved for as a large formation."""
-    velocity = np.full(n, options.atol_velocity or options.atol)
-    return absolute_tolerances(options, size, velocity, np.zeros(m), large=False)
 
 
 def tolerance_of_velocity(

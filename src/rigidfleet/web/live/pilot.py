@@ -124,7 +124,7 @@ class Pilot:
         self.pose = self._reference()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
         self.target = PilotTarget(
-            self._turning_point(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1]
+            self._place_to_turn(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1]
         )
         self.last: Result | None = None
 
@@ -369,7 +369,7 @@ class Pilot:
         cm, v = self.masses @ seen.position / total, self.masses @ seen.velocity / total
         return Pose(cm, v, frame if frame is not None else np.eye(3), np.zeros(3))
 
-    def _turning_point(self, r: Floats) -> Floats:
+    def _place_to_turn(self, r: Floats) -> Floats:
         """A point (3,) [m] at or above ``r``, high enough for the first formation to rotate about it."""
         slots = self.flight.plan.slots
         assert slots is not None  # every formation flown has slots

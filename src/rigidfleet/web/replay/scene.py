@@ -237,73 +237,59 @@ def _plots(mission: Mission) -> list[dict[str, Any]]:
     return [basic | plot for plot in plots]
 
 
-def _groups_by_limit(mission: Mission) -> list[Ints] | None:
-    """Groups of vehicles with the same limit, whose greatest thrust is one line; None if there are too many limits."""
-    limits = mission.fleet.thrust_limit
-    if len(limits) <= _LINES:
-        return [np.array([i]) for i in range(len(limits))]
-    known = np.unique(limits)
-    return [np.flatnonzero(limits == x) for x in known] if len(known) <= _LINES else None
+def _line_colours(n: int) -> list[str]:
+    """Colours of `_lines` of n vehicles."""
+    return agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
+
+
+def _lines(values: Floats) -> Floats:
+    """Lines (K, L) of a plot: the values (K, N) of each vehicle, or of many the least and the greatest."""
+    if values.shape[1] <= _LINES:
+        return values
+    return np.stack([np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)], axis=1)
+
+
+def _thrust_in_shares(mission: Mission) -> bool:
+    """Whether thrust is drawn as a share of its limit: that of many vehicles with different ones."""
+    return mission.n_agents > _LINES and len(set(mission.agents.thrust_limit)) > 1
 
 
 def _thrust_plot(mission: Mission) -> dict[str, Any]:
-    """Lines of thrust, each with its own limit."""
-    alike, limits = _groups_by_limit(mission), mission.agents.thrust_limit
-    title, grey = "Greatest thrust", ["#8FA3B8", "#20262D"]
-    if alike is None:  # too many limits: thrust as a share of the limit
-        limit: dict[str, Any] = {"unit": "%", "colours": grey, "limits": [None, 100.0]}
-        return {"title": f"{title}, as share of limit", **limit}
-    if (
-        len(alike) == 1 < len(limits)
-    ):  # many vehicles with one limit: the least and the greatest thrust
-        return {"title": title, "unit": "N", "colours": grey, "limits": [None, limits[0]]}
-    own = [limits[int(who[0])] for who in alike]
-    return {"title": title, "unit": "N", "colours": agent_colours(len(alike)), "limits": own}
+    """Lines of thrust with their limits."""
+    title, limits = "Greatest thrust", mission.agents.thrust_limit
+    plot = {"title": title, "unit": "N", "colours": _line_colours(len(limits)), "limits": limits}
+    if _thrust_in_shares(mission):
+        plot |= {"title": f"{title}, as share of limit", "unit": "%", "limits": [None, 100.0]}
+    elif len(limits) > _LINES:
+        plot["limits"] = [None, limits[0]]
+    return plot
 
 
 def _rotor_plot(n: int) -> dict[str, Any]:
-    """Lines of the greatest rotor force of each vehicle, or of the least and the greatest of many, as shares."""
-    colours = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
-    return {
-        "title": "Rotors, share of limit",
-        "unit": "%",
-        "colours": colours,
-        "limits": [100.0] * len(colours),
-    }
-
-
-def _rotor_lines(result: Result) -> Floats:
-    """Samples (K, lines) of `_rotor_plot`."""
-    share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limits(result.mission)
-    if share.shape[1] <= _LINES:
-        return share
-    return np.stack([np.fmin.reduce(share, axis=1), np.fmax.reduce(share, axis=1)], axis=1)
-
-
-def _thrust_lines(mission: Mission, thrust: Floats) -> Floats:
-    """Samples (K, lines) of `_thrust_plot`."""
-    alike = _groups_by_limit(mission)
-    if alike is None:
-        thrust = 100.0 * thrust / mission.fleet.thrust_limit
-    elif len(alike) > 1 or thrust.shape[1] == 1:
-        return np.stack([thrust[:, who].max(axis=1) for who in alike], axis=1)
-    return np.stack([thrust.min(axis=1), thrust.max(axis=1)], axis=1)
+    """Lines of the greatest rotor force of each vehicle, as shares of its limit."""
+    colours = _line_colours(n)
+    limits = [100.0] * len(colours)
+    return {"title": "Rotors, share of limit", "unit": "%", "colours": colours, "limits": limits}
 
 
 def _plot_columns(result: Result) -> dict[str, PackedColumn]:
     """Samples of each plot."""
-    thrust = _thrust_lines(result.mission, result.thrust)
+    mission, thrust = result.mission, result.thrust
+    if _thrust_in_shares(mission):
+        thrust = 100.0 * thrust / mission.fleet.thrust_limit
     # Without active edges there is no error.
     error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
     error = error.max(axis=1, initial=-1.0)
     samples = {
-        "thrust plot": PackedColumn(thrust, 1e-3),
+        "thrust plot": PackedColumn(_lines(thrust), 1e-3),
         "error plot": PackedColumn(np.where(error < 0.0, np.nan, error), _FLOOR),
         "separation plot": PackedColumn(result.separation, 1e-3),
         "clearance plot": PackedColumn(result.clearance, 1e-3),
     }
-    if np.isfinite(rotor_limits(result.mission)).any():
-        samples["rotor plot"] = PackedColumn(_rotor_lines(result), 0.1)
+    limits = rotor_limits(mission)
+    if np.isfinite(limits).any():
+        share = 100.0 * rotor_forces(result).max(axis=2) / limits
+        samples["rotor plot"] = PackedColumn(_lines(share), 0.1)
         off = quantities.samples(result, "tracking_error").worst
         samples["off plot"] = PackedColumn(off, 1e-4)
-    return {plot["column"]: samples[plot["column"]] for plot in _plots(result.mission)}
+    return {plot["column"]: samples[plot["column"]] for plot in _plots(mission)}
