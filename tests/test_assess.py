@@ -757,7 +757,7 @@ def test_worst_pair_is_that_of_all_pairs(flown):
     assert fit.flown == pytest.approx(np.linalg.norm(p[i] - p[j]))
     assert fit.intended == pytest.approx(np.linalg.norm(slots[i] - slots[j]))
     assert fit.shortest == pytest.approx(2.0)
-    assert fit.mirrored == (flown == "mirrored") or flown in ("exchanged", "scattered")
+    assert fit.is_mirrored == (flown == "mirrored") or flown in ("exchanged", "scattered")
 
 
 @pytest.mark.parametrize("agents", [2, 3, 5, 16, 17])

@@ -278,7 +278,7 @@ def test_no_home(home, base, tmp_path, monkeypatch):
     }[home]
     with pytest.warns(RuntimeWarning, match=why):
         assert answer() == OWN
-    assert jit.compiled(lambda x: x + 1.0)(1.0) == 2.0  # and no second warning
+    assert jit.jit(lambda x: x + 1.0)(1.0) == 2.0  # and no second warning
 
 
 def refused(*_: object, **__: object) -> None:
@@ -304,7 +304,7 @@ def test_what_is_made_is_private(tmp_path, monkeypatch):
     before = os.umask(0)
     try:
         assert answer() == OWN
-        assert jit.compiled(lambda x: 2.0 * x)(1.0) == 2.0
+        assert jit.jit(lambda x: 2.0 * x)(1.0) == 2.0
     finally:
         os.umask(before)
     made = list((tmp_path / "a").rglob("*"))
@@ -352,11 +352,11 @@ def test_planted_pickles(suffix, which, tmp_path, monkeypatch):
     base.mkdir(0o700)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(base))
     monkeypatch.setattr(jit, "_CACHE", cache_directory(), raising=False)
-    assert jit.compiled(double)(1.0) == 2.0
+    assert jit.jit(double)(1.0) == 2.0
     (file,) = base.rglob("*double*" + suffix)
     file.write_bytes(pickle.dumps(Hostile(mark)))
     with suppress(Exception):  # a pickle of one's own is read
-        jit.compiled(double)(1.0)
+        jit.jit(double)(1.0)
     assert mark.exists()
     mark.unlink()
     forget()
@@ -366,7 +366,7 @@ def test_planted_pickles(suffix, which, tmp_path, monkeypatch):
     else:
         (base if which == "folder" else file).chmod(0o777)
     with pytest.warns(RuntimeWarning) if which == "folder" else warnings.catch_warnings():
-        assert jit.compiled(double)(1.0) == 2.0
+        assert jit.jit(double)(1.0) == 2.0
     assert not mark.exists()
 
 
@@ -479,7 +479,7 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
     monkeypatch.setattr(native, "_compile", refused)
     native.inherit(given)
     assert native._code().integrate(0, 0, 0, 0) == OWN
-    assert jit.compiled(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
+    assert jit.jit(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
     assert native.bequeath() == given
 
 

@@ -17,7 +17,7 @@ from test_sweep import everything
 
 import rigidfleet as rf
 from rigidfleet import plotting
-from rigidfleet._common.facts import Fact, Line, Row, Sheet, Table, value, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, value, worst_values
 from rigidfleet.cli import app, console
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import mission_names
@@ -133,7 +133,7 @@ def test_consoles_notebooks_and_pages_show_the_same_rows(what, flights):
     """Each row of each table (name, values, units, level) is the same on a console, in a notebook and on a page."""
     thing = SHOWN[what](flights)
     sheet = thing.facts()
-    tables = [part for part in sheet.shown if isinstance(part, Table)]
+    tables = [part for part in sheet.shown if isinstance(part, FactTable)]
     notebook = rows_of(thing._repr_html_())
     page = [row for table in tables for row in rows_of(table.html("kind"))]
     assert page == notebook
@@ -202,7 +202,7 @@ def test_a_check_shows_what_its_json_holds(name):
         ("tilt", "deg", vehicles.get("tilt"), "tilt_deg"),
         *(("clearance", "m", c, "clearance_m") for c in paths["clearance"]),
     ]  # fmt: skip
-    tables = [part for part in ahead.facts().shown if isinstance(part, Table)]
+    tables = [part for part in ahead.facts().shown if isinstance(part, FactTable)]
     rows = rows_of(next(table for table in tables if table.heads[0] == "planned").html())
     rows = [row for row in rows[1:] if not row.startswith("spacing")]
     wanted = [x for x in worst if x[2] is not None]
@@ -235,7 +235,7 @@ def test_the_page_has_the_tables_of_its_objects(flights):
     rows = [row for table in tables for row in rows_of(table)]
     for sheet in (flights[0].mission.facts(), rf.assess(flights[0]).facts()):
         for part in sheet.shown:
-            if isinstance(part, Table):
+            if isinstance(part, FactTable):
                 assert all(row in rows for row in rows_of(part.html()))
 
 
@@ -350,7 +350,7 @@ def test_lists_of_the_command_fit_eighty_columns(line, capsys, monkeypatch):
 def test_too_many_columns_stand_in_two_tables():
     """A table whose numbers do not fit stands as two, each with the first column; nothing is lost."""
     heads = ["name", *(f"column{k} [m]" for k in range(12))]
-    table = Table(heads, [Row(["first", *(1.5 + k for k in range(12))])])
+    table = FactTable(heads, [Row(["first", *(1.5 + k for k in range(12))])])
     text = printed(Sheet("a", "b", [table]), 60)
     assert max(map(len, text.splitlines())) <= 60
     assert all(f"{1.5 + k:g}" in text.split() for k in range(12))

@@ -182,7 +182,7 @@ def test_kill_in_the_middle_of_a_write(flown: bytes):
 def test_a_full_disk_while_the_kernel_is_kept():
     """A kernel that cannot be written to its cache flies all the same; a warning names the folder and the reason."""
     native.warned.clear()
-    double: Any = jit.compiled(lambda x: 2.0 * x)
+    double: Any = jit.jit(lambda x: 2.0 * x)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:

@@ -386,19 +386,28 @@ def test_phase_names_do_not_overlap(name, lengths):
 
 @pytest.mark.parametrize("lengths", ["two", "twelve as in the paper", "twelve in a rush"])
 def test_every_phase_is_named(lengths):
-    """Up to a dozen phases all have their names, however short they are, in the order of time."""
+    """Up to a dozen phases all have their names, over the axes or in the key, in the order of time."""
     phases = [(f"leg {k}", x) for k, x in enumerate(LENGTHS[lengths])]
-    labels = by_gid(drawn("distances", a_flight(phases=phases)), "phase")
-    assert [label.get_text() for label in labels] == [name for name, _ in phases]
+    figure = drawn("distances", a_flight(phases=phases))
+    labels = by_gid(figure, "phase")
+    if len(phases) > 2:  # numbers
+        key = " ".join(figure._supxlabel.get_text().split())
+        assert key == "Phases: " + " · ".join(f"{k + 1} leg {k}" for k in range(len(phases)))
+        assert {label.get_text() for label in labels} <= {str(k + 1) for k in range(len(phases))}
+    else:
+        assert [label.get_text() for label in labels] == [name for name, _ in phases]
     places = [label.get_position()[0] for label in labels]
     assert places == sorted(places)
 
 
-def test_names_stand_upright_where_they_fit(triangle):
-    """Long phases have their names level and centred; short ones slanting."""
-    labels = by_gid(drawn("distances", triangle), "phase")
-    assert [label.get_rotation() for label in labels] == [0, 0]
+def test_names_stand_over_their_phases_where_they_fit(triangle):
+    """Long phases have their names level and centred, and no key; of a phase of a second, the number stands there."""
+    figure = drawn("distances", triangle)
+    labels = by_gid(figure, "phase")
     assert [label.get_position()[0] for label in labels] == [3.0, 13.0]
+    assert figure._supxlabel is None
+    short = drawn("distances", a_flight(phases=[("a name of some length", 1.0), ("fly", 19.0)]))
+    assert [label.get_text() for label in by_gid(short, "phase")] == ["1", "2"]
 
 
 def test_the_summary_says_which_phase_has_which_number(triangle):

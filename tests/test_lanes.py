@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigidfleet.kernel.compiler.simd import (
-    filled,
+    fill_lanes,
     in_vectors,
     pack,
     rough_inverse,
@@ -86,7 +86,7 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
     @numba.njit
     def error(x):
         y = in_vectors(x)
-        squares = filled(0.0)
+        squares = fill_lanes(0.0)
         for k in range(y.shape[0]):
             squares += y[k] * y[k]
         return total_or_worst(squares, x)

@@ -281,12 +281,8 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """Counts, from now on, of the calls that make what a phase departs from."""
     count: Counter[str] = Counter()
-    for module, name in (
-        (legs, "depart"),
-        (legs, "_attach_frame"),
-        (legs, "align_slots"),
-        (timing, "depart"),
-    ):
+    places = (legs, "depart"), (legs, "_attach_frame"), (legs, "align_slots"), (timing, "depart")
+    for module, name in places:
         function = getattr(module, name)
 
         def counted(*arguments: Any, _function: Any = function, _name: str = name) -> Any:

@@ -36,7 +36,7 @@ UNEQUAL = {"wind": [1.5, 0, 0], "drag": [0.2, 0.0, 0.1]}
 #: figure the limit is seen.
 BROKEN: dict[str, tuple[str, dict[str, Any], str, str]] = {
     **{
-        q.name: (q.name, POINTS | {"limits": {q.name: 0.2}}, q.called, "motion") for q in MOTIONS
+        q.name: (q.name, POINTS | {"limits": {q.name: 0.2}}, q.name_in_words, "motion") for q in MOTIONS
     },
     "tilt_deg": ("tilt", ROTORS | {"limits": {"tilt_deg": 2.0}}, "tilt", "vehicles"),
     "separation": ("separation", POINTS | {"limits": {"separation": 5.0}}, "collision", "clearance"),
@@ -114,7 +114,7 @@ def test_a_limit_that_a_flight_fails_by_is_in_all_readers(key, capsys):
     factor = 0.01 if q.unit == "%" else 1.0
     assert measure(result, verdict)[name] == pytest.approx(factor * check.worst)
     assert METRICS[name].text == q.text
-    (row,) = [row for row in safety(result, verdict) if row.quantity == q.called]
+    (row,) = [row for row in safety(result, verdict) if row.quantity == q.name_in_words]
     assert not row.passed
     assert row.margin == pytest.approx(-abs(check.worst - check.limit))
     words = json_schema()["$defs"]["Limits"]["properties"]
@@ -133,7 +133,7 @@ def test_a_limit_that_a_flight_fails_by_is_on_page_and_figure(key):
     q = QUANTITIES[name]
     page = html_page(result)
     check = max((c for c in verdict.checks if c.check == name), key=lambda c: q.rank(c.worst))
-    assert page.count(f"<th>{q.called}") >= 2
+    assert page.count(f"<th>{q.name_in_words}") >= 2
     assert "broken" in page
     (picture,) = plotting.plot(result, names=[figure])
     drawn = " ".join(text.get_text() for text in picture.findobj(Text))

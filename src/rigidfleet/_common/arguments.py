@@ -12,7 +12,7 @@ from rigidfleet.errors import wrong_type
 from rigidfleet.typing import Floats
 
 
-def as_path(given: object) -> Path:
+def as_path(value: object) -> Path:
     """A path as a function takes it.
 
     Raises
@@ -20,12 +20,12 @@ def as_path(given: object) -> Path:
     TypeError
         It is neither text nor a `Path`. A number would be an open file, which nobody means.
     """
-    if isinstance(given, str | os.PathLike) and isinstance(path := os.fspath(given), str):
+    if isinstance(value, str | os.PathLike) and isinstance(path := os.fspath(value), str):
         return Path(path)
-    raise wrong_type("a path (a string or a Path)", given)
+    raise wrong_type("a path (a string or a Path)", value)
 
 
-def numbers(name: str, given: ArrayLike) -> Floats:
+def numbers(name: str, values: ArrayLike) -> Floats:
     """An array of numbers as a function takes it; ``name`` says of what.
 
     Raises
@@ -34,6 +34,6 @@ def numbers(name: str, given: ArrayLike) -> Floats:
         It is none.
     """
     try:
-        return np.asarray(given, dtype=np.float64)
+        return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise wrong_type(f"an array of numbers for {name}", given) from None
+        raise wrong_type(f"an array of numbers for {name}", values) from None

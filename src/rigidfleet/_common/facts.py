@@ -78,7 +78,7 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Table:
+class FactTable:
     """Things in rows, their quantities in columns; what applies to no row is not shown.
 
     Attributes
@@ -97,16 +97,19 @@ class Table:
     @property
     def columns(self) -> list[tuple[str, str, bool]]:
         """Name and unit of each column that is shown, and whether it holds words; the last one is of marks, if any."""
-        names = [self.heads[k].partition(" [") for k in self._used]
+        names = [self.heads[k].partition(" [") for k in self._columns_shown]
         words = [k == 0 or name in self.words for k, (name, *_) in enumerate(names)]
         shown = [(name, unit[:-1], w) for (name, _, unit), w in zip(names, words, strict=True)]
-        return shown + [("", "", True)] * self._judged
+        return shown + [("", "", True)] * self._has_marks
 
     @property
     def cells(self) -> list[list[Cell]]:
         """What stands in each row that is shown."""
         return [
-            [*(_cell(row.cells[k]) for k in self._used), *[Cell(MARKS[row.level])] * self._judged]
+            [
+                *(_cell(row.cells[k]) for k in self._columns_shown),
+                *[Cell(MARKS[row.level])] * self._has_marks,
+            ]
             for row in self.rows
         ]
 
@@ -116,12 +119,12 @@ class Table:
         return [[str(cell) for cell in cells] for cells in self.cells]
 
     @property
-    def _used(self) -> list[int]:
+    def _columns_shown(self) -> list[int]:
         every = range(len(self.heads))
         return [k for k in every if k == 0 or any(str(_cell(r.cells[k])) for r in self.rows)]
 
     @property
-    def _judged(self) -> bool:
+    def _has_marks(self) -> bool:
         return any(row.level for row in self.rows) and not self.bare
 
     def html(self, kind: str = "") -> str:
@@ -227,10 +230,10 @@ class Fact(NamedTuple):
         return Row((self.name, worst, self.bound, when, self.who), self.level)
 
 
-def worst_values(what: str, facts: Iterable[Fact]) -> Table:
+def worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
     """Table of worst values with their limits."""
     heads = (what, "worst", "limit", "at [s]", "who or where")
-    return Table(heads, [fact.row for fact in facts], heads[4:])
+    return FactTable(heads, [fact.row for fact in facts], heads[4:])
 
 
 @dataclass(frozen=True)
@@ -239,10 +242,10 @@ class Sheet:
 
     name: str
     title: str
-    parts: Sequence[Table | Line]
+    parts: Sequence[FactTable | Line]
 
     @property
-    def shown(self) -> list[Table | Line]:
+    def shown(self) -> list[FactTable | Line]:
         """The parts, without tables in which nothing stands."""
         return [part for part in self.parts if isinstance(part, Line) or part.rows]
 
@@ -255,7 +258,7 @@ class Sheet:
         begin: list[Any] = [head] if self.name else []
         blocks = [*begin]
         for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):
-            apart = isinstance(part, Table) or isinstance(before, Table)
+            apart = isinstance(part, FactTable) or isinstance(before, FactTable)
             blocks += ["", part] if apart and blocks != begin else [part]
         return blocks
 

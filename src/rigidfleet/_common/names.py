@@ -26,10 +26,8 @@ _UNIT = {
 AXES = {"e": (0, 1.0), "w": (0, -1.0), "n": (1, 1.0), "s": (1, -1.0), "u": (2, 1.0), "d": (2, -1.0)}
 DIRECTIONS = {name: name[0] for name in ("north", "east", "south", "west", "down", "up")}
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
-_AXIS, _HUE = (
-    re.compile(r"(pos|vel|acc|[ptvajq])?([xyzw])"),
-    re.compile(r"(?:led|diffuse|colou?r|rgb)?[ _.]*(r|g|b)(?:ed|reen|lue)?"),
-)
+_AXIS = re.compile(r"(pos|vel|acc|[ptvajq])?([xyzw])")
+_HUE = re.compile(r"(?:led|diffuse|colou?r|rgb)?[ _.]*(r|g|b)(?:ed|reen|lue)?")
 _WORDS = {
     # Beside an axis: a place, a velocity, an acceleration, a jerk, a quaternion; or none of them.
     "": "p t pos position pose translation location coordinate point local world global odom map rs r wb estimate "

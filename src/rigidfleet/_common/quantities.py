@@ -57,7 +57,7 @@ class Quantity:
     checked: bool = True
 
     @property
-    def called(self) -> str:
+    def name_in_words(self) -> str:
         """Its name in words."""
         return self.name.replace("_", " ")
 
@@ -78,7 +78,7 @@ class Quantity:
         return None if limit is None else limit(mission)
 
 
-def _motion(order: int, way: str, what: str, unit: str) -> Quantity:
+def _motion_quantity(order: int, way: str, what: str, unit: str) -> Quantity:
     """The size of a velocity, an acceleration or a jerk in a direction.
 
     Nobody measures the jerk of a vehicle: the one that is limited is that of the slots that are tracked.
@@ -139,7 +139,7 @@ QUANTITIES: dict[str, Quantity] = {
             limit=lambda m: None if _no_fence(m) else m.limits.geofence.max[2],
         ),
         *(
-            _motion(order, way, what, unit)
+            _motion_quantity(order, way, what, unit)
             for ways in (("",), ("horizontal", "vertical"))
             for order, what, unit in ((1, "speed", "m/s"), (2, "acceleration", "m/s^2"), (3, "jerk", "m/s^3"))
             for way in ways
@@ -199,7 +199,7 @@ LIMITS_OF_CURVES = [
 ]
 
 
-def shown(unit: str) -> str:
+def display_unit(unit: str) -> str:
     """A unit as pages and figures show it: m/s² for m/s^2."""
     return unit.replace("^2", "²").replace("^3", "³")
 

@@ -51,7 +51,7 @@ class Array:
 
 
 def attribute(file: h5py.File, name: str, kind: Any) -> Any:
-    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`typed`).
+    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`of_type`).
 
     Raises
     ------
@@ -81,10 +81,10 @@ def attribute(file: h5py.File, name: str, kind: Any) -> Any:
         plain = json.loads(value)
     except (ValueError, RecursionError) as error:
         raise DamagedError(f"attribute {name} is not valid JSON ({error})") from None
-    return typed(plain, kind, f"attribute {name}")
+    return of_type(plain, kind, f"attribute {name}")
 
 
-def typed(value: Any, kind: Any, where: str) -> Any:
+def of_type(value: Any, kind: Any, where: str) -> Any:
     """Check plain data against a type and return it.
 
     Types are dataclasses, typed dictionaries, lists, tuples, literals, text, integers and finite numbers. A dataclass
@@ -100,10 +100,10 @@ def typed(value: Any, kind: Any, where: str) -> Any:
     if kind is Any:
         return value
     if origin is Annotated:  # A is the type in Python, B the type in a file
-        return None if value is None else typed(value, inner[1], where)
+        return None if value is None else of_type(value, inner[1], where)
     if origin in (Union, UnionType):  # every union here is `X | None`
         some = next(k for k in inner if k is not NoneType)
-        return None if value is None else typed(value, some, where)
+        return None if value is None else of_type(value, some, where)
     if origin is Literal and isinstance(value, str) and value in inner:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -113,12 +113,12 @@ def typed(value: Any, kind: Any, where: str) -> Any:
         if kind is not str or _is_text(value):
             return value
     elif origin is list and isinstance(value, list):
-        return [typed(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
+        return [of_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
     elif origin is tuple and isinstance(value, list) and len(value) == len(inner):
-        return [typed(item, k, where) for item, k in zip(value, inner, strict=True)]
+        return [of_type(item, k, where) for item, k in zip(value, inner, strict=True)]
     elif isinstance(value, dict):
         if origin is dict:
-            return {key: typed(item, inner[1], f"{where}.{key}") for key, item in value.items()}
+            return {key: of_type(item, inner[1], f"{where}.{key}") for key, item in value.items()}
         hints = get_type_hints(kind, include_extras=True)
         needed = getattr(kind, "__required_keys__", None)
         if needed is None:  # a dataclass
@@ -130,7 +130,7 @@ def typed(value: Any, kind: Any, where: str) -> Any:
         known = hints.keys() - {"__others__"}
         if needed <= value.keys() and ("__others__" in hints or value.keys() <= known):
             made = {
-                key: typed(item, hints.get(key, Any), f"{where}.{key}")
+                key: of_type(item, hints.get(key, Any), f"{where}.{key}")
                 for key, item in value.items()
             }
             return kind(**made)
@@ -170,7 +170,7 @@ def arrays(
     DamagedError
         An array is missing, has another type or shape, or the arrays are larger than a file of this size can be.
     """
-    found, known, numbers = {}, dict(sizes), 0
+    datasets, known, numbers = {}, dict(sizes), 0
     for name, due in declared.items():
         if name not in file:
             if due.optional:
@@ -185,13 +185,13 @@ def arrays(
             known.setdefault(dim, n) == n for dim, n in zip(due.dims, shape, strict=True)
         )
         if not right:
-            asked = ", ".join(f"{dim} {known.get(dim, '')}".rstrip() for dim in due.dims)
-            raise DamagedError(f"{name} has shape {shape}, not ({asked})")
+            expected = ", ".join(f"{dim} {known.get(dim, '')}".rstrip() for dim in due.dims)
+            raise DamagedError(f"{name} has shape {shape}, not ({expected})")
         numbers += math.prod(shape)
         if numbers > MOST_NUMBERS or 8 * numbers > _DENSE * size + _SPARE:
             raise DamagedError(f"{name} is larger than a file of {size:,} bytes can hold")
-        found[name] = data
-    return {name: data[...] for name, data in found.items()}
+        datasets[name] = data
+    return {name: data[...] for name, data in datasets.items()}
 
 
 def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
@@ -208,7 +208,7 @@ def _dataset(file: h5py.File, name: str) -> h5py.Dataset:
     return data
 
 
-def opened(data: bytes) -> h5py.File:
+def open_hdf5(data: bytes) -> h5py.File:
     """Open the content of a file for reading.
 
     Raises

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import Quantity
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import CheckResult, Extreme, bounded, value
+from rigidfleet.assessment.outcome import CheckResult, Extreme, limit_check, value
 from rigidfleet.result import Result
 
 #: Rate below which the clock counts as slowed: it comes back to 1 by an exponential.
@@ -27,7 +27,7 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
             f"the guarantee of [avoidance] is lost at {e.when:.2f} s, by {e.who}: braking at once would leave them"
             f" {value(-e.value, 'm')} too near"
         )
-        yield bounded(q, e, 0.0, words, passed=False)
+        yield limit_check(q, e, 0.0, words, passed=False)
         return
     state = "held" if _doubt(measured) else "proved"
     e = min(_margins(measured), key=lambda e: e.value, default=None)
@@ -37,15 +37,15 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
             f"the guarantee of [avoidance] is {state}, with {value(e.value, 'm')} to spare at least"
         )
         e = replace(e, value=max(e.value, 0.0))
-    yield bounded(q, e, 0.0, words, passed=True)
+    yield limit_check(q, e, 0.0, words, passed=True)
 
 
 def avoidance_notes(measured: Measurements) -> Iterator[str]:
     """What the layers of avoidance did, and what the guarantee is worth."""
-    given, result = measured.mission.avoidance, measured.result
-    if given is None:
+    avoidance, result = measured.mission.avoidance, measured.result
+    if avoidance is None:
         return
-    if not given.guard:
+    if not avoidance.guard:
         yield "[avoidance] without its guard guarantees nothing"
     elif not _margins(measured, "_lost"):
         doubt = _doubt(measured)
@@ -54,7 +54,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
             if doubt
             else "the guarantee of [avoidance] is proved: at every tick, all vehicles could brake in time"
         )
-    yield from _first_layers(result)
+    yield from _clock_and_body_notes(result)
     for name, words in (("barrier", "barriers changed"), ("guard", "the guard replaced")):
         every = [p.extremes[name] for p in result.phases if name in p.extremes]
         if every:
@@ -66,7 +66,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
             )
 
 
-def _first_layers(result: Result) -> Iterator[str]:
+def _clock_and_body_notes(result: Result) -> Iterator[str]:
     """What the virtual clock and the body layer did, and the share of time by layer."""
     waited = [p for p in result.phases if "clock" in p.extremes]
     if waited:
@@ -87,17 +87,17 @@ def _first_layers(result: Result) -> Iterator[str]:
         "barriers acted": (acts & 1 != 0).any(axis=1),
         "the guard acted": (acts & 2 != 0).any(axis=1),
     }
-    told = [f"{words} {100 * float(step @ on):.2g} %" for words, on in shares.items() if on.any()]
-    if told:
+    parts = [f"{words} {100 * float(step @ on):.2g} %" for words, on in shares.items() if on.any()]
+    if parts:
         far = float(np.linalg.norm(way, axis=1).max())
         aside = f"; the body was up to {value(far, 'm')} beside its path" if far > 0.0 else ""
-        yield f"of the samples, by time: {', '.join(told)}{aside}"
+        yield f"of the samples, by time: {', '.join(parts)}{aside}"
 
 
 def _margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
     return [
-        measured.recorded(name + ending, p.extremes[name + ending], p.name)
+        measured.extreme_of(name + ending, p.extremes[name + ending], p.name)
         for p in measured.result.phases
         for name in ("guarantee", "clearance_guarantee")
         if name + ending in p.extremes
@@ -106,9 +106,9 @@ def _margins(measured: Measurements, ending: str = "") -> list[Extreme]:
 
 def _doubt(measured: Measurements) -> str:
     """Why the guarantee is not proved; empty if it is."""
-    from rigidfleet.mission.avoidance import unproved
+    from rigidfleet.mission.avoidance import why_unproved
 
     if measured.result.statistics.get("pushed"):
         return "a force from outside acted, which it does not know"
     mission = measured.mission
-    return unproved(mission.vehicle_models or [], mission.disturbances, mission.obstacles)
+    return why_unproved(mission.vehicle_models or [], mission.disturbances, mission.obstacles)

@@ -21,7 +21,8 @@ from rigidfleet.assessment.outcome import (
     CheckResult,
     Extreme,
     PhaseVerdict,
-    bounded,
+    keeps_limit,
+    limit_check,
     value,
 )
 from rigidfleet.result import LABELS, PAD, Result
@@ -38,20 +39,20 @@ _UNSEEN = 0.01
 
 def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """All checks of a flight: whether it is complete and its record true, its ends of phases, its quantities."""
-    yield _complete(measured.result)
-    yield from _record(measured)
-    yield from _unseen(measured)
+    yield _completeness_check(measured.result)
+    yield from _record_check(measured)
+    yield from _sample_checks(measured)
     yield from _failures_or_nearest(
         [
-            *_settled(phases),
-            *_shapes(measured, phases),
-            *_waypoints(phases),
-            *_touch_downs(measured, phases),
+            *_settling_checks(phases),
+            *_shape_checks(measured, phases),
+            *_waypoint_checks(phases),
+            *_touch_down_checks(measured, phases),
         ]
     )
     for q in QUANTITIES.values():
-        yield from _CHECKS.get(q.name, _limited)(measured, q)
-    yield from _corner(measured)
+        yield from _CHECKS.get(q.name, _quantity_check)(measured, q)
+    yield from _corner_check(measured)
 
 
 def _failures_or_nearest(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -64,7 +65,7 @@ def _failures_or_nearest(candidates: Iterable[CheckResult]) -> Iterator[CheckRes
         yield from failed or [max(every, key=lambda c: (c.worst or 0.0) / (c.limit or 1.0))]
 
 
-def _limited(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _quantity_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Compare a quantity with its limit; without a limit, report what a verdict has of each phase."""
     limit = q.limit_of(measured.mission) if q.key else None
     if limit is None and not q.by_phase:
@@ -72,15 +73,15 @@ def _limited(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     e = measured.worst(q.name)
     if e is None and limit is not None and q in MOTIONS and measured.result.interpolation:
         words = (
-            f"{q.called} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none. Assume"
-            " cubics, or give velocities"
+            f"{q.name_in_words} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none."
+            " Assume cubics, or give velocities"
         )
         yield CheckResult(q.name, False, words, None, limit, q.unit)
     elif e is not None or limit is not None:
-        yield bounded(q, e, limit)
+        yield limit_check(q, e, limit)
 
 
-def _complete(result: Result) -> CheckResult:
+def _completeness_check(result: Result) -> CheckResult:
     end = float(result.time[-1])
     finite = np.isfinite(result.position)
     if not finite.all():
@@ -97,17 +98,17 @@ def _complete(result: Result) -> CheckResult:
     return CheckResult("complete", False, words, when=end, phase=result.phases[-1].name)
 
 
-def _record(measured: Measurements) -> Iterator[CheckResult]:
+def _record_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail a record that contradicts itself: it has been altered and proves nothing."""
-    found = list(measured.contradictions())
-    if found:
-        words, when = found[0]
-        more = f", and {len(found) - 1} more like that" if len(found) > 1 else ""
+    contradictions = list(measured.contradictions())
+    if contradictions:
+        words, when = contradictions[0]
+        more = f", and {len(contradictions) - 1} more like that" if len(contradictions) > 1 else ""
         words = f"the record contradicts itself: {words}{more}. Fly the mission again"
         yield CheckResult("record", False, words, when=when)
 
 
-def _unseen(measured: Measurements) -> Iterator[CheckResult]:
+def _sample_checks(measured: Measurements) -> Iterator[CheckResult]:
     """Fail waypoints and ends of shaping phases that no sample is near: they cannot be judged."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
@@ -135,7 +136,7 @@ def _unseen(measured: Measurements) -> Iterator[CheckResult]:
                 yield CheckResult("samples", False, words, away, _UNSEEN, "s", when=t, phase=p.name)
 
 
-def _settled(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+def _settling_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     for p in phases:
         if p.settled is not None:
             how = "settled after" if p.settled else "did not settle within"
@@ -143,7 +144,7 @@ def _settled(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
             yield CheckResult("settled", p.settled, words, when=p.t_end, phase=p.name)
 
 
-def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """Check each formation at the end of the phases that shape it, and at the end of the flight."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
@@ -160,7 +161,7 @@ def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[Chec
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
-            yield _at_end(p, "distances", held, words, p.distances, limit, "m")
+            yield _check_at_end(p, "distances", held, words, p.distances, limit, "m")
         if i not in measured.fits:
             continue
         fit = measured.fits[i]
@@ -182,28 +183,28 @@ def _shapes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[Chec
             words = f"'{p.formation}' is not reached: {words}"
         else:
             words = f"'{p.formation}' is reached: {words}"
-        yield _at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
+        yield _check_at_end(p, "shape", passed, words, fit.error, fit.limit, "m", who=who)
         if fit.in_order is not None:
             words = f"the agents of '{p.formation}' are {'' if fit.in_order else 'not '}in order"
-            yield _at_end(p, "order", fit.in_order, words)
+            yield _check_at_end(p, "order", fit.in_order, words)
         if not passed:
             continue  # handedness and side mean nothing for a wrong shape
         if p.handedness is not None:
             words = (
                 "is the mirror image of its slots"
-                if fit.mirrored
+                if fit.is_mirrored
                 else "has the intended handedness"
             )
-            yield _at_end(p, "handedness", p.handedness, f"'{p.formation}' {words}")
+            yield _check_at_end(p, "handedness", p.handedness, f"'{p.formation}' {words}")
         if p.flip is not None:
             what = "normal" if fit.dimension == 2 else "direction"
             flipped = "has flipped" if p.flip > FLIPPED else "has not flipped"
             words = f"{what} is {value(p.flip, 'deg')} from where it should point"
             words = f"'{p.formation}' {flipped}: its {words}"
-            yield _at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
+            yield _check_at_end(p, "flip", p.flip <= FLIPPED, words, p.flip, FLIPPED, "deg")
 
 
-def _at_end(
+def _check_at_end(
     p: PhaseVerdict,
     check: str,
     passed: bool,
@@ -220,8 +221,8 @@ def _at_end(
     )
 
 
-def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """How well every waypoint is met, in each quantity."""
+def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+    """How far waypoints are missed in each quantity: those that are, or else the one that comes nearest."""
     points = [
         (p, what, at)
         for p in phases
@@ -233,10 +234,11 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
         if at is not None
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
-        unit = UNITS[name]
-        for p, what, at in points:
-            if (miss := getattr(at, name)) is None:
-                continue
+        unit, every = UNITS[name], [x for x in points if getattr(x[2], name) is not None]
+        off = [getattr(at, name) for *_, at in every]
+        missed = [k for k, miss in enumerate(off) if not miss <= limit]
+        for k in missed or ([off.index(max(off))] if off else []):
+            (p, what, at), miss = every[k], off[k]
             passed = miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
@@ -245,7 +247,7 @@ def _waypoints(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
             )
 
 
-def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
+def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
     """Check how fast vehicles come down at the end of each landing."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
@@ -257,7 +259,7 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         who = np.flatnonzero(measured.left[k] & (measured.close.each[k] <= PAD))
         who = who[measured.standing(np.full(len(who), k), who).any(axis=0)]
         if not len(who):
-            yield _at_end(p, "touch_down", False, "no vehicle is on the ground")
+            yield _check_at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue
         worst = int(who[down[who].argmax()])
         speed = max(0.0, float(down[worst]))
@@ -267,12 +269,12 @@ def _touch_downs(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator
         if (off := int(np.isfinite(measured.result.motors_off).sum())) > 0:
             words += f"; {off} vehicle{'s' if off > 1 else ''} may switch off"
         passed = speed <= TOUCH_DOWN
-        yield _at_end(
+        yield _check_at_end(
             p, "touch_down", passed, words, speed, TOUCH_DOWN, "m/s", who=f"agent {worst + 1}"
         )
 
 
-def _corner(measured: Measurements) -> Iterator[CheckResult]:
+def _corner_check(measured: Measurements) -> Iterator[CheckResult]:
     """Fail limits of acceleration where a curve that others made turns at a corner: none is great enough there."""
     result = measured.result
     if result.interpolation is None or not np.isfinite(result.acceleration).any():
@@ -288,19 +290,19 @@ def _corner(measured: Measurements) -> Iterator[CheckResult]:
     judged = any(x.limit_of(measured.mission) for x in MOTIONS if x.order == 2)
     if judged:
         words += f" (limit {_CORNER:g} m/s where accelerations are limited)"
-    yield bounded(
+    yield limit_check(
         Quantity("corner", "m/s"), e, _CORNER if judged else None, words, passed=not judged
     )
 
 
-def _separation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     e, limit = measured.worst(q.name), measured.mission.limits.separation
     if e is not None:
         words, first = "", measured.first_contact(q.name, e)
         if first is not None:
             words = f"{first.who} collide, first at {first.when:.2f} s; {e.who} overlap the most,"
             words += f" by {value(abs(e.value), 'm')} at {e.when:.2f} s"
-        yield bounded(q, e, q.limit_of(measured.mission), words, first=first)
+        yield limit_check(q, e, q.limit_of(measured.mission), words, first=first)
     elif limit is not None and measured.result.interpolation is not None:
         one = measured.result.n_agents == 1
         words = (
@@ -311,35 +313,40 @@ def _separation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
         yield CheckResult(q.name, False, words, None, limit, q.unit)
 
 
-def _flying(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the separation of agents of which one is at the altitude from which on it holds."""
     limit, altitude = q.limit_of(measured.mission), measured.mission.limits.separation_altitude
     if limit is not None and measured.worst("separation") is not None:
         e = measured.worst(q.name)
-        words = "no two agents come as near" if e is None else _near(e)
+        words = "no two agents come as near" if e is None else _nearness_in_words(e)
         words += f" with one at z = {altitude:g} m or above (limit {limit:g} m)"
-        yield bounded(q, e, limit, words)
+        yield limit_check(q, e, limit, words)
 
 
-def _as_planned(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _planned_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
-    allowed, every = q.limit_of(measured.mission), []
-    for record, worst in zip(measured.result.phases, measured.worst_of, strict=True):
-        if record.planned is not None and (e := worst.get("separation")) is not None:
-            planned = record.planned["separation"]
-            words = (
-                f"in phase '{record.name}' {_near(e)};"
-                f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
-            )
-            every.append(bounded(q, replace(e, value=planned - e.value), allowed, words))
-    yield from _failures_or_nearest(every)
+    allowed = q.limit_of(measured.mission)
+    every = [
+        (record.planned["separation"], e, record.name)
+        for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True)
+        if record.planned is not None and (e := worst.get("separation")) is not None
+    ]
+    nearer = [planned - e.value for planned, e, _ in every]
+    beyond = [k for k, by in enumerate(nearer) if not keeps_limit(q, by, allowed)]
+    for k in beyond or ([nearer.index(max(nearer))] if nearer else []):
+        planned, e, name = every[k]
+        words = (
+            f"in phase '{name}' {_nearness_in_words(e)};"
+            f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
+        )
+        yield limit_check(q, replace(e, value=nearer[k]), allowed, words)
 
 
-def _near(e: Extreme) -> str:
+def _nearness_in_words(e: Extreme) -> str:
     return f"{e.who} come within {value(e.value, 'm')} of each other at {e.when:.2f} s"
 
 
-def _clearance(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _clearance_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the clearance in flight, and separately that of vehicles that stand on an obstacle at start or end."""
     if (least := measured.worst(q.name)) is None:
         return
@@ -355,17 +362,17 @@ def _clearance(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
             who, what = first.who.split(", ", 1)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = f"{who} hits '{what}', first at {first.when:.2f} s; {agent} is deepest in '{obstacle}', {depth}"
-        yield bounded(q, e, 0.0, words, passed=not first, first=first)
+        yield limit_check(q, e, 0.0, words, passed=not first, first=first)
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
         if name in apart and not hit:
             e = apart[name]
             agent, obstacle = e.who.split(", ", 1)
             how = "in contact with" if e.value <= _CONTACT else f"{value(e.value, 'm')} above"
             words = f"{agent} stands {how} '{obstacle}' {when} ({e.when:.2f} s)"
-            yield bounded(quantity(name), e, 0.0, words, passed=True)
+            yield limit_check(quantity(name), e, 0.0, words, passed=True)
 
 
-def _lost(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _loss_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check that the vehicles that the mission loses do not hit those still flying; report phases not flown."""
     if not measured.left.all() and measured.mission.first_loss < math.inf:
         who = np.flatnonzero(~measured.left[-1])
@@ -376,12 +383,12 @@ def _lost(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
             if (first := measured.first_contact(q.name, e)) is not None:
                 words += f"; after that, {first.who} collide, first at {first.when:.2f} s"
             else:
-                words += f"; after that, {_near(e)}"
-        yield bounded(q, e, 0.0, words, first=first)
-    yield from abandoned(measured)
+                words += f"; after that, {_nearness_in_words(e)}"
+        yield limit_check(q, e, 0.0, words, first=first)
+    yield from abandonment_check(measured)
 
 
-def abandoned(measured: Measurements) -> Iterator[CheckResult]:
+def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
     """Report the phases that the flight left, or never began, because a vehicle or link was lost."""
     mission, flown = measured.mission, measured.result.phases
     when = mission.first_loss
@@ -403,36 +410,36 @@ def abandoned(measured: Measurements) -> Iterator[CheckResult]:
     )
 
 
-def _geofence(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     if q.limit_of(measured.mission) is None or (e := measured.worst(q.name)) is None:
         return
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
     if e.value > 0:
         words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
-    yield bounded(q, e, 0.0, words)
+    yield limit_check(q, e, 0.0, words)
 
 
-def _thrust(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the vehicle nearest to its own thrust limit; report the greatest thrust if another vehicle has it."""
     if (e := measured.worst(q.name)) is None:
         return  # nobody knows what a trajectory from elsewhere needs
     limits, margin = measured.mission.fleet.thrust_limit, QUANTITIES["thrust_margin"]
-    beyond = measured.among(margin.name, Samples(margin, measured.thrust - limits))
+    beyond = measured.worst_among(margin.name, Samples(margin, measured.thrust - limits))
     if beyond is None:
-        yield bounded(q, e, None)
+        yield limit_check(q, e, None)
         return
 
     def limit(who: str) -> float:
         return float(limits[int(who.removeprefix("agent ")) - 1])
 
     if e.value - limit(e.who) < beyond.value:
-        yield bounded(quantity("thrust_peak"), e, None)
+        yield limit_check(quantity("thrust_peak"), e, None)
         most = limit(beyond.who)
         e = replace(beyond, value=beyond.value + most)
-    yield bounded(q, e, limit(e.who))
+    yield limit_check(q, e, limit(e.who))
 
 
-def _rotor_force(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _rotor_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """The rotor nearest to its limit, from step to step and at samples."""
     result, limits = measured.result, np.array(q.limit_of(measured.mission))
     if result.rotor_force is None or not limits.any():
@@ -453,10 +460,10 @@ def _rotor_force(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
         f"the {LABELS['rotor'][j]} rotor of {e.who} gives up to {value(worst, 'N')} at {when:.2f} s"
         f" (limit {value(limit, 'N')})"
     )
-    yield bounded(q, e, limit, words, passed=share <= 1.0 + SLACK)
+    yield limit_check(q, e, limit, words, passed=share <= 1.0 + SLACK)
 
 
-def _saturation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _saturation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Share of a phase in which a vehicle with rotors cannot give what is asked of it."""
     e, limit = measured.worst(q.name), q.limit_of(measured.mission)
     if e is None or not any(model.rotor_limit for model in measured.mission.vehicle_models or ()):
@@ -468,38 +475,38 @@ def _saturation(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     if e.value == 0.0:
         yield CheckResult(q.name, True, q.nothing, 0.0, limit, q.unit)
     else:
-        yield bounded(q, e, limit, words)
+        yield limit_check(q, e, limit, words)
 
 
-def _tilt(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _tilt_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the tilt: of vehicles with rotors always, of points where it is limited."""
     if not any(model.rotor_limit for model in measured.mission.vehicle_models or ()):
-        yield from _limited(measured, q)
+        yield from _quantity_check(measured, q)
     elif (e := measured.worst(q.name)) is not None:
-        yield bounded(q, e, q.limit_of(measured.mission))
+        yield limit_check(q, e, q.limit_of(measured.mission))
 
 
-def _tracking_error(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+def _tracking_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check how far agents are off the slots that they track: of vehicles at every tick, of points at samples."""
     limit = q.limit_of(measured.mission)
     own = measured.result.interpolation is None  # the curves of others are their own slots
     e = measured.worst(q.name) if own else None
     if e is not None or limit is not None:
-        yield bounded(q, e, limit)
+        yield limit_check(q, e, limit)
 
 
 #: Checks that are more than a comparison with a limit, by quantity.
 _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = {
-    "separation": _separation,
-    "separation_flying": _flying,
-    "separation_as_planned": _as_planned,
-    "clearance": _clearance,
-    "lost": _lost,
-    "geofence": _geofence,
-    "thrust": _thrust,
-    "rotor_force": _rotor_force,
-    "saturation": _saturation,
-    "tilt": _tilt,
-    "tracking_error": _tracking_error,
+    "separation": _separation_check,
+    "separation_flying": _flying_separation_check,
+    "separation_as_planned": _planned_separation_check,
+    "clearance": _clearance_checks,
+    "lost": _loss_checks,
+    "geofence": _geofence_check,
+    "thrust": _thrust_checks,
+    "rotor_force": _rotor_check,
+    "saturation": _saturation_check,
+    "tilt": _tilt_check,
+    "tracking_error": _tracking_check,
     "guarantee": guarantee_check,
 }

@@ -40,6 +40,49 @@ _FLAT = 1e-9
 _JUDGED = 200
 
 
+class Alignments:
+    """Slots fitted to the agents of G formations of equally many agents; what is asked for is found for all at once."""
+
+    def __init__(self, p: Floats, slots: Floats) -> None:
+        """Take agents and slots (G, N, 3)."""
+        self.p, self.slots = (x - x.sum(axis=1, keepdims=True) / x.shape[1] for x in (p, slots))
+        few = 1 < p.shape[1] <= _FEW
+        #: The pair with the worst distance (G, 5): error [m], both, flown, of slots [m]; None of many agents.
+        self.worst = _worst_pairs_of_few(p, slots).tolist() if few else None
+
+    @cached_property
+    def across(self) -> Floats:
+        """The sums of p slot^T (G, 3, 3) over the agents."""
+        return self.p.swapaxes(1, 2) @ self.slots
+
+    @cached_property
+    def distances_off(self) -> Floats:
+        """Distance (G, N) of each agent from its slot, mirrored if that fits better."""
+        U, _, Vt = np.linalg.svd(self.across)
+        return length(self.p - self.slots @ (U @ Vt).swapaxes(1, 2))
+
+    @cached_property
+    def size(self) -> Floats:
+        """Greatest coordinate (G,) of the slots, about their centre."""
+        return np.abs(self.slots).max(axis=(1, 2))
+
+    @cached_property
+    def are_mirrored(self) -> list[bool]:
+        """Whether the slots fit better if they are mirrored (G,)."""
+        return (~(np.linalg.det(self.across) > 0.0)).tolist()
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """The best-fitting rotation (G, 3, 3), without a reflection."""
+        return rigid_body.best_rotation(*np.linalg.svd(self.across))[0]
+
+    @cached_property
+    def order(self) -> list[list[int]]:
+        """The agents in the order in which they follow each other where they extend most."""
+        along = np.linalg.eigh(self.p.swapaxes(1, 2) @ self.p)[1][..., -1:]
+        return (self.p @ along)[..., 0].argsort(axis=1).tolist()
+
+
 class Fit:
     """A formation as flown at one sample, compared with its slots.
 
@@ -53,77 +96,46 @@ class Fit:
 
     limit: float
 
-    def __init__(self, p: Floats, slots: Floats, who: Ints | None = None) -> None:
-        """Compare agents p (N, 3) with slots (N, 3); ``who`` (N,) are their numbers."""
+    def __init__(
+        self,
+        p: Floats,
+        slots: Floats,
+        who: Ints | None = None,
+        group: Alignments | None = None,
+        k: int = 0,
+    ) -> None:
+        """Compare agents p (N, 3) with slots (N, 3), the k-th of ``group``; ``who`` (N,) are their numbers."""
+        self._group, self._k = Alignments(p[None], slots[None]) if group is None else group, k
         shape = _shape if slots.nbytes < _KEPT else _shape_of_many
         self.dimension, self.axis, self._plane, self._order, self.shortest = shape(slots.tobytes())
-        self._p, self._slots = (x - x.sum(axis=0) / len(x) for x in (p, slots))
-        self.error, pair, self.flown, self.intended = self._worst_pair(p, slots)
+        self.error, pair, self.flown, self.intended = _worst_pair(p, slots, self._group, k)
         self.pair = pair if who is None else (int(who[pair[0]]), int(who[pair[1]]))
 
-    @cached_property
-    def _across(self) -> Floats:
-        """The sum of p slot^T (3, 3) over the agents."""
-        return self._p.T @ self._slots
-
-    @cached_property
-    def mirrored(self) -> bool:
+    @property
+    def is_mirrored(self) -> bool:
         """Whether a spatial shape is the mirror image of its slots."""
-        return self.dimension == 3 and not np.linalg.det(self._across) > 0.0
+        return self.dimension == 3 and self._group.are_mirrored[self._k]
 
     @cached_property
     def points(self) -> list[float]:
         """Where the best-fitting rotation turns the axis in the world: a vector (3,) of any length."""
+        across = self._group.across[self._k]
         if self.dimension == 1:
-            found = (self._across @ self.axis).tolist()
-            known = any(found)
+            axis = (across @ self.axis).tolist()
+            unique = any(axis)
         else:
-            (x, y, z), (u, v, w) = (self._plane @ self._across.T).tolist()
-            found = [y * w - z * v, z * u - x * w, x * v - y * u]
-            known = math.hypot(*found) > _FLAT * (x * x + y * y + z * z + u * u + v * v + w * w)
-        if known:
-            return found
+            (x, y, z), (u, v, w) = (self._plane @ across.T).tolist()
+            axis = [y * w - z * v, z * u - x * w, x * v - y * u]
+            unique = math.hypot(*axis) > _FLAT * (x * x + y * y + z * z + u * u + v * v + w * w)
         # Of agents on a line, or at a point, many rotations fit equally well.
-        return (rigid_body.best_rotation(*np.linalg.svd(self._across))[0] @ self.axis).tolist()
+        return axis if unique else (self._group.rotation[self._k] @ self.axis).tolist()
 
-    @cached_property
+    @property
     def in_order(self) -> bool | None:
         """Whether the agents of a line are in order; None for other shapes, and for two agents."""
         if self.dimension != 1 or len(self._order) < 3:
             return None
-        along = np.linalg.eigh(self._p.T @ self._p)[1][:, -1]  # where they extend most
-        return (self._p @ along).argsort().tolist() in (self._order, self._order[::-1])
-
-    def _worst_pair(self, p: Floats, slots: Floats) -> tuple[float, tuple[int, int], float, float]:
-        """Worst error of a distance among all pairs: error, pair, flown, intended [m].
-
-        Of many agents, few pairs have to be computed: the error of a pair is at most the sum of both agents' distances
-        from their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
-        """
-        if len(p) <= _FEW:
-            i, j = proximity.all_pairs(len(p))
-            flown, intended = (length(x[i] - x[j]) for x in (p, slots))
-            error = np.abs(flown - intended)
-            # Of equal errors the first pair's.
-            at = int((error >= error.max() - _ROUNDING * intended.max()).argmax())
-            return error.item(at), (i.item(at), j.item(at)), flown.item(at), intended.item(at)
-        U, _, Vt = np.linalg.svd(self._across)
-        off, both = length(self._p - self._slots @ (U @ Vt).T), np.array([p, slots])
-        order = np.argsort(-off, kind="stable")
-        ranked, rounding = -off[order], _ROUNDING * float(np.abs(self._slots).max())
-        worst = (-1.0, (0, 0), 0.0, 0.0)
-        for first, i in enumerate(order[:-1].tolist(), start=1):
-            last = bisect_left(ranked, off[i] - worst[0] - rounding)
-            if last <= first:
-                break
-            others = np.sort(order[first:last])
-            flown, intended = length(both.take(others, axis=1) - both[:, i, None])
-            error = np.abs(flown - intended)
-            at = int(error.argmax())
-            if (most := float(error[at])) > worst[0]:
-                j = int(others[at])
-                worst = (most, (min(i, j), max(i, j)), float(flown[at]), float(intended[at]))
-        return worst
+        return self._group.order[self._k] in (self._order, self._order[::-1])
 
 
 @lru_cache(64)
@@ -140,6 +152,46 @@ def _shape(slots: bytes) -> tuple[int, Floats, Floats, list[int], float]:
 
 
 _shape_of_many = lru_cache(1)(_shape.__wrapped__)
+
+
+def _worst_pairs_of_few(p: Floats, slots: Floats) -> Floats:
+    """Worst error of a distance of few agents (G, N, 3), see `Laid.worst`; of equal errors the first pair's."""
+    i, j = proximity.all_pairs(p.shape[1])
+    flown, intended = (length(x.take(i, axis=1) - x.take(j, axis=1)) for x in (p, slots))
+    error = np.abs(flown - intended)
+    least = error.max(axis=1) - _ROUNDING * intended.max(axis=1)
+    at = (error >= least[:, None]).argmax(axis=1)
+    k = np.arange(len(p))
+    return np.stack([error[k, at], i[at], j[at], flown[k, at], intended[k, at]], axis=1)
+
+
+def _worst_pair(
+    p: Floats, slots: Floats, group: Alignments, k: int
+) -> tuple[float, tuple[int, int], float, float]:
+    """Worst error of a distance among all pairs: error, pair, flown, intended [m].
+
+    Of many agents, few pairs have to be computed: the error of a pair is at most the sum of both agents' distances from
+    their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
+    """
+    if group.worst is not None:
+        error, i, j, flown, intended = group.worst[k]
+        return error, (int(i), int(j)), flown, intended
+    off, both = group.distances_off[k], np.array([p, slots])
+    order = np.argsort(-off, kind="stable")
+    ranked, rounding = -off[order], _ROUNDING * float(group.size[k])
+    worst = (-1.0, (0, 0), 0.0, 0.0)
+    for first, i in enumerate(order[:-1].tolist(), start=1):
+        last = bisect_left(ranked, off[i] - worst[0] - rounding)
+        if last <= first:
+            break
+        others = np.sort(order[first:last])
+        flown, intended = length(both.take(others, axis=1) - both[:, i, None])
+        error = np.abs(flown - intended)
+        at = int(error.argmax())
+        if (most := float(error[at])) > worst[0]:
+            j = int(others[at])
+            worst = (most, (min(i, j), max(i, j)), float(flown[at]), float(intended[at]))
+    return worst
 
 
 def is_rigid(p: Floats, edges: Ints) -> bool:

@@ -7,12 +7,11 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, quantity
-from rigidfleet.assessment.fits import Fit, angle_between
+from rigidfleet.assessment.fits import Alignments, Fit, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -21,7 +20,6 @@ from rigidfleet.result.quantities import (
     SAMPLED,
     Samples,
     closeness,
-    length,
     owner_name,
     samples,
     without_lost,
@@ -32,6 +30,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 #: Forces have no such bound: a peak is searched only where the ends of a step show one, so that a jump of a user's
 #: force may be missed.
 _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
+
+#: Quantities of which a phase between samples has a worst value.
+_DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geofence")
 
 
 class Measurements:
@@ -47,29 +48,32 @@ class Measurements:
         #: Phases that have samples.
         self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
         #: Quantities of which the record tells what happens between samples.
-        self.told = set[str]().union(*(p.extremes for p in result.phases))
+        self.names_recorded = set[str]().union(*(p.extremes for p in result.phases))
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
+        self._nearest: dict[tuple[float, int], int] = {}
         self._sampled: dict[str, Samples] = {}
         #: Distances to each other and to obstacles at samples.
         self.close = closeness(result)
-        self.measured = {q.name: self.sampled(q.name) for q in QUANTITIES.values() if q.by_phase}
+        self.measured = {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
         self.thrust = self.measured["thrust"].values
-        #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
-        self.rank = {name: [-math.inf] * len(result.phases) for name in self.measured}
         starts = np.array([self.samples[k].start for k in self.flown])
-        for name, sampled in self.measured.items():
+        ranks = np.full((len(self.measured), len(result.phases)), -np.inf)
+        for row, sampled in zip(ranks, self.measured.values(), strict=True):
             if places := sampled.rank.shape[1]:
-                most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
-                for k, rank in zip(self.flown, most, strict=True):
-                    self.rank[name][k] = rank
+                row[self.flown] = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts)
+        #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
+        self.rank = dict(zip(self.measured, ranks.tolist(), strict=True))
+        #: The last sample of each phase flown, and positions (F, N, 3) there.
+        self.last = [self.samples[k].stop - 1 for k in self.flown]
+        self.ends = result.position[self.last]
 
-    def first(self, broken: Bools) -> float:
+    def first_time(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
         return float(self.result.time[int(np.argmax(broken))]) if broken.any() else math.inf
 
     # -- at samples -----------------------------------------------------------------------------------
 
-    def sampled(self, name: str) -> Samples:
+    def samples_of(self, name: str) -> Samples:
         """Values of a quantity at samples."""
         if name not in self._sampled:
             self._sampled[name] = samples(self.result, name, self.close)
@@ -87,24 +91,19 @@ class Measurements:
             return None
         k += part.start or 0
         at = (k,) if values.ndim == 1 else (k, place)
-        phase, who = result.phases[result.phase.item(k)].name, samples.owner(*at)
-        return Extreme(
-            values.item(at),
-            result.time.item(k),
-            owner_name(result, samples.quantity, *who),
-            phase,
-            alone,
-        )
+        who = owner_name(result, samples.quantity, *samples.owner(*at))
+        phase = result.phases[result.phase.item(k)].name
+        return Extreme(values.item(at), result.time.item(k), who, phase, alone)
 
     # -- between samples ------------------------------------------------------------------------------
 
-    def between(self, name: str, index: int) -> Extreme | None:
+    def recorded_extreme(self, name: str, index: int) -> Extreme | None:
         """The recorded extreme of a phase in continuous time; None if the record has none."""
         phase = self.result.phases[index]
         x = phase.extremes.get(name)
-        return None if x is None else self.recorded(name, x, phase.name)
+        return None if x is None else self.extreme_of(name, x, phase.name)
 
-    def recorded(self, name: str, x: Extremum, phase: str) -> Extreme:
+    def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
         size = abs(x.value) if name == "constraint" else q.scale * x.value
@@ -113,12 +112,12 @@ class Measurements:
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
         if name in self.measured:
-            every = [worst[name] for worst in self.worst_of if name in worst]
+            every = [worst[name] for worst in self.worst_by_phase if name in worst]
             rank = QUANTITIES[name].rank
             return max(every, key=lambda e: rank(e.value), default=None)
-        return self.among(name, self.sampled(name) if name in SAMPLED else None)
+        return self.worst_among(name, self.samples_of(name) if name in SAMPLED else None)
 
-    def among(self, name: str, samples: Samples | None) -> Extreme | None:
+    def worst_among(self, name: str, samples: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``samples``, or between them."""
         rank = quantity(name).rank
         every = {
@@ -126,27 +125,26 @@ class Measurements:
             for k, p in enumerate(self.result.phases)
             if name in p.extremes
         }
-        between = self.between(name, max(every, key=every.__getitem__)) if every else None
+        between = self.recorded_extreme(name, max(every, key=every.__getitem__)) if every else None
         sampled = None if samples is None else self.worst_sample(samples, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
         return between if rank(between.value) > rank(sampled.value) else sampled
 
     @cached_property
-    def worst_of(self) -> list[dict[str, Extreme]]:
+    def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
-        found: list[dict[str, Extreme]] = [{} for _ in self.samples]
+        every: list[dict[str, Extreme]] = [{} for _ in self.samples]
+        phases = list(zip(self.result.phases, self.samples, every, strict=True))
         for name, sampled in self.measured.items():
-            ranks, alone = self.rank[name], name not in self.told
-            for k, phase in enumerate(self.result.phases):
-                x, rank, worst = phase.extremes.get(name), ranks[k], None
-                if x is not None and rank < sampled.quantity.rank(x.value):
-                    worst = self.recorded(name, x, phase.name)
-                elif rank != -math.inf:
-                    worst = self.worst_sample(sampled, self.samples[k], alone=alone)
-                if worst is not None:
-                    found[k][name] = worst
-        return found
+            rank_of, alone = sampled.quantity.rank, name not in self.names_recorded
+            for rank, (phase, part, worst) in zip(self.rank[name], phases, strict=True):
+                x = phase.extremes.get(name)
+                if x is not None and rank < rank_of(x.value):
+                    worst[name] = self.extreme_of(name, x, phase.name)
+                elif e := self.worst_sample(sampled, part, alone=alone):
+                    worst[name] = e
+        return every
 
     def first_contact(self, name: str, e: Extreme) -> Extreme | None:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
@@ -154,8 +152,8 @@ class Measurements:
             return None
         every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
         if every:
-            return self.between(f"{name}_first", every[0])
-        sampled = self.sampled(name)
+            return self.recorded_extreme(f"{name}_first", every[0])
+        sampled = self.samples_of(name)
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
 
@@ -168,7 +166,7 @@ class Measurements:
         time = self.result.time
         clearance, nearest = without_lost(self.result, self.close.each), self.close.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
-        if not (stands or self.told & {"clearance_start", "clearance_end"}):
+        if not (stands or self.names_recorded & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst("clearance")}
         off, beside = clearance > PAD, np.zeros(clearance.shape, dtype=np.bool_)
@@ -189,7 +187,7 @@ class Measurements:
             return i, int(nearest[k, i])
 
         return {
-            name: self.among(
+            name: self.worst_among(
                 name, Samples(quantity(name), np.where(part, clearance, np.nan), owner)
             )
             for name, part in parts.items()
@@ -229,33 +227,19 @@ class Measurements:
                     f"its {name} is up to {value(worst, unit)} off the value from its own samples"
                 )
                 yield words, float(time[k])
-        there = [thing.solid.there[0].tolist() for thing in self.mission.obstacles]
-        fenced = self.mission.limits.geofence is not None
         for index, phase in enumerate(result.phases):
             samples, extremes = self.samples[index], phase.extremes
             if samples.stop > samples.start and extremes:
-                due = {
-                    "speed": True,
-                    "lowest": True,
-                    "highest": True,
-                    "thrust": self.rank["thrust"][index] > -math.inf,
-                    "separation": result.n_agents > 1
-                    and (self.whole or np.count_nonzero(self.left[samples.start]) > 1),
-                    "clearance": _meets(there, phase),
-                    "geofence": fenced,
-                }
-                lacking = [name for name, needed in due.items() if needed and name not in extremes]
-                if lacking:
-                    words = (
-                        f"it lacks the worst '{lacking[0]}' of phase '{phase.name}' between samples"
-                    )
+                lacking = (x for x in _DUE if x not in extremes and self.is_due(x, index))
+                if name := next(lacking, ""):
+                    words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[samples.start])
             for name, share in _SLACK.items():
                 x, rank = extremes.get(name), self.rank[name][index]
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
-                if rank > quantity(name).rank(x.value) + slack or not (
+                if rank > self.measured[name].quantity.rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
                     sampled = self.worst_sample(self.measured[name], samples)
@@ -265,6 +249,20 @@ class Measurements:
                     )
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
+
+    def is_due(self, name: str, index: int) -> bool:
+        """Whether a phase that has samples has a worst value of a quantity between them."""
+        match name:
+            case "thrust":
+                return self.rank[name][index] > -math.inf
+            case "separation":
+                return bool(np.count_nonzero(self.left[self.samples[index].start]) > 1)
+            case "clearance":
+                phase, every = self.result.phases[index], self.mission.obstacles
+                return any(_meets(*thing.solid.there[0].tolist(), phase) for thing in every)
+            case "geofence":
+                return self.mission.limits.geofence is not None
+        return True
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -282,25 +280,38 @@ class Measurements:
             t_end=record.t_end,
             settled=record.settled,
             finished=finished,
-            constraint=_greatest(result.constraint[samples.stop - 1]) if flown else None,
-            distances=self.edge_error(index) if flown else None,
+            constraint=self.constraints.get(index),
+            distances=self.edge_errors.get(index),
             shape=None if fit is None else fit.error,
-            handedness=None if fit is None or fit.dimension < 3 else not fit.mirrored,
-            flip=self.flip(index),
+            handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
+            flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
-            waypoint=self.miss(index, record.target) if finished else None,
-            stay=self.miss(index, record.stay) if finished else None,
-            through=tuple(self.passed(index)),
-            worst=self.worst_of[index],
+            waypoint=self.misses.get(("target", index)) if finished else None,
+            stay=self.misses.get(("stay", index)) if finished else None,
+            through=tuple(self.misses_on_way(index)),
+            worst=self.worst_by_phase[index],
         )
 
-    def edge_error(self, index: int) -> float | None:
-        """Greatest error [m] of an edge against the formation at the end of a phase flown; None without one."""
-        name, k = self.result.phases[index].formation, self.samples[index].stop - 1
-        if name is None:
-            return None
-        (edges, intended), r = self.edges(name, k), self.result.position[k]
-        return _greatest(length(r[edges[:, 0]] - r[edges[:, 1]]) - intended)
+    @cached_property
+    def constraints(self) -> dict[int, float | None]:
+        """Greatest |c| [m] of an edge at the end of each phase flown."""
+        return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
+
+    @cached_property
+    def edge_errors(self) -> dict[int, float | None]:
+        """Greatest error [m] of an edge against its formation at the end of each phase that has one."""
+        alike: dict[str, list[int]] = {}
+        for i, k in enumerate(self.flown):
+            if (name := self.result.phases[k].formation) is not None:
+                alike.setdefault(name, []).append(i)
+        errors: dict[int, float | None] = {}
+        for name, every in alike.items():
+            # Some edges may be lost later
+            for group in [every] if self._same_edges else [[i] for i in every]:
+                edges, intended = self.edges(name, self.last[group[0]])
+                off = (proximity.lengths(self.ends[group], edges) - intended[:, None]).T
+                errors |= zip([self.flown[i] for i in group], _greatest(off), strict=True)
+        return errors
 
     @property
     def _same_edges(self) -> bool:
@@ -327,80 +338,115 @@ class Measurements:
 
     @cached_property
     def fits(self) -> dict[int, Fit]:
-        """Fits of the formations at the end of each phase."""
-        fits = {}
-        for index in self.flown:
-            k, name = self.samples[index].stop - 1, self.result.phases[index].formation
+        """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
+        alike: dict[int, list[tuple[int, Floats, Floats, Ints | None]]] = {}
+        known = np.atleast_1d(np.isfinite(self.ends).all(axis=(1, 2)))
+        for index, end, finite in zip(self.flown, self.ends, known, strict=True):
+            name = self.result.phases[index].formation
             slots = None if name is None else self.formation(name)[0]
-            p, left = self.result.position[k], np.flatnonzero(self.left[k])
-            if name is None or slots is None or len(left) < 2 or not np.isfinite(p).all():
+            if slots is None or not finite:
                 continue
-            fit = fits[index] = Fit(p[left], slots[left], left)
-            fit.limit = self.mission.formations[name].greatest_error(fit.shortest)
+            one = index, end, slots, None
+            if not self.whole:
+                left = np.flatnonzero(self.left[self.samples[index].stop - 1])
+                one = index, end[left], slots[left], left
+            if len(one[1]) > 1:
+                alike.setdefault(len(one[1]), []).append(one)
+        fits = {}
+        for group in alike.values():
+            alignments = Alignments(
+                np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group])
+            )
+            for k, (index, p, slots, left) in enumerate(group):
+                fit = fits[index] = Fit(p, slots, left, alignments, k)
+                form = self.mission.formations[self.result.phases[index].formation or ""]
+                fit.limit = form.greatest_error(fit.shortest)
         return fits
 
     @cached_property
-    def turns(self) -> dict[int, Floats]:
-        """Matrices (2, 3, 3) from the slots' axes to how they should lie at the end of each phase flown.
-
-        A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        """
-        last = [self.samples[k].stop - 1 for k in self.flown]
-        q = np.stack([self.result.attitude_reference[last], self.result.frame[last]], axis=1)
-        return dict(zip(self.flown, att.dcm_from_quaternion(q).swapaxes(2, 3), strict=True))
-
-    def flip(self, index: int) -> float | None:
-        """Angle [deg] of a line or plane from its intended direction at the end of a phase that has one."""
-        fit = self.fits.get(index)
-        if fit is None or fit.dimension not in (1, 2):
-            return None
-        aims = (self.turns[index] @ fit.axis).tolist()
-        if fit.dimension == 1:
-            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-            aims = aims[:1] if self.result.phases[index].control == "tracking" else []
-        angles = (angle_between(fit.points, aim) for aim in aims)
-        return next(filter(math.isfinite, angles), None)
+    def flips(self) -> dict[int, float]:
+        """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
+        flat = {k: fit for k, fit in self.fits.items() if fit.dimension in (1, 2)}
+        if not flat:
+            return {}
+        # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
+        last = [self.samples[k].stop - 1 for k in flat]
+        q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
+        axes = np.array([fit.axis for fit in flat.values()])
+        aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
+        angle_by_phase = {}
+        for i, (k, fit) in enumerate(flat.items()):
+            some = aims[:, i].tolist()
+            if fit.dimension == 1:
+                # Only tracked slots steer a line; otherwise its direction follows from the shape before.
+                some = some[:1] if self.result.phases[k].control == "tracking" else []
+            angles = (angle_between(fit.points, aim) for aim in some)
+            angle = next(filter(math.isfinite, angles), None)
+            if angle is not None:
+                angle_by_phase[k] = angle
+        return angle_by_phase
 
     def nearest(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
-        time, samples = self.result.time, self.samples[index]
-        after = bisect_left(time, t, samples.start, samples.stop - 1)
-        before = max(after - 1, samples.start)
-        return after if abs(time[after] - t) < abs(time[before] - t) else before
+        known, time, samples = self._nearest.get((t, index)), self.result.time, self.samples[index]
+        if known is None:
+            after = bisect_left(time, t, samples.start, samples.stop - 1)
+            before = max(after - 1, samples.start)
+            known = after if abs(time[after] - t) < abs(time[before] - t) else before
+            self._nearest[t, index] = known
+        return known
 
-    def miss(self, index: int, target: dict[str, Any] | None) -> Waypoint | None:
-        """Miss of the target of a phase, or of its place to stay at its end; None without one.
+    @cached_property
+    def misses(self) -> dict[tuple[str, int], Waypoint]:
+        """Miss of the ``target`` of each phase that has one, and of its place to ``stay`` at its end.
 
         A target is due at its time, or at the end of a phase that settles earlier. Where no formation is held, each
         vehicle has a place of its own: the vehicle furthest from it counts.
         """
-        if target is None:
-            return None
-        result, k = self.result, self.nearest(target["time"], index)
-        off: dict[str, float] = {}
+        result = self.result
+        targets = [
+            ((what, k), x)
+            for k in self.flown
+            for what in ("target", "stay")
+            if (x := getattr(result.phases[k], what)) is not None
+        ]
+        if not targets:
+            return {}
+        at = [self.nearest(target["time"], k) for (_, k), target in targets]
+        miss: dict[str, dict[int, float]] = {}
         for name, values in (
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
             ("rates", result.rates),
         ):  # fmt: skip
-            x, wanted = values[k], target.get(name)
-            if wanted is None or not all(map(math.isfinite, x.tolist())):
-                continue
-            if name == "attitude":
-                off[name] = math.degrees(att.angle_between(x, np.array(wanted)))
+            rows = values[at].tolist()
+            # Where the quantity is asked for, and known.
+            wanted_at = {
+                i: wanted for i, ((_, target), row) in enumerate(zip(targets, rows, strict=True))
+                if (wanted := target.get(name)) is not None and all(map(math.isfinite, row))
+            }  # fmt: skip
+            rows = [rows[i] for i in wanted_at]
+            if name == "attitude" and rows:
+                off = np.degrees(att.angle_between(rows, [*wanted_at.values()])).tolist()
             else:
-                off[name] = math.dist(x.tolist(), wanted)
-        if "position" in off and result.phases[index].formation is None:
-            own = float(np.fmax.reduce(self.sampled("tracking_error").values[k]))
-            # With a vehicle lost, the centre of those left says nothing of their places.
-            off["position"] = max(off["position"], own) if self.left[k].all() else own
-        if "rates" in off:
-            off["rates"] = math.degrees(off["rates"])
-        return Waypoint(
-            result.time.item(k),
-            *(off.get(x) for x in ("position", "velocity", "attitude", "rates")),
-        )
+                off = map(math.dist, rows, wanted_at.values())
+            miss[name] = dict(zip(wanted_at, off, strict=True))
+        for i, off in miss["position"].items():
+            if result.phases[targets[i][0][1]].formation is None:
+                own = float(np.fmax.reduce(self.samples_of("tracking_error").values[at[i]]))
+                # With a vehicle lost, the centre of those left says nothing of their places.
+                miss["position"][i] = max(off, own) if self.left[at[i]].all() else own
+        return {
+            k: Waypoint(
+                time=t,
+                position=miss["position"].get(i),
+                velocity=miss["velocity"].get(i),
+                attitude=miss["attitude"].get(i),
+                rates=math.degrees(miss["rates"][i]) if i in miss["rates"] else None,
+            )
+            for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
+        }
 
-    def passed(self, index: int) -> Iterator[Waypoint]:
+    def misses_on_way(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""
         result, samples = self.result, self.samples[index]
         for point in (result.phases[index].target or {}).get("through", ()):
@@ -412,12 +458,17 @@ class Measurements:
             yield Waypoint(float(result.time[k]), miss, off, None, None)
 
 
-def _meets(there: list[list[float]], phase: PhaseRecord) -> bool:
-    """Whether an obstacle is there during a phase, not only at its start or end, of all ``there`` from when to when."""
-    return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
+def _meets(since: float, until: float, phase: PhaseRecord) -> bool:
+    """Whether an obstacle that is there from when to when [s] is there during a phase, not only at its start or end."""
+    return since < phase.t_end - 1e-9 and until > phase.t_start + 1e-9
 
 
-def _greatest(values: Floats) -> float | None:
-    """Greatest finite size of values (m,); None if there is none."""
-    sizes = np.abs(values[np.isfinite(values)])
-    return float(sizes.max()) if sizes.size else None
+def _greatest(values: Floats) -> list[float | None]:
+    """Greatest finite size of each row of values (G, m); None if there is none."""
+    sizes = np.abs(values)
+    if not sizes.shape[1]:
+        return [None] * len(sizes)
+    return [
+        most if math.isfinite(most) else max(filter(math.isfinite, row.tolist()), default=None)
+        for most, row in zip(sizes.max(axis=1).tolist(), sizes, strict=True)
+    ]

@@ -8,7 +8,7 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.assessment.avoidance import avoidance_notes
-from rigidfleet.assessment.checks import abandoned
+from rigidfleet.assessment.checks import abandonment_check
 from rigidfleet.assessment.fits import angle_between
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import DIP, FLIPPED, PhaseVerdict, value
@@ -21,10 +21,10 @@ _NAMED = 20
 
 def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Facts that fail no check but that a reader should know."""
-    yield from _left(measured)
-    yield from _dips(measured)
-    yield from _turned_over(measured, phases)
-    yield from _fallen(measured)
+    yield from _abandonment_notes(measured)
+    yield from _dip_notes(measured)
+    yield from _turnover_notes(measured, phases)
+    yield from _fall_notes(measured)
     pairs, times = measured.mission.links_lost
     for (i, j), t in zip(pairs + 1, times, strict=True):
         if t < measured.result.time[-1]:
@@ -34,14 +34,14 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
         full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
         if full.any():
             who = agent_names(np.flatnonzero(full.any(axis=0)))
-            since = measured.first(full.max(axis=1))
+            since = measured.first_time(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     yield from avoidance_notes(measured)
-    yield from _sampled(measured)
-    yield from _of_others(measured)
+    yield from _samples_note(measured)
+    yield from _foreign_flight_notes(measured)
 
 
-def _of_others(measured: Measurements) -> Iterator[str]:
+def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
     """What is judged of a flight that others made, how near its centres come, what is odd, and who is who."""
     result = measured.result
     if (how := result.interpolation) is None:
@@ -60,9 +60,9 @@ def _of_others(measured: Measurements) -> Iterator[str]:
         yield f"the least distance centre to centre is {far}, {e.who} at {e.when:.2f} s"
     fast, wide = measured.worst("speed"), float(np.abs(result.position).max())
     if wide > _WIDE or (fast is not None and fast.value > _FAST):
-        told = "" if fast is None else f"speeds reach {fast.value:,.0f} m/s and "
+        speeds = "" if fast is None else f"speeds reach {fast.value:,.0f} m/s and "
         yield (
-            f"{told}positions {wide:,.0f} m: are these metres and seconds? A table may name other units in its "
+            f"{speeds}positions {wide:,.0f} m: are these metres and seconds? A table may name other units in its "
             "columns: x [mm], time [ms]"
         )
     yield from result.statistics.get("notes", [])
@@ -76,10 +76,10 @@ def _of_others(measured: Measurements) -> Iterator[str]:
         yield f"agents from 1 on are {', '.join(names[:_NAMED])}{more}"
 
 
-def _left(measured: Measurements) -> Iterator[str]:
+def _abandonment_notes(measured: Measurements) -> Iterator[str]:
     """Note each phase that was left for another one before it arrived."""
     result = measured.result
-    yield from (check.message for check in abandoned(measured))
+    yield from (check.message for check in abandonment_check(measured))
     if result.mission.on_loss != "continue":
         return  # no phase of such a mission was begun by hand
     for phase, record in zip(result.mission.phases, result.phases, strict=False):
@@ -87,7 +87,7 @@ def _left(measured: Measurements) -> Iterator[str]:
             yield f"'{record.name}' was left at {record.t_end:.2f} s, before its arrival, which is not judged"
 
 
-def _sampled(measured: Measurements) -> Iterator[str]:
+def _samples_note(measured: Measurements) -> Iterator[str]:
     """Note a record that does not say what happens between its samples."""
     if any(not measured.result.phases[k].extremes for k in measured.flown):
         step = float(np.diff(measured.result.time).max(initial=0.0))
@@ -97,7 +97,7 @@ def _sampled(measured: Measurements) -> Iterator[str]:
         )
 
 
-def _fallen(measured: Measurements) -> Iterator[str]:
+def _fall_notes(measured: Measurements) -> Iterator[str]:
     """Note where each lost vehicle falls."""
     radius = measured.mission.agents.radius
     for i in np.flatnonzero(~measured.left[-1] & (measured.mission.lost_at < np.inf)):
@@ -106,12 +106,12 @@ def _fallen(measured: Measurements) -> Iterator[str]:
         down = ~measured.left[:, i] & (r[:, 2] <= measured.mission.height_at(*r.T) + radius[i])
         if down.any():
             x, y, _ = r[-1]
-            yield f"{words} hits the ground at {measured.first(down):.2f} s and lies at ({x:z.1f}, {y:z.1f}) m"
+            yield f"{words} hits the ground at {measured.first_time(down):.2f} s and lies at ({x:z.1f}, {y:z.1f}) m"
         else:
             yield f"{words} is still falling at z = {r[-1, 2]:.1f} m when the flight ends"
 
 
-def _dips(measured: Measurements) -> Iterator[str]:
+def _dip_notes(measured: Measurements) -> Iterator[str]:
     """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
     mission = measured.mission
     if mission.limits.geofence is not None or any(
@@ -120,14 +120,14 @@ def _dips(measured: Measurements) -> Iterator[str]:
         return
     e = measured.worst("lowest")
     if e is not None and e.value < -DIP:
-        z = measured.sampled("lowest").values
+        z = measured.samples_of("lowest").values
         low = np.flatnonzero((z < -DIP).any(axis=0))
         others = f" ({agent_names(low)} are below 0 at times)" if len(low) > 1 else ""
         words = f"dips to z = {e.value:.2f} m at {e.when:.2f} s{others}"
         yield f"{e.who} {words}; the mission has no ground"
 
 
-def _turned_over(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
+def _turnover_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Note planar formations that turn over between phases while no attitude is commanded."""
     seen: dict[str, tuple[list[float], float]] = {}
     for i, p in enumerate(phases):

@@ -138,7 +138,14 @@ class PhaseVerdict:
     worst: dict[str, Extreme]
 
 
-def bounded(
+def keeps_limit(q: Quantity, worst: float, limit: float) -> bool:
+    """Whether a worst value keeps its limit."""
+    if q.at_least:
+        return worst >= limit - SLACK and worst > 0
+    return worst <= limit + SLACK * max(1.0, abs(limit))
+
+
+def limit_check(
     q: Quantity,
     e: Extreme | None,
     limit: float | None,
@@ -150,20 +157,21 @@ def bounded(
     """Compare a worst value with its limit, if it has one; ``first`` is the first contact."""
     at_least = q.at_least and limit is not None
     if e is None:
-        words = words or q.nothing or f"the flight has no {q.called} to judge"
+        words = words or q.nothing or f"the flight has no {q.name_in_words} to judge"
         return CheckResult(
             q.name, True, words, None, limit, q.unit, at_least, judged=limit is not None
         )
     if not words:
         bound = "" if limit is None else f" (limit {limit:g} {q.unit})"
-        words = q.words or f"greatest {q.called} {{worst}}, {{who}}, at {{when:.2f}} s{bound}"
+        words = (
+            q.words or f"greatest {q.name_in_words} {{worst}}, {{who}}, at {{when:.2f}} s{bound}"
+        )
         worst = value(e.value, q.unit)
         words = words.format(worst=worst, who=e.who, when=e.when, limit=limit)
     if e.at_samples:
         words += ", at samples"
     if passed is None and limit is not None:
-        greatest = limit + SLACK * max(1.0, abs(limit))
-        passed = e.value >= limit - SLACK and e.value > 0 if q.at_least else e.value <= greatest
+        passed = keeps_limit(q, e.value, limit)
     passed = passed is None or bool(passed)
     return CheckResult(
         q.name, passed, words, e.value, limit, q.unit, at_least, e.when, e.who, e.phase,

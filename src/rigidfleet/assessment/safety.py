@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rigidfleet._common.facts import Fact
-from rigidfleet._common.quantities import QUANTITIES, shown
+from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.assessment.measure import Measurements
 from rigidfleet.assessment.outcome import Extreme
 from rigidfleet.assessment.verdict import Verdict
@@ -77,7 +77,9 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             limit, worst = q.limit_of(result.mission), measured.worst(q.name)
         if (q.key or q.limit) and (limit is not None or worst is not None):
             limit = None if limit is None or not np.isfinite(limit) else limit
-            row = Safety(q.called, q.text, shown(q.unit), q.at_least, limit, worst, passed)
+            row = Safety(
+                q.name_in_words, q.text, display_unit(q.unit), q.at_least, limit, worst, passed
+            )
             beyond = check is None and row.margin is not None and row.margin < -1e-9
             rows.append(replace(row, passed=passed and not beyond))
     return rows

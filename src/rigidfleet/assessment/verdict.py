@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown, worst_values
 from rigidfleet._common.plain import plain
 from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold
@@ -77,12 +77,12 @@ class Verdict(Shown):
     @property
     def by_name(self) -> dict[str, CheckResult]:
         """Each check by its name; of those that several phases fail, the one with the worst value."""
-        found: dict[str, CheckResult] = {}
+        by_name: dict[str, CheckResult] = {}
         for check in self.checks:
-            rank, known = quantity(check.check).rank, found.setdefault(check.check, check)
+            rank, known = quantity(check.check).rank, by_name.setdefault(check.check, check)
             if check.worst is not None and known.worst is not None:
-                found[check.check] = max(known, check, key=lambda c: rank(c.worst))
-        return found
+                by_name[check.check] = max(known, check, key=lambda c: rank(c.worst))
+        return by_name
 
     @property
     def worst(self) -> dict[str, Extreme]:
@@ -103,8 +103,8 @@ class Verdict(Shown):
 
         Then the phases in which a user's controller was not called.
         """
-        told = f"\n{self.uncalled[0].upper()}{self.uncalled[1:]}." if self.uncalled else ""
-        return self._judgement() + told
+        uncalled = f"\n{self.uncalled[0].upper()}{self.uncalled[1:]}." if self.uncalled else ""
+        return self._judgement() + uncalled
 
     def _judgement(self) -> str:
         judged = [check for check in self.checks if check.judged]
@@ -112,13 +112,15 @@ class Verdict(Shown):
         if failed:
             head = f"Failed: {len(failed)} of {len(judged)} checks."
             return "\n".join([head, *(f"- {check.message}" for check in failed)])
-        found = {f.check: f for f in self.checks if f.worst is not None}
+        by_check = {f.check: f for f in self.checks if f.worst is not None}
         praise = dict(_PRAISE)
-        if "thrust_peak" in found:
+        if "thrust_peak" in by_check:
             praise["thrust"] = "{who} comes nearest to its limit, at {worst} of {limit}"
-        told = [found[name].fill(words) for name, words in praise.items() if name in found]
+        praise_lines = [
+            by_check[name].fill(words) for name, words in praise.items() if name in by_check
+        ]
         head = f"Passed: {all_hold(len(judged))}"
-        return (f"{head}; {', '.join(told)}." if told else f"{head}.") + self.covers
+        return (f"{head}; {', '.join(praise_lines)}." if praise_lines else f"{head}.") + self.covers
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""
@@ -164,9 +166,9 @@ class Verdict(Shown):
             "|c|: how far an edge's length is off the commanded one; the greatest of all edges."
         )
         parts = [
-            _phases(self.phases),
+            _phase_table(self.phases),
             *([Line(meaning)] if has_edges else []),
-            _waypoints(self.phases),
+            _waypoint_table(self.phases),
             worst_values("check", checks),
             *(Line(f"Note: {note}.", "note") for note in self.notes),
             Line(self.summary, "ok" if self.passed else "fails"),
@@ -174,7 +176,7 @@ class Verdict(Shown):
         return Sheet(self.mission, self.title, parts)
 
 
-def _phases(phases: list[PhaseVerdict]) -> Table:
+def _phase_table(phases: list[PhaseVerdict]) -> FactTable:
     """Worst values of each phase."""
     worst = ("constraint", "shape", "separation", "clearance", "speed", "thrust")
     rows = []
@@ -183,13 +185,13 @@ def _phases(phases: list[PhaseVerdict]) -> Table:
         rows.append(Row((p.name, f"{p.t_end:.2f}", p.constraint, *map(values.get, worst))))
     heads = ("phase", "end [s]", "|c| at end [m]", "worst |c| [m]", "shape off [m]", "apart [m]",
              "clear [m]", "speed [m/s]", "thrust [N]")  # fmt: skip
-    return Table(heads, rows)
+    return FactTable(heads, rows)
 
 
-def _waypoints(phases: list[PhaseVerdict]) -> Table:
+def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
     """Miss of each waypoint, in position, velocity, attitude and rates."""
 
-    def met() -> Iterator[Row]:
+    def rows() -> Iterator[Row]:
         for p in phases:
             points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
             points += [] if p.waypoint is None else [(p.name, p.waypoint)]
@@ -204,4 +206,4 @@ def _waypoints(phases: list[PhaseVerdict]) -> Table:
         "attitude [deg]",
         "rates [deg/s]",
     )
-    return Table(heads, [*met()])
+    return FactTable(heads, [*rows()])

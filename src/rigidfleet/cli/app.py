@@ -129,6 +129,6 @@ def _usage(error: CycloptsError) -> str:
     text = str(error)
     if isinstance(error, UnusedCliTokensError):
         text = f"Unexpected arguments: {' '.join(error.unused_tokens or ())}."
-    if isinstance(error, UnknownOptionError) and (told := successor(error.token.keyword)):
-        text = f"Unknown option: {error.token.keyword}; {told}."
+    if isinstance(error, UnknownOptionError) and (newer := successor(error.token.keyword)):
+        text = f"Unknown option: {error.token.keyword}; {newer}."
     return f"{text}\n    see `{command}`"

@@ -91,12 +91,12 @@ def assess(
 
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
-    given: dict[str, Any] = {
+    options: dict[str, Any] = {
         "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
         "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
         "units": units, "axes": axes,
     }  # fmt: skip
-    chosen = [key for key, value in given.items() if value is not None]
+    chosen = [key for key, value in options.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
         from rigidfleet.result import Result
 
@@ -113,7 +113,7 @@ def assess(
             words = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
             raise RigidfleetError(words)
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        read = read_trajectories(files, **{key: given[key] for key in _READ if key in chosen})
+        read = read_trajectories(files, **{key: options[key] for key in _READ if key in chosen})
         result = of_curves(
             read.curves, read.assumed, names=read.names, away=read.away, since=read.since, mission=mission,
             separation=separation, limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground,
@@ -161,17 +161,17 @@ def _limits(limits: list[str]) -> dict[str, float]:
     RigidfleetError
         One cannot be read.
     """
-    found: dict[str, float] = {}
+    by_key: dict[str, float] = {}
     for option in limits:
         for part in option.split(","):
             key, equals, value = part.partition("=")
             try:
-                found[key.strip()] = float(value)
+                by_key[key.strip()] = float(value)
             except ValueError:
                 equals = ""
             if not equals:
                 raise RigidfleetError(f"--limits {part}: give KEY=VALUE, such as speed=3")
-    return found
+    return by_key
 
 
 def _name(file: Path) -> str:

@@ -58,11 +58,11 @@ def check(
     watch = console.CheckWatch(mission)
     try:
         with watch, watched_by(watch.update):
-            found = load_mission(mission)
+            loaded = load_mission(mission)
             if expand is not None:
-                found = spelled_out(found)
-                write_file(expand, (found.about + to_toml(found.to_dict())).encode())
-            found = complete_times(found)
+                loaded = spelled_out(loaded)
+                write_file(expand, (loaded.about + to_toml(loaded.to_dict())).encode())
+            loaded = complete_times(loaded)
     except MissionError as error:
         if not json:
             raise
@@ -75,14 +75,14 @@ def check(
     from rigidfleet.preflight.check import check as preflight
 
     with watch:
-        ahead = preflight(found, search=realisations, progress=watch.update)
+        ahead = preflight(loaded, search=realisations, progress=watch.update)
     if figure is not None:
         from rigidfleet.plotting.graph import draw_graphs
 
         judged = {f.name: f.rigidity for f in ahead.formations}
-        draw_graphs(found, judged, figure)
+        draw_graphs(loaded, judged, figure)
     if json:
-        console.print_json({"mission": mission, "right": True} | facts(found) | ahead.data())
+        console.print_json({"mission": mission, "right": True} | facts(loaded) | ahead.data())
         return PASSED if ahead.passed else FAILED
     console.show(ahead.facts())
     if expand is not None:

@@ -112,11 +112,11 @@ def warn(message: object, *_where: object) -> None:
 
 def show(sheet: Sheet) -> None:
     """Print facts: in a file or a pipe, rows of tables are not wrapped."""
-    from rigidfleet._common.facts import Table
+    from rigidfleet._common.facts import FactTable
 
     wide = out() if out().is_terminal else console(stderr=False, width=_WIDE)
     for block in sheet.blocks:
-        (wide if isinstance(block, Table) and not block.bare else out()).print(block)
+        (wide if isinstance(block, FactTable) and not block.bare else out()).print(block)
 
 
 class _Screen:

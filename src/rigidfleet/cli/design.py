@@ -75,7 +75,7 @@ def design(
     """
     from json import dumps
 
-    from rigidfleet._common.facts import Row, Table
+    from rigidfleet._common.facts import FactTable, Row
     from rigidfleet._common.files import write_file
     from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
     from rigidfleet.formation.point_files import csv_of_points
@@ -115,11 +115,13 @@ def design(
         table = csv_of_points(slots, colours) if out.suffix.lower() == ".csv" else text
         write_file(out, table.encode())
     if json:
-        found = {what: data for what, (data, _) in judged.items()}
-        console.print_json({"name": name, "toml": text, "limits": limits, "graphs": found})
+        graphs = {what: data for what, (data, _) in judged.items()}
+        console.print_json({"name": name, "toml": text, "limits": limits, "graphs": graphs})
         return PASSED
     heads = ("graph", "edges", "rank", "index", "condition", "longest [m]", "class")
-    table = Table(heads, [Row((what, *cells)) for what, (_, cells) in judged.items()], ("class",))
+    table = FactTable(
+        heads, [Row((what, *cells)) for what, (_, cells) in judged.items()], ("class",)
+    )
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
     if kinds:
@@ -145,8 +147,8 @@ def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
     from rigidfleet.rigidity.design import GRAPHS
 
     if edges not in GRAPHS and edges != "none":
-        told = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"
-        raise ValueError(f"there is no graph {edges!r}; {told}")
+        remedy = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"
+        raise ValueError(f"there is no graph {edges!r}; {remedy}")
     if searched:
         raise ValueError("--extra and --range have no effect with --edges; remove them or --edges")
     if reach is not None and edges != "neighbours":
@@ -164,12 +166,12 @@ def compare_graph(slots: Any, edges: Any) -> tuple[dict[str, Any], tuple[Any, ..
 
     longest = float(distances(slots, edges).max(initial=0.0))
     if len(slots) <= _DENSE:
-        found = analyse(slots, edges)
+        rigidity = analyse(slots, edges)
         # The smallest non-zero value counts, as in the index.
-        held = len(edges) > 0 and found.w > 0
-        ratio = float(np.linalg.norm(jacobian(slots, edges), 2) ** 2) / found.w if held else None
-        data = found.data() | {"condition": ratio}
-        rank = f"{found.rank} of {found.needed}"
+        held = len(edges) > 0 and rigidity.w > 0
+        ratio = float(np.linalg.norm(jacobian(slots, edges), 2) ** 2) / rigidity.w if held else None
+        data = rigidity.data() | {"condition": ratio}
+        rank = f"{rigidity.rank} of {rigidity.needed}"
     else:
         ends = spectrum(slots, edges, [1.0] * len(slots))
         rigidity_class = "flexible to first order" if ends.free else "infinitesimally rigid"
@@ -202,7 +204,7 @@ def points_of(
     from rigidfleet.formation.point_files import Points, read_points
     from rigidfleet.formation.shapes import SHAPES, agents_taken, slots
     from rigidfleet.math.rigid_body import centred
-    from rigidfleet.mission.findings import near_shape
+    from rigidfleet.mission.findings import suggest_shape
 
     kind, _, words = shape.partition(":")
     letters = {"text": outlines.text_outlines, "strokes": outlines.stroke_outlines}.get(kind)
@@ -220,7 +222,7 @@ def points_of(
     if letters is None and not Path(shape).exists():
         if Path(shape).suffix or len(Path(shape).parts) > 1:
             raise ValueError("no such file")
-        raise ValueError(f"is neither a shape nor a file: {near_shape(shape)}")
+        raise ValueError(f"is neither a shape nor a file: {suggest_shape(shape)}")
     if size is not None:
         raise ValueError("--size has no effect on a file or on words; use --spacing")
     if letters is not None or Path(shape).suffix.lower() == ".svg":

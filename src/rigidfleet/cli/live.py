@@ -52,7 +52,7 @@ def live(
     place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")
     place.try_out()
 
-    def landed(result: Result) -> str:
+    def save_flight(result: Result) -> str:
         files = Files(place.folder, result.mission.name).make_new_folder()
         result.save(files.result)
         verdict = assess(result)
@@ -67,5 +67,5 @@ def live(
         console.err().print("To end the flight, press Ctrl-C or close its page")
 
     with heeding_interrupts():
-        fly(flown, port=port, browser=not no_browser, ready=ready, landed=landed)
+        fly(flown, port=port, browser=not no_browser, ready=ready, landed=save_flight)
     return PASSED

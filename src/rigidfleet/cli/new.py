@@ -78,28 +78,28 @@ def new(
     from rigidfleet.mission.loading import mission_of_file
     from rigidfleet.preflight.check import check as preflight
 
-    given: dict[str, Any] = {
+    all_options: dict[str, Any] = {
         "shape": shape, "agents": agents, "size": size, "mass": mass,
         "thrust_limit": thrust_limit, "waypoints": to,
     }  # fmt: skip
-    asked = {key: value for key, value in given.items() if value is not None}
-    if not (asked or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
-        name, asked = _ask(name)
+    options = {key: value for key, value in all_options.items() if value is not None}
+    if not (options or quiet or json or show) and sys.stdin.isatty() and console.err().is_terminal:
+        name, options = _ask(name)
     file = Path(name or "mission")
     if not file.name:
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
     keep_existing(file, force=force, other="give another name")
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
-        show, formations = True, formations or asked.pop("shape")
+        show, formations = True, formations or options.pop("shape")
     try:
         if show:
             spacing = 2.0 if spacing is None else spacing
-            text = _show(file, asked, formations or "sphere,helix", spacing)
+            text = _show_text(file, options, formations or "sphere,helix", spacing)
         elif formations is not None or spacing is not None:
             raise ValueError("--formations and --spacing are for a show: add --show")
         else:
-            text = draft.draft(file.stem, file=str(file), **asked)
+            text = draft.draft(file.stem, file=str(file), **options)
     except ValueError as error:
         raise RigidfleetError(str(error)) from None
     mission = mission_of_file(text, str(file))
@@ -117,7 +117,7 @@ def new(
     return PASSED
 
 
-def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) -> str:
+def _show_text(file: Path, values: dict[str, Any], formations: str, spacing: float) -> str:
     """Text of a show; points in the folder of the mission are written by the name of their file.
 
     Raises
@@ -128,16 +128,16 @@ def _show(file: Path, asked: dict[str, Any], formations: str, spacing: float) ->
     from rigidfleet.mission import show_draft
 
     options = {"shape": "--shape", "size": "--size", "waypoints": "--to"}
-    if unused := " and ".join(option for key, option in options.items() if key in asked):
+    if unused := " and ".join(option for key, option in options.items() if key in values):
         raise ValueError(f"{unused}: no effect on a show; use --formations and --spacing")
-    agents = asked.pop("agents", None)
+    agents = values.pop("agents", None)
     words = [word.strip() for word in formations.split(",") if word.strip()]
     if agents is None:
         counts = (len(points.slots) for word in words if (points := _file_points(word)))
         agents = next(counts, _SHOWN)
     scenes = [_scene(file, word, agents, spacing) for word in words]
     return show_draft.show(
-        file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **asked
+        file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **values
     )
 
 
@@ -229,14 +229,14 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
 
     name = name or answer("Name", "mission", str)
     shape = answer(f"Shape ({', '.join(SHAPES)})", "triangle", known)
-    asked: dict[str, Any] = {"shape": shape}
+    answers: dict[str, Any] = {"shape": shape}
     usual = draft.agents_for(shape)
     if len(SHAPES[shape].agents) > 1:
-        asked["agents"] = answer(f"Vehicles ({agents_taken(shape)})", str(usual), count)
-    asked["size"] = [answer("Edge length [m]", f"{draft.SIZE:g}", positive)]
-    asked["mass"] = answer("Mass of each [kg]", f"{draft.MASS:g}", positive)
+        answers["agents"] = answer(f"Vehicles ({agents_taken(shape)})", str(usual), count)
+    answers["size"] = [answer("Edge length [m]", f"{draft.SIZE:g}", positive)]
+    answers["mass"] = answer("Mass of each [kg]", f"{draft.MASS:g}", positive)
     there = " ".join(f"{x:g}" for x in draft.WAYPOINT)
     waypoint = answer("Fly to x y z [m]", there, point)
     if waypoint != draft.WAYPOINT:  # the default waypoint is higher for a large shape
-        asked["waypoints"] = [waypoint]
-    return name, asked
+        answers["waypoints"] = [waypoint]
+    return name, answers

@@ -37,7 +37,7 @@ class Files:
         ]
 
     @property
-    def derived(self) -> list[Path]:
+    def beside_result(self) -> list[Path]:
         """All files that are derived from the result."""
         return [self.verdict, self.table, self.report, self.replay, *self.figures]
 
@@ -49,7 +49,7 @@ class Files:
         ResultError
             Files exist and must not be overwritten, or the folder cannot be written.
         """
-        keep_existing(self.result, *self.derived, force=replace)
+        keep_existing(self.result, *self.beside_result, force=replace)
         self.try_out()
 
     def try_out(self) -> None:
@@ -91,7 +91,7 @@ class Files:
 
     def forget(self) -> None:
         """Remove all files that are derived from an earlier result."""
-        for path in self.derived:
+        for path in self.beside_result:
             path.unlink(missing_ok=True)
 
 

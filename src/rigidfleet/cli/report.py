@@ -81,8 +81,8 @@ def report(
     files.try_out()
     verdicts = [assess(record) for record in records]
     if json:
-        found = [verdict.to_dict() for verdict in verdicts]
-        console.print_json(found if others else found[0])
+        verdict_data = [verdict.to_dict() for verdict in verdicts]
+        console.print_json(verdict_data if others else verdict_data[0])
     make_folder(files.folder)
     if others:
         labels = labels_of(paths, records)

@@ -86,11 +86,11 @@ def run(
     check_width(width)
     from rigidfleet.mission import load_mission
 
-    asked = load_mission(mission)
-    files = Files(out or Path("flights", asked.name), asked.name)
+    loaded = load_mission(mission)
+    files = Files(out or Path("flights", loaded.name), loaded.name)
     files.claim(replace=force)
     with watching(None if quiet else console.FlightWatch()) as progress:
-        result, interrupted = fly(asked, progress)
+        result, interrupted = fly(loaded, progress)
 
     from rigidfleet._common.files import make_folder, write_file
     from rigidfleet.assessment import assess
@@ -155,7 +155,7 @@ def missions(
     else:
         import tomllib
 
-        from rigidfleet._common.facts import Row, Sheet, Table
+        from rigidfleet._common.facts import FactTable, Row, Sheet
 
         def row(name: str) -> Row:
             head = tomllib.loads(mission_text(name))
@@ -166,7 +166,7 @@ def missions(
         ]
         heads = ("mission", "what it shows", "in the paper")
         first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
-        console.show(Sheet("", "", [Table(heads, rows, heads)]))
+        console.show(Sheet("", "", [FactTable(heads, rows, heads)]))
         console.out().print(first, soft_wrap=True)
     return PASSED
 

@@ -96,7 +96,7 @@ def sweep(
     check_workers(workers)
     from rigidfleet._common.files import write_file
     from rigidfleet.sweep import figures, fly, store
-    from rigidfleet.sweep.record import UNJUDGED, called
+    from rigidfleet.sweep.record import UNJUDGED, reason_in_words
     from rigidfleet.sweep.summary import summarise
 
     if summary:
@@ -107,11 +107,11 @@ def sweep(
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
             "controller": controller, "rate": rate,
         }  # fmt: skip
-        asked, folder = _asked(mission, vary or [], runs, out, keys)
+        definition, folder = _sweep_and_folder(mission, vary or [], runs, out, keys)
         try:
             with watching(None if quiet else console.SweepWatch()) as progress:
                 table = fly(
-                    asked,
+                    definition,
                     folder,
                     workers=workers,
                     cluster=cluster,
@@ -120,16 +120,16 @@ def sweep(
                 )
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
-            words = f"Interrupted: {done} of {asked.runs} runs are saved in {folder}"
+            words = f"Interrupted: {done} of {definition.runs} runs are saved in {folder}"
             again = f"To resume: rigidfleet sweep {folder}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
-    found = summarise(table)
-    write_file(folder / "summary.json", (found.json() + "\n").encode())
+    outcome = summarise(table)
+    write_file(folder / "summary.json", (outcome.json() + "\n").encode())
     if json:
-        console.print_exactly(found.json() + "\n")
+        console.print_exactly(outcome.json() + "\n")
     elif not quiet:
-        console.show(found.facts())
+        console.show(outcome.facts())
     drawn = [] if no_figures else figures.plot(
         table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
         titles=not no_titles,
@@ -140,17 +140,17 @@ def sweep(
         if drawn:
             text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
             console.out().print(text, soft_wrap=True)
-    if found.reasons and set(table.reason) <= {*UNJUDGED}:
-        reason, example = next(iter(found.examples.items()))
+    if outcome.reasons and set(table.reason) <= {*UNJUDGED}:
+        reason, example = next(iter(outcome.examples.items()))
         console.complain(
-            f"{folder}: no run has a verdict. Run {example.run}: {called(reason)}: {example.detail}\n    correct the"
-            " mission, what varies, or the controller; --force overwrites this sweep"
+            f"{folder}: no run has a verdict. Run {example.run}: {reason_in_words(reason)}: {example.detail}\n"
+            "    correct the mission, what varies, or the controller; --force overwrites this sweep"
         )
         return BAD_INPUT
     return PASSED
 
 
-def _asked(
+def _sweep_and_folder(
     what: str, vary: list[str], runs: int | None, out: Path | None, keys: dict[str, Any]
 ) -> tuple[Sweep, Path]:
     """Sweep of the command line, and its folder."""
@@ -164,11 +164,11 @@ def _asked(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
             )
-        found = store.read_sweep(Path(what))
-        found.runs = found.runs if runs is None else runs
-        return found, Path(what)
+        definition = store.read_sweep(Path(what))
+        definition.runs = definition.runs if runs is None else runs
+        return definition, Path(what)
     if what not in mission_names() and is_sweep_file(what):
-        found = Sweep.load(what, more=vary, runs=runs, **keys)
+        definition = Sweep.load(what, more=vary, runs=runs, **keys)
     else:
-        found = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
-    return found, out or Path("sweeps", found.name)
+        definition = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
+    return definition, out or Path("sweeps", definition.name)

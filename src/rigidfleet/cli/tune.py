@@ -72,13 +72,13 @@ def tune(
     from rigidfleet.tuning import tune as study
 
     check_workers(workers)
-    found = load_mission(mission)
-    folder = out or Path("tunes", found.name)
+    loaded = load_mission(mission)
+    folder = out or Path("tunes", loaded.name)
     try:
         with watching(None if quiet else console.SweepWatch()) as progress:
             tuned = study(
-                found, folder, objective=objective, budget=budget, seeds=seeds, validation=validation,
-                seed=seed, margin_share=margin_share, assume=_assumed(assume or []),
+                loaded, folder, objective=objective, budget=budget, seeds=seeds, validation=validation,
+                seed=seed, margin_share=margin_share, assume=_keys_of_lines(assume or []),
                 workers=workers, replace=force, progress=progress,
             )  # fmt: skip
     except KeyboardInterrupt:
@@ -94,7 +94,7 @@ def tune(
     return PASSED
 
 
-def _assumed(lines: list[str]) -> dict[str, Any]:
+def _keys_of_lines(lines: list[str]) -> dict[str, Any]:
     """Keys of a mission, given as lines of TOML."""
     try:
         return tomllib.loads("\n".join(lines))

@@ -21,9 +21,7 @@ def distances(points: ArrayLike, edges: ArrayLike) -> Floats:
     """Lengths (m,) [m] of edges (m, 2) between points (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
     e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
-    apart = p[e[:, 0]] - p[e[:, 1]]
-    apart *= apart
-    return np.sqrt(np.add.reduce(apart, axis=1))  # a third of the time of a norm of few
+    return np.linalg.norm(p[e[:, 0]] - p[e[:, 1]], axis=1)
 
 
 def dimension(points: ArrayLike, tol: float = 1e-6) -> int:

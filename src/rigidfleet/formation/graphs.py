@@ -35,19 +35,14 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     """
     from scipy.spatial import KDTree
 
-    p = np.asarray(points, dtype=np.float64)
-    if len(p) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = KDTree(p).query_pairs(_reach_of_neighbours(p, reach), output_type="ndarray")
+    distance = _reach_of_neighbours(points, reach)
+    pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
 
 
 def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
     """Number of edges that `neighbours` would return, without building them."""
-    p = np.asarray(points, dtype=np.float64)
-    if len(p) < 2:
-        return 0
-    return count_within(p, _reach_of_neighbours(p, reach))
+    return count_within(points, _reach_of_neighbours(points, reach))
 
 
 def count_within(points: ArrayLike, distance: float) -> int:
@@ -58,8 +53,9 @@ def count_within(points: ArrayLike, distance: float) -> int:
     return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
-def _reach_of_neighbours(p: Floats, reach: float) -> float:
-    """Greatest distance [m] between neighbours among points (N, 3)."""
+def _reach_of_neighbours(points: ArrayLike, reach: float) -> float:
+    """Greatest distance [m] between neighbours among points (N, 3); infinite for a single one."""
+    p = np.asarray(points, dtype=np.float64)
     return reach * float(np.median(nearest(p))) * (1 + 1e-9)
 
 

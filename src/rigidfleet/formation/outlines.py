@@ -39,9 +39,8 @@ def svg_outlines(path: str | Path, notes: list[str] | None = None) -> list[Float
     try:
         from rigidfleet.formation.drawings import Drawing
     except ImportError:
-        raise RigidfleetError(
-            "Drawings need svgelements. Install it: pip install svgelements."
-        ) from None
+        needed = "Drawings need svgelements. Install it: pip install svgelements."
+        raise RigidfleetError(needed) from None
     data = read_bytes(path)
     try:
         drawing = Drawing(data)
@@ -89,9 +88,8 @@ def stroke_outlines(words: str, font: str = "futural") -> list[Floats]:
     try:
         from HersheyFonts import HersheyFonts
     except ImportError:
-        raise RigidfleetError(
-            "Words of strokes need Hershey-Fonts. Install it: pip install Hershey-Fonts."
-        ) from None
+        needed = "Words of strokes need Hershey-Fonts. Install it: pip install Hershey-Fonts."
+        raise RigidfleetError(needed) from None
     letters = HersheyFonts()
     letters.load_default_font(font)
     letters.normalize_rendering(1.0)

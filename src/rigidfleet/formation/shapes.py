@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -236,13 +235,7 @@ def slots(shape: str, size: float | Sequence[float], n: int) -> Floats:
         raise ValueError(f"shape {shape!r} takes {wanted}")
     if not (np.isfinite(sizes).all() and (sizes > 0).all()):
         raise ValueError(f"shape {shape!r} needs sizes > 0 m, not {size}")
-    return _slots(shape, tuple(sizes.tolist()), n).copy()
-
-
-@lru_cache(8)
-def _slots(shape: str, sizes: tuple[float, ...], n: int) -> Floats:
-    """Slots as `slots` returns them, cached because those of many agents take seconds."""
-    return centred(SHAPES[shape].make(np.array(sizes), n))
+    return centred(form.make(sizes, n))
 
 
 def agents_taken(shape: str) -> str:

@@ -2,7 +2,7 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.disturbances import spline
 from rigidfleet.kernel.fleet import jet_speed
 from rigidfleet.kernel.rigid_body import attitude_matrix
@@ -11,10 +11,10 @@ from rigidfleet.kernel.rigid_body import attitude_matrix
 # the formula is used.
 _BODY, _LEAST_HEIGHT = 2.0, 0.5
 
-jet = inlined(jet_speed)
+jet = jit_inline(jet_speed)
 
 
-@compiled
+@jit
 def air_velocity(t, h, around, out):
     """Velocity of the air at each vehicle [m/s] at t, t + h/2 and t + h, into out (3, N, 3)."""
     for s in range(3):
@@ -27,7 +27,7 @@ def air_velocity(t, h, around, out):
                 row[i, q] = around.wind[q] + gust
 
 
-@compiled
+@jit
 def add_downwash(S, vehicles, density, T, out):
     """Add to the air (3, N, 3) the jets of all vehicles above, at states S (N, 17).
 
@@ -49,7 +49,7 @@ def add_downwash(S, vehicles, density, T, out):
                             out[stage, i, q] -= flow * T[2, q]
 
 
-@compiled
+@jit
 def ground_effect(z, R, span):
     """Factor of the thrust at a height z [m] above the ground, for rotors of radius R [m].
 

@@ -7,17 +7,17 @@ the body axes b1, b2, b3; the rates omega [rad/s] and accelerations [rad/s^2] in
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import ATTITUDE, ROTORS, speed_of
 from rigidfleet.kernel.rigid_body import attitude_matrix
 
 # Least vertical part of a force whose tilt is limited, as a share of the weight: a force downwards has no tilt to keep.
 _LEAST_LIFT = 0.05
 
-_speed = inlined(speed_of)
+_speed = jit_inline(speed_of)
 
 
-@compiled
+@jit
 def limit_tilt(F, tilt, weight):
     """Limit the tilt of a desired force F (3,) [N] to ``tilt`` [rad]; none from pi/2 on. Returns whether F changed.
 
@@ -33,7 +33,7 @@ def limit_tilt(F, tilt, weight):
     return limited
 
 
-@compiled
+@jit
 def flat_attitude(F, F_dot, F_ddot, yaw, out):
     """Attitude, rates and accelerations (5, 3) with the thrust axis along F (3,) and a heading.
 
@@ -76,7 +76,7 @@ def flat_attitude(F, F_dot, F_ddot, yaw, out):
     ) / x_c1
 
 
-@compiled
+@jit
 def attitude_torque(T, omega, desired, inertia, k_R, k_omega, tau):
     """Torque tau (3,) [N m] that leads the attitude T (3, 3) with rates omega (3,) to a desired one (5, 3).
 
@@ -108,7 +108,7 @@ def attitude_torque(T, omega, desired, inertia, k_R, k_omega, tau):
     tau[2] = I2 * (a2 - 0.5 * k_R[2] * (E10 - E01) - k_omega[2] * (R - w2)) + (I1 - I0) * P * Q
 
 
-@compiled
+@jit
 def allocate_rotors(thrust, tau, B, least, most, f):
     """Forces f (4,) [N] of the rotors for a thrust [N] and torque (3,) [N m], by the inverse mixing matrix B (4, 4).
 
@@ -149,14 +149,14 @@ def allocate_rotors(thrust, tau, B, least, most, f):
     return True
 
 
-@compiled
+@jit
 def rotor_speeds(f, curve, limits, out):
     """Speeds out (4,) [rad/s] of rotors with forces f (4,) [N], within limits (2,), by their thrust curve (3,)."""
     for j in range(4):
         out[j] = min(max(_speed(f[j], curve[0], curve[1], curve[2]), limits[0]), limits[1])
 
 
-@compiled
+@jit
 def desired_attitude(k, i, flight, state, F):
     """Desired attitude of vehicle i at tick k, for the desired force F (3,), into ``work.desired``."""
     vehicles, tables, work = flight.vehicles, flight.tables, state.work
@@ -171,7 +171,7 @@ def desired_attitude(k, i, flight, state, F):
     flat_attitude(F, F_dot, F_ddot, yaw, work.desired)
 
 
-@compiled
+@jit
 def steer(k, i, flight, state):
     """Rotor speeds commanded to vehicle i at tick k, into ``state.command``; returns whether it saturates.
 

@@ -27,7 +27,7 @@ import math
 from rigidfleet.kernel.attitude_control import limit_tilt
 from rigidfleet.kernel.avoidance import BARRIER, EXACT, KNOWN
 from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
 from rigidfleet.kernel.moving import braking_beside
@@ -46,10 +46,10 @@ _ACROSS = 0.25
 #: Least share to which an edge holds in the equations.
 _LOOSE = 1e-3
 
-needed_rate = inlined(_needed_rate)
+needed_rate = jit_inline(_needed_rate)
 
 
-@compiled
+@jit
 def loosen(p, w, state, a):
     """Take from the forces of edges what they let go, and from their integrals what the tick has added to it.
 
@@ -71,7 +71,7 @@ def loosen(p, w, state, a):
             state.integral[0, e] -= free * a.period * w.c[e]
 
 
-@compiled
+@jit
 def add_row(count, i, j, entry, n, missing, limit, a):
     """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
 
@@ -88,7 +88,7 @@ def add_row(count, i, j, entry, n, missing, limit, a):
     return count
 
 
-@compiled
+@jit
 def add_obstacle(count, i, entry, needed, a):
     """Add a barrier of vehicle i along ``normal``, if it may act; the number of them, and whether this is violated."""
     n, c = a.normal, a.wanted[i]
@@ -98,7 +98,7 @@ def add_obstacle(count, i, entry, needed, a):
     return count, missing > 0.0
 
 
-@compiled
+@jit
 def needed_beside(i, o, r, v, a):
     """Least acceleration of vehicle i with which obstacle o, which moves, passes it; ``normal`` is its direction.
 
@@ -127,7 +127,7 @@ def needed_beside(i, o, r, v, a):
     return 2.0 * missing / max(t - a.lag[i], a.period) ** 2
 
 
-@compiled
+@jit
 def list_barriers(r, v, lost, a):
     """Write the barriers that may act at this tick; returns their number, and whether one of them is violated."""
     count, violated, n, walls = 0, False, a.normal, a.near.shape[0]
@@ -191,7 +191,7 @@ def list_barriers(r, v, lost, a):
     return count, violated
 
 
-@compiled
+@jit
 def relative(i, j, n, x):
     """The part along a unit vector n (3,) of the difference of rows i and j of x (N, 3); of row i if j is -1."""
     along = n[0] * x[i, 0] + n[1] * x[i, 1] + n[2] * x[i, 2]
@@ -200,7 +200,7 @@ def relative(i, j, n, x):
     return along
 
 
-@compiled
+@jit
 def shove(i, j, n, force, a):
     """Add the accelerations of a force [N] along a unit vector n (3,) on i, and against it on j if j is not -1."""
     for q in range(3):
@@ -209,7 +209,7 @@ def shove(i, j, n, force, a):
             a.shift[j, q] -= force * a.inverse[j] * n[q]
 
 
-@compiled
+@jit
 def softness(e, p, a):
     """What an edge adds to its own diagonal of A: the law's damping, and more the less it holds."""
     i, j = p.graph.edges[e, 0], p.graph.edges[e, 1]
@@ -217,7 +217,7 @@ def softness(e, p, a):
     return p.law.mu / p.vehicles.mean + (1.0 / hold - 1.0) * p.graph.diagonal[e]
 
 
-@compiled
+@jit
 def relax(k, a):
     """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
     i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
@@ -232,7 +232,7 @@ def relax(k, a):
     return abs(more) * (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
 
 
-@compiled
+@jit
 def relax_edges(p, w, a):
     """The same for all edges."""
     change = 0.0
@@ -249,7 +249,7 @@ def relax_edges(p, w, a):
     return change
 
 
-@compiled
+@jit
 def sweep(count, p, w, a):
     """Projected Gauss-Seidel: a sweep over all barriers and edges, then some over those that push alone.
 
@@ -271,7 +271,7 @@ def sweep(count, p, w, a):
     return first
 
 
-@compiled
+@jit
 def entry(i, j, n, k, l, m, a):
     """Entry of A for two rows: unit vectors n and m (3,), vehicles i and j, k and l (-1: none)."""
     value = 0.0
@@ -288,7 +288,7 @@ def entry(i, j, n, k, l, m, a):
     return value
 
 
-@compiled
+@jit
 def finish(count, p, w, a):
     """Solve exactly for the barriers that push less than they may, and the edges, if the sweeps have found which.
 
@@ -335,7 +335,7 @@ def finish(count, p, w, a):
     return True
 
 
-@compiled
+@jit
 def line(row, size, p, w, a):
     """Vehicles and unit vector of a row of the system: of one of ``size`` barriers, or after these of an edge."""
     if row < size:
@@ -344,7 +344,7 @@ def line(row, size, p, w, a):
     return p.graph.edges[row - size, 0], p.graph.edges[row - size, 1], w.u[row - size]
 
 
-@compiled
+@jit
 def solve_barriers(count, p, w, a):
     """Pushes of barriers, pulls of edges, and the changes of accelerations that they make (``shift``).
 
@@ -365,7 +365,7 @@ def solve_barriers(count, p, w, a):
         finish(count, p, w, a)  # a sweep after it tells whether that was all
 
 
-@compiled
+@jit
 def limit(i, a):
     """Limit the thrust of an acceleration asked for."""
     c = a.wanted[i]
@@ -379,7 +379,7 @@ def limit(i, a):
         c[2] -= a.g
 
 
-@compiled
+@jit
 def filter_accelerations(t, r, v, lost, p, w, a):
     """Change what is asked for as little as possible, so that all barriers hold; returns whether any did not."""
     count, violated = list_barriers(r, v, lost, a)

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.solids.distance import box_normal, from_box
 
 #: Accuracy of a least value [m, m/s].
@@ -30,7 +30,7 @@ _SQUARE = np.array(
 )
 
 
-@compiled
+@jit
 def lowest(work, degree, floor):
     """Least value of a polynomial over [0, 1] and its place, if below ``floor``; otherwise ``floor`` and -1.
 
@@ -79,7 +79,7 @@ def lowest(work, degree, floor):
     return best, at
 
 
-@compiled
+@jit
 def halve(piece, left):
     """Halve a curve (15 control points, start and width): write its first half into ``left``, keep the second."""
     half = 0.5 * piece[16]
@@ -96,7 +96,7 @@ def halve(piece, left):
             left[3 * k + q] = piece[q]
 
 
-@compiled
+@jit
 def square(points, sign, out):
     """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (15,)."""
     for k in range(9):
@@ -109,7 +109,7 @@ def square(points, sign, out):
             out[i + j] += sign * _SQUARE[i, j] * dot
 
 
-@compiled
+@jit
 def length_at(points, x):
     """|r| of a curve with control points (15,) at x."""
     rest, total = 1.0 - x, 0.0
@@ -121,7 +121,7 @@ def length_at(points, x):
     return math.sqrt(total)
 
 
-@compiled
+@jit
 def span_of(curve):
     """Radius [m] of the ball about the middle one of control points (5, 3) that holds all."""
     far = 0.0
@@ -131,14 +131,14 @@ def span_of(curve):
     return math.sqrt(far)
 
 
-@compiled
+@jit
 def basis_at(x):
     """The five Bernstein polynomials of fourth degree at x."""
     y = 1.0 - x
     return y**4, 4.0 * x * y**3, 6.0 * x * x * y * y, 4.0 * x**3 * y, x**4
 
 
-@compiled
+@jit
 def point_at(curve, x):
     """Point of a curve with control points (5, 3) at x."""
     a, b, c, d, e = basis_at(x)
@@ -149,7 +149,7 @@ def point_at(curve, x):
     )
 
 
-@compiled
+@jit
 def shortest(curve, floor, work, pieces):
     """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
 
@@ -195,7 +195,7 @@ def shortest(curve, floor, work, pieces):
     return best, at
 
 
-@compiled
+@jit
 def beyond_plane(piece, distance, x, y, z):
     """Lower bound of the distance between a curve with control points (15,) and something convex.
 
@@ -211,14 +211,14 @@ def beyond_plane(piece, distance, x, y, z):
     return distance + least
 
 
-@compiled
+@jit
 def touch_box(x, y, z, b, _, boxes):
     """Signed distance of a point from box b, negative inside, and the normal of its tangent plane."""
     nx, ny, nz = box_normal(x, y, z, boxes[b])
     return from_box(x, y, z, boxes[b]), nx, ny, nz
 
 
-@compiled
+@jit
 def refine(bound, best, at, close, count, top, pieces):
     """Halve the piece on top of the stack if its lower bound may be below the best value, else drop it.
 
@@ -234,7 +234,7 @@ def refine(bound, best, at, close, count, top, pieces):
     return best, at, top - 1
 
 
-@compiled
+@jit
 def put_whole(curve, pieces):
     """Put a curve with control points (5, 3) on an empty stack; returns the accuracy that its rounding allows [m]."""
     close = CLOSE
@@ -246,7 +246,7 @@ def put_whole(curve, pieces):
     return close
 
 
-@compiled
+@jit
 def nearest_box(curve, b, part, floor, pieces, boxes):
     """Least distance of a curve with control points (5, 3) from box b, if below ``floor``, and its place; else -1.
 
@@ -266,7 +266,7 @@ def nearest_box(curve, b, part, floor, pieces, boxes):
     return best, at
 
 
-@compiled
+@jit
 def lowest_overlap(points, reach, floor, pieces):
     """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
     best, at, top, count, close = floor, -1.0, 0, 0, put_whole(points, pieces)
@@ -294,7 +294,7 @@ def lowest_overlap(points, reach, floor, pieces):
     return best, at
 
 
-@compiled
+@jit
 def shortest_above(curve, own, other, altitude, floor, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
     best, at, top, count, close, rate = floor, -1.0, 0, 0, put_whole(curve, pieces), 0.0
@@ -321,7 +321,7 @@ def shortest_above(curve, own, other, altitude, floor, pieces):
     return best, at
 
 
-@compiled
+@jit
 def weights(x, out):
     """Write the Bernstein polynomials (5,) of fourth degree at x."""
     out[0], out[1], out[2], out[3], out[4] = basis_at(x)

@@ -12,14 +12,14 @@ The named solvers differ only in how they treat this case.
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve, jacobi_eigen
 from rigidfleet.kernel.outside import call_solver
 from rigidfleet.kernel.problem import EXACT, ITERATED, PINV, SPECTRAL
 from rigidfleet.kernel.references import distance_references
 
 
-@inlined
+@jit_inline
 def constraint_force(t, y, dy, p, w):
     """f_C (N, 3) [N], Eq. (12), at time t [s] for w.r, w.v, the forces w.f_E and w.f_u; and dy of the integral of c."""
     vehicles, graph = p.vehicles, p.graph
@@ -36,7 +36,7 @@ def constraint_force(t, y, dy, p, w):
         dy[6 * n + k] = w.c[k]
 
 
-@inlined
+@jit_inline
 def right_side(r, v, integral, a, edges, law, w):
     """Edges at positions r and velocities v (N, 3), and the bracket of Eq. (12).
 
@@ -66,7 +66,7 @@ def right_side(r, v, integral, a, edges, law, w):
         )
 
 
-@compiled
+@jit
 def assemble(u, graph, scale, shift, A):
     """Lower triangle of A = scale J M^-1 J^T + shift 1 (m, m), the matrix of Eqs. (11), (12)."""
     pairs, weight = graph.pairs, graph.weight
@@ -83,7 +83,7 @@ def assemble(u, graph, scale, shift, A):
         A[k, l] = scale * weight[p] * dot
 
 
-@inlined
+@jit_inline
 def solve_multipliers(vehicles, graph, law, w):
     """Multipliers w.multiplier (m,) [N] of Eqs. (11), (12) for w.b; NaN if A is singular and the law exact.
 
@@ -133,7 +133,7 @@ def solve_multipliers(vehicles, graph, law, w):
     solve_by_eigenvalues(graph, mbar, law, w)
 
 
-@inlined
+@jit_inline
 def solve_by_eigenvalues(graph, mbar, law, w):
     """The laws pinv and spectral, as functions of the eigenvalues, if a factor does not exist."""
     n = graph.edges.shape[0]
@@ -158,7 +158,7 @@ def solve_by_eigenvalues(graph, mbar, law, w):
             y[k] += mbar * phi * s * w.V[k, q]
 
 
-@compiled
+@jit
 def solve_at_agents(m, mbar, edges, law, w):
     """The iterated solve in the agents' coordinates, which is the smaller system if there are many edges.
 
@@ -209,7 +209,7 @@ def solve_at_agents(m, mbar, edges, law, w):
                 a[i, p] += x[3 * i + p]
 
 
-@compiled
+@jit
 def find_multipliers(graph):
     """Have w.multiplier (m,) [N] of the last evaluation computed, by a solver that finds f_C without.
 
@@ -219,7 +219,7 @@ def find_multipliers(graph):
         call_solver(graph.multipliers)
 
 
-@compiled
+@jit
 def apply_multipliers(u, edges, multiplier, f_C):
     """f_C = J^T lambda, Eq. (10), into f_C (N, 3) [N]: no net force, no net torque."""
     for i in range(f_C.shape[0]):

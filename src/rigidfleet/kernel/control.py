@@ -2,7 +2,7 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.problem import BODY, SHAPE, TRACKING
 from rigidfleet.kernel.references import blend_slots, piece_at
 from rigidfleet.kernel.rigid_body import (
@@ -15,7 +15,7 @@ from rigidfleet.kernel.rigid_body import (
 )
 
 
-@compiled
+@jit
 def _series(xx, s):
     a = 0.5 - xx * (1 / 24 - xx * (1 / 720 - xx / 40320))
     b = 1 / 6 - xx * (1 / 120 - xx * (1 / 5040 - xx / 362880))
@@ -24,7 +24,7 @@ def _series(xx, s):
     return a, b, a_dot, b_dot
 
 
-@compiled
+@jit
 def _closed_form(xx, s):
     x = math.sqrt(xx)
     sin, cos = math.sin(x), math.cos(x)
@@ -34,13 +34,13 @@ def _closed_form(xx, s):
     return a, b, a_dot, b_dot
 
 
-@compiled
+@jit
 def rate_factors(xx, s):
     """a, b and their derivatives over time, of `body_rates`, for xx = |phi|^2 and s = phi . dphi/dt."""
     return _series(xx, s) if xx < 0.04 else _closed_form(xx, s)
 
 
-@compiled
+@jit
 def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
     """Body-axes rates of R = Exp(phi): omega = J_r(phi) phi_dot, and its derivative.
 
@@ -65,7 +65,7 @@ def body_rates(phi, phi_dot, phi_ddot, omega, omega_dot):
         omega_dot[q] = phi_ddot[q] - a_dot * pv_q - a * pa_q + b_dot * ppv + b * (vpv + ppa)
 
 
-@compiled
+@jit
 def exp_transposed(phi, E):
     """E (3, 3) = Exp(phi)^T."""
     xx = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
@@ -85,7 +85,7 @@ def exp_transposed(phi, E):
     E[2, 1] -= a * phi[0]
 
 
-@compiled
+@jit
 def rotate_after(E, T, out):
     """out = E T for (3, 3) matrices."""
     for i in range(3):
@@ -93,7 +93,7 @@ def rotate_after(E, T, out):
             out[i, j] = E[i, 0] * T[0, j] + E[i, 1] * T[1, j] + E[i, 2] * T[2, j]
 
 
-@inlined
+@jit_inline
 def reference_motion(t, motion, w):
     """Reference motion of the virtual body at t into w.body (see `Workspace`) and w.T_ref.
 
@@ -126,7 +126,7 @@ def reference_motion(t, motion, w):
     rotate_after(w.E, motion.T1, w.T_ref)
 
 
-@inlined
+@jit_inline
 def desired_agents(w):
     """Desired position of each agent, r_i = r_cm + T^T p_i, and two derivatives, into w.r_ref etc.
 
@@ -150,7 +150,7 @@ def desired_agents(w):
             w.a_ref[i, q] = w.body[2, q] + T[0, q] * a0 + T[1, q] * a1 + T[2, q] * a2
 
 
-@inlined
+@jit_inline
 def local_law(t, p, w):
     """Local LQR of every agent (paper, section V): f_i = m_i (a_i + g - k1 e_i - k2 de_i).
 
@@ -179,7 +179,7 @@ def local_law(t, p, w):
         w.wrench[5] += x * a1 - y * a0
 
 
-@compiled
+@jit
 def body_gains(t, feedback, out):
     """Gains (4,) at t, from cubics through the table over the time to go; after arrival, the holding gains."""
     remaining = feedback.arrival - t
@@ -197,7 +197,7 @@ def body_gains(t, feedback, out):
         out[q] = x0 + s * (v0 + s * (3.0 * rise - 2.0 * v0 - v1 + s * (v0 + v1 - 2.0 * rise)))
 
 
-@compiled
+@jit
 def body_law(t, p, w):
     """LQR of the virtual body: from CM and attitude to the wrench w.wrench, which `allocate` distributes.
 
@@ -236,7 +236,7 @@ def body_law(t, p, w):
     tau[2] += o[0] * h[1] - o[1] * h[0]
 
 
-@inlined
+@jit_inline
 def input_law(t, p, w):
     """Input force w.f_u (N, 3) [N] at t [s] by the phase's law, plus the deformation damping, for w.r and w.v.
 

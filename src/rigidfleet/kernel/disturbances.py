@@ -6,7 +6,7 @@ true state and adds the forces that no vehicle knows.
 """
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- compiles `height_below`
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.solids.distance import height_below
 
 # A lost vehicle on the ground: critically damped contact of this natural frequency [1/s], damped from
@@ -14,7 +14,7 @@ from rigidfleet.solids.distance import height_below
 _CONTACT, _SOFT = 20.0, 0.01
 
 
-@inlined
+@jit_inline
 def spline_weights(t, step, rows):
     """First of the four rows of a table of ``rows`` that count at t, and their weights; see `spline`."""
     last = rows - 4
@@ -27,7 +27,7 @@ def spline_weights(t, step, rows):
     return j, rest * rest * rest / 6.0, b1, b2, s * s * s / 6.0
 
 
-@compiled
+@jit
 def spline(t, step, table, out):
     """Cubic B-spline with coefficients table (K, N, 3), knots every `step` [s] from 0, into out (N, 3).
 
@@ -44,7 +44,7 @@ def spline(t, step, table, out):
             )
 
 
-@compiled
+@jit
 def exchange(a, b):
     """Exchange the contents of a and b, (N, 3) both."""
     for i in range(a.shape[0]):
@@ -52,7 +52,7 @@ def exchange(a, b):
             a[i, q], b[i, q] = b[i, q], a[i, q]
 
 
-@compiled
+@jit
 def sense(t, disturbance, w):
     """Write measured states into w.r and w.v, and store the true ones in w.r_seen and w.v_seen meanwhile."""
     if disturbance.noise_r.shape[0] > 0:
@@ -65,7 +65,7 @@ def sense(t, disturbance, w):
                 w.r_seen[i, q], w.v_seen[i, q] = r, v
 
 
-@inlined
+@jit_inline
 def contact(m, g, floor, z):
     """Damping [N s/m] and upward force [N] of the ground on a lost vehicle of mass m [kg] at height z [m].
 
@@ -75,7 +75,7 @@ def contact(m, g, floor, z):
     return 2.0 * _CONTACT * m * min(1.0, deep / _SOFT), _CONTACT**2 * m * deep
 
 
-@compiled
+@jit
 def disturb(t, m, g, disturbance, w):
     """Write true states back into w.r and w.v, true forces into w.f_E, and the aerodynamic force into w.f_D (N, 3) [N].
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.records import (
@@ -25,7 +25,7 @@ from rigidfleet.kernel.records import (
     TRAILED,
     TRIAL,
 )
-from rigidfleet.kernel.vectors import filled, in_vectors, rough_inverse, total_or_worst
+from rigidfleet.kernel.vectors import fill_lanes, in_vectors, rough_inverse, total_or_worst
 
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
 _STAGES = 7
@@ -48,15 +48,15 @@ _D = np.array(
 )  # fmt: skip
 
 
-@compiled
+@jit
 def forget_stages(k, first):
     """Set the stages from ``first`` on to zero: NaN in them would survive a weight of zero."""
     for s in range(first, 7):
         for q in range(k.shape[1]):
-            k[s, q] = filled(0.0)
+            k[s, q] = fill_lanes(0.0)
 
 
-@inlined
+@jit_inline
 def advance(k, stage, a, h, p):
     """Write the state of a stage of p: y + h sum a[stage, s] k_s."""
     # All six terms at once, or the first: later stages have weight zero and finite values.
@@ -75,10 +75,10 @@ def advance(k, stage, a, h, p):
             k[TRIAL, q] = early + (k[STATE, q] + (a4 * k[4, q] + a5 * k[5, q]))
 
 
-@inlined
+@jit_inline
 def squared_errors(k, h, rtol, p):
     """Squares of a step's errors over their tolerances, summed over vectors of states."""
-    squares = filled(0.0)
+    squares = fill_lanes(0.0)
     for q in range(k.shape[1]):
         e = h * (
             (_E[0] * k[0, q] + _E[2] * k[2, q] + _E[3] * k[3, q])
@@ -90,19 +90,19 @@ def squared_errors(k, h, rtol, p):
     return squares
 
 
-@inlined
+@jit_inline
 def until_knot(t, step):
     """Time from t to the next knot [s]; knots are every ``step`` from 0, and one that t just meets has passed."""
     return (math.floor(t / step + 1e-6) + 1.0) * step - t
 
 
-@inlined
+@jit_inline
 def step_size(t, h, t_end, p):
     """Length of the next step [s], see `step_to_knot`."""
     return step_to_knot(t, min(h, p.external.max_step), t_end, p.disturbance)
 
 
-@inlined
+@jit_inline
 def step_to_knot(t, h, t_end, disturbance):
     """Length of the next step [s]: about h at most, in equal steps up to the next knot of gusts or noise.
 
@@ -118,13 +118,13 @@ def step_to_knot(t, h, t_end, disturbance):
     return rest / max(1.0, math.ceil(rest / h - 0.05))
 
 
-@compiled
+@jit
 def keep_start(p, w, state):
     """Record the forces after a jump in the trail."""
     read_gauge(p, w, state.trail.start)
 
 
-@compiled
+@jit
 def keep_step(t, h, p, w, state):
     """Record a step in the next row of the trail: Bernstein coefficients of its extension, and the forces at its end.
 
@@ -148,7 +148,7 @@ def keep_step(t, h, p, w, state):
     state.count[TRAILED] += 1
 
 
-@inlined
+@jit_inline
 def keep_samples(t, h, t_new, times, samples, p, state):
     """Write the states at the times in (t, t_new] by the step's continuous extension, from t [s] on, of length h."""
     K, count = state.K, state.count
@@ -169,7 +169,7 @@ def keep_samples(t, h, t_new, times, samples, p, state):
         count[SAMPLES] += 1
 
 
-@compiled
+@jit
 def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     """Integrate `closed_loop` to ``t_end`` [s]; adaptive Dormand-Prince 5(4), PI step control.
 

@@ -7,7 +7,7 @@ y_i = T (v_i - v_cm).
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import constraint_force
 from rigidfleet.kernel.control import input_law
 from rigidfleet.kernel.disturbances import disturb, sense
@@ -21,7 +21,7 @@ from rigidfleet.kernel.rigid_body import (
 )
 
 
-@inlined
+@jit_inline
 def closed_loop(t, y, dy, p, w):
     """Right-hand side dy of the closed loop at time t [s] and state y.
 
@@ -72,7 +72,7 @@ def closed_loop(t, y, dy, p, w):
         quaternion_rate(y[q : q + 4], w.cm[4], dy[q : q + 4])
 
 
-@inlined
+@jit_inline
 def accelerate(dy, p, w):
     """Newton's law, Eqs. (1), (2), with true masses and what vehicles can give: w.a (N, 3) [m/s^2].
 
@@ -95,7 +95,7 @@ def accelerate(dy, p, w):
                 dy[3 * i + s], dy[3 * n + 3 * i + s] = v[i, s], w.a[i, s]
 
 
-@compiled
+@jit
 def world_states(y, p, w):
     """Positions and velocities in world axes from the states of the body formulation: v by Eq. (22)."""
     n = p.vehicles.m.shape[0]
@@ -104,7 +104,7 @@ def world_states(y, p, w):
     turn_back(w.T, y[3 * n : 6 * n], y[q + 7 : q + 10], w.v)
 
 
-@compiled
+@jit
 def turn_back(T, x, origin, out):
     """out_i = origin + T^T x_i (N, 3), of x (3N,)."""
     # Scalars instead of elements: for the compiler, the output could alias the elements.
@@ -119,7 +119,7 @@ def turn_back(T, x, origin, out):
         out[i, 2] = o2 + T02 * x0 + T12 * x1 + T22 * x2
 
 
-@compiled
+@jit
 def body_derivatives(y, dy, p, w):
     """The paper's equations of motion in the body frame, Eqs. (15), (16), in their well-posed form.
 

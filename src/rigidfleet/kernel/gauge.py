@@ -2,11 +2,11 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.constraint import find_multipliers
 
 
-@compiled
+@jit
 def read_gauge(p, w, values):
     """Thrust, acceleration and constraint force of each agent; tension and constraint of each edge; into (3N + 2m,).
 

@@ -30,7 +30,7 @@ from rigidfleet.kernel.avoidance import (
     TICKS,
 )
 from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.moving import (
@@ -61,19 +61,19 @@ _FASTER, _LEAST_SPEED, _NEARER, _LEAST_WAY = 0.25, 0.2, 0.15, 0.2
 #: Shortfall of a distance from which a vehicle evades what moves as well as it can, and that counts as rounding [m].
 _LATE, _ROUNDING = 0.05, 1e-9
 
-_curve = inlined(thrust_of)
+_curve = jit_inline(thrust_of)
 
 
 # -- what a vehicle does -------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def stop_distance(u, i, a):
     """Way [m] of vehicle i to rest from a speed u [m/s]."""
     return way_to_rest(u, a.b[i], a.lag[i], a.period)
 
 
-@compiled
+@jit
 def predict(i, r, v, c, a, out):
     """Motion of vehicle i from r, v (3,) under an acceleration c (3,) held for a tick; see `Avoidance.trial`.
 
@@ -96,7 +96,7 @@ def predict(i, r, v, c, a, out):
     return max(a.behind[i], a.period * (speed + 0.5 * a.period * math.sqrt(rise)) + stop)
 
 
-@compiled
+@jit
 def brake(i, v, a, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,): by b, or to rest within the tick, with drag."""
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
@@ -106,7 +106,7 @@ def brake(i, v, a, out):
         out[q] = -size * v[q]
 
 
-@compiled
+@jit
 def take(i, far, a):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = a.trial
@@ -117,7 +117,7 @@ def take(i, far, a):
         a.chosen[i, q], a.rise[i, q] = trial[3, q], trial[4, q]
 
 
-@compiled
+@jit
 def keeps(i, v, j, s, floor, a):
     """Whether the candidate of vehicle i keeps its distance from the present choice of j; velocities v and s (3,).
 
@@ -152,7 +152,7 @@ def keeps(i, v, j, s, floor, a):
     return least_along(along, rate, least, a.period) >= floor
 
 
-@compiled
+@jit
 def clears(i, v, far, a):
     """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from obstacles at rest."""
     way, normal = a.trial, a.normal
@@ -185,7 +185,7 @@ def clears(i, v, far, a):
 # -- neighbours ----------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def interaction_range(u, c, a):
     """Distance [m] beyond which vehicles with speeds up to u [m/s] neither meet by the next tick nor meet a barrier.
 
@@ -208,7 +208,7 @@ def interaction_range(u, c, a):
     return 2.0 * (room + behind) + max(meet, barrier)
 
 
-@compiled
+@jit
 def list_neighbours(r, lost, way, a):
     """List for each vehicle those within a distance ``way`` [m]; returns False if the list is too short."""
     # By sweep and prune: along the axis in which the fleet is widest, only those within ``way`` are compared.
@@ -258,7 +258,7 @@ def list_neighbours(r, lost, way, a):
     return True
 
 
-@compiled
+@jit
 def greatest(x):
     """Greatest length of the rows of x (N, 3)."""
     longest = 0.0
@@ -267,7 +267,7 @@ def greatest(x):
     return math.sqrt(longest)
 
 
-@compiled
+@jit
 def moved_apart(r, a):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
     # What all have gone together changes no distance: a fleet that travels keeps its lists.
@@ -285,7 +285,7 @@ def moved_apart(r, a):
     return math.sqrt(farthest)
 
 
-@compiled
+@jit
 def update_neighbours(r, v, lost, a):
     """Renew the list of neighbours if others could have come near; returns False if it is too short."""
     fastest, hardest = greatest(v), greatest(a.wanted)
@@ -307,7 +307,7 @@ def update_neighbours(r, v, lost, a):
 # -- the tick ------------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def note(kind, value, t, i, j, a):
     """Note a margin [m] of vehicle i to j, or to obstacle j, if it is the least so far, or the first negative one."""
     if value < a.margin[kind, 0]:
@@ -318,13 +318,13 @@ def note(kind, value, t, i, j, a):
         a.loser[kind, 0], a.loser[kind, 1] = i, j
 
 
-@compiled
+@jit
 def alone(i, a):
     """Whether vehicle i has neither neighbours nor obstacles."""
     return a.start[i + 1] == a.start[i] and a.solids.kind.shape[0] == 0
 
 
-@compiled
+@jit
 def set_floor_beside(t, i, o, r, v, closest, a):
     """Find the distance that the relative stop segment of vehicle i keeps from obstacle o, which moves.
 
@@ -349,7 +349,7 @@ def set_floor_beside(t, i, o, r, v, closest, a):
     return closest
 
 
-@compiled
+@jit
 def set_floors(t, r, v, lost, a):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, acceleration = a.b.shape[0], a.trial[3]
@@ -398,7 +398,7 @@ def set_floors(t, r, v, lost, a):
                 note(OBSTACLE, kept - a.reach[i], t, i, o, a)
 
 
-@compiled
+@jit
 def safe(i, r, v, far, a):
     """Whether the candidate of vehicle i is compatible with the present choices of all others and with obstacles."""
     for e in range(a.start[i], a.start[i + 1]):
@@ -410,14 +410,14 @@ def safe(i, r, v, far, a):
     return clears(i, v[i], far, a)
 
 
-@compiled
+@jit
 def is_pushed(i, a):
     """Whether barriers push vehicle i."""
     push = a.known[2, i]
     return push[0] * push[0] + push[1] * push[1] + push[2] * push[2] > 0.0
 
 
-@compiled
+@jit
 def propose(i, k, v, a, c):
     """Candidate k of vehicle i into c (3,): what it wants, fixed ones, then braking relative to its threat."""
     last = a.candidates.shape[0] + 1
@@ -433,7 +433,7 @@ def propose(i, k, v, a, c):
         brake_beside(i, a.threat[i], v, a, c)
 
 
-@compiled
+@jit
 def room_if_braking(i, r, v, late, a):
     """What `choose` compares of vehicle i, if it brakes [m]."""
     c = a.trial[3]
@@ -444,7 +444,7 @@ def room_if_braking(i, r, v, late, a):
     return room_beside(i, v[i], a)
 
 
-@compiled
+@jit
 def choose(i, r, v, a):
     """Choose for vehicle i: what it wants, else the nearest safe candidate, else braking; returns which.
 
@@ -483,14 +483,14 @@ def choose(i, r, v, a):
     return 1
 
 
-@compiled
+@jit
 def tally(kind, i, t, a):
     """Count that a layer has acted on vehicle i at this tick."""
     a.acted[kind, i] += 1
     a.first[kind, i] = min(a.first[kind, i], t)
 
 
-@compiled
+@jit
 def command(i, state, a):
     """Give vehicle i the force of the acceleration chosen for it; a quadrotor's follows it with a lag."""
     c, u = a.chosen[i], a.commanded[i]
@@ -499,7 +499,7 @@ def command(i, state, a):
         state.force[i, q] = a.weight[i] * (u[q] + (a.g if q == 2 else 0.0))
 
 
-@compiled
+@jit
 def want(i, state, a):
     """The acceleration that vehicle i is asked for, with its thrust limited."""
     force = state.force[i]
@@ -522,7 +522,7 @@ def want(i, state, a):
             a.overruled[i] = 0
 
 
-@compiled
+@jit
 def at_once(i, q, a):
     """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
     return a.commanded[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (
@@ -530,7 +530,7 @@ def at_once(i, q, a):
     )
 
 
-@compiled
+@jit
 def foresee(i, vehicles, state, r, v, a):
     """Lead r and v (3,) of vehicle i to the point that obeys the guard at once; keeps the points behind it.
 
@@ -555,7 +555,7 @@ def foresee(i, vehicles, state, r, v, a):
     a.behind[i] = math.sqrt(away)
 
 
-@compiled
+@jit
 def avoid(p, w, flight, state, a):
     """Filter and guard the forces that the formation's law has just given; returns 0 if neighbours are too many."""
     n, lost, t = a.b.shape[0], flight.vehicles.lost, state.work.law_time[0]

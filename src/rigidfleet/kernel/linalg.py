@@ -2,22 +2,22 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 
 
-@compiled
+@jit
 def where_positive(x, a, b):
     """Return a if x > 0, else b."""
     return a if x > 0.0 else b
 
 
-@compiled
+@jit
 def surely_positive(x):
     """Whether x > 0; straight-line code cannot know and assumes that it is not (`tracer`)."""
     return x > 0.0
 
 
-@compiled
+@jit
 def cholesky(A):
     """Factor the lower triangle of A (n, n) = L D L^T in place; the diagonal keeps 1 / D_jj.
 
@@ -56,7 +56,7 @@ def cholesky(A):
     return True
 
 
-@compiled
+@jit
 def cholesky_solve(A, x):
     """Solve L D L^T x = x in place, A as left by `cholesky`; two unknowns at a time."""
     n = A.shape[0]
@@ -77,7 +77,7 @@ def cholesky_solve(A, x):
             x[k] -= A[i, k] * s + A[i + 1, k] * t
 
 
-@compiled
+@jit
 def jacobi_eigen(A, V, w):
     """Eigenvalues ``w`` and eigenvectors ``V[:, i]`` of symmetric A by cyclic Jacobi rotations.
 
@@ -132,7 +132,7 @@ def jacobi_eigen(A, V, w):
     return largest
 
 
-@compiled
+@jit
 def least_eigenvalue(A, v, d, e, zero):
     """The smallest eigenvalue of symmetric A (n, n) that exceeds ``zero`` times the largest one.
 
@@ -183,7 +183,7 @@ def least_eigenvalue(A, v, d, e, zero):
     return least
 
 
-@compiled
+@jit
 def tridiagonal_eigenvalues(d, e):
     """Eigenvalues of a tridiagonal matrix with diagonal d (n,) and subdiagonal e (n,), whose last is 0; into d."""
     n = d.shape[0]

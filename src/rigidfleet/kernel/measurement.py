@@ -8,7 +8,7 @@ doi:10.1107/S0108767305015266).
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, exact
+from rigidfleet.kernel.compiler.jit import exact, jit
 from rigidfleet.kernel.linalg import jacobi_eigen, least_eigenvalue
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
@@ -18,7 +18,7 @@ from rigidfleet.kernel.rigid_body import (
     multiply,
     multiply_transposed,
 )
-from rigidfleet.kernel.vectors import filled, in_vectors, inverse_root_of, where_positive
+from rigidfleet.kernel.vectors import fill_lanes, in_vectors, inverse_root_of, where_positive
 
 #: Slots thinner than this, relative to their length, count as a line in an attitude fit.
 _THIN = 1e-3
@@ -37,7 +37,7 @@ _AT_ONCE = 8
 _SWEEPS, _TINY = 4, 1e-300
 
 
-@compiled
+@jit
 def fit(B, bound, K, V, w, q):
     """Unit quaternion q (4,) of the rotation T that maximises tr(T B^T), B = sum m p x^T (3, 3).
 
@@ -96,7 +96,7 @@ def fit(B, bound, K, V, w, q):
         q[j] = V[j, at]
 
 
-@compiled
+@jit
 def cofactors(K, i, out):
     """Row i of the cofactors of K (4, 4) into out (4,); returns the square of their length."""
     a, b, c = K[0], K[1], K[2]
@@ -120,7 +120,7 @@ def cofactors(K, i, out):
     return total
 
 
-@compiled
+@jit
 def determinant(K):
     """Determinant of K (4, 4)."""
     s0, s1 = K[0, 0] * K[1, 1] - K[1, 0] * K[0, 1], K[0, 0] * K[1, 2] - K[1, 0] * K[0, 2]
@@ -132,7 +132,7 @@ def determinant(K):
     return s0 * c5 - s1 * c4 + s2 * c3 + s3 * c2 - s4 * c1 + s5 * c0
 
 
-@compiled
+@jit
 def quaternion_of(T, q):
     """Unit quaternion q (4,) of a rotation T (3, 3): the longest column of 4 q q^T."""
     a, b, c = T[0, 0], T[1, 1], T[2, 2]
@@ -152,7 +152,7 @@ def quaternion_of(T, q):
         q[k] *= scale
 
 
-@compiled
+@jit
 def keep_sign(q, last):
     """Choose the sign of a quaternion q (4,): no jump from the one before, ``last``, or else q0 >= 0."""
     if math.isnan(q[0] + q[1] + q[2] + q[3]):
@@ -167,7 +167,7 @@ def keep_sign(q, last):
         last[k] = q[k]
 
 
-@compiled
+@jit
 def extent(p, mass, C, V, w, axis):
     """Width and length of slots p (N, 3) of a ``mass`` (N,); the direction of the length into ``axis`` (3,).
 
@@ -200,7 +200,7 @@ def extent(p, mass, C, V, w, axis):
     return math.sqrt(max(second, 0.0)), math.sqrt(max(w[k], 0.0))
 
 
-@compiled
+@jit
 def lay_line(x, p, mass, axis, near, T, now, there, across):
     """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
     for a in range(3):
@@ -248,7 +248,7 @@ def lay_line(x, p, mass, axis, near, T, now, there, across):
             T[k, a] += (along * across[a] - square * near[k, a]) / close
 
 
-@compiled
+@jit
 def line_inverse(I, lifted, axis, out):
     """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself.
 
@@ -287,7 +287,7 @@ def line_inverse(I, lifted, axis, out):
             out[a, b] -= axis[a] * axis[b] / (x + largest)
 
 
-@compiled
+@jit
 def axis_of(I, x, axis):
     """Unit eigenvector of symmetric I (3, 3) for its simple eigenvalue x, into axis (3,); returns det (I - x)."""
     a, d, f = I[0, 0] - x, I[1, 1] - x, I[2, 2] - x
@@ -307,7 +307,7 @@ def axis_of(I, x, axis):
     return a * A + b * B + c * C
 
 
-@compiled
+@jit
 def attitude_of(m, k, known, line_known, near, work, T):
     """Attitude of the slots at sample k into ``m.attitude`` and T (3, 3); returns whether they count as a line.
 
@@ -347,7 +347,7 @@ def attitude_of(m, k, known, line_known, near, work, T):
     return False
 
 
-@compiled
+@jit
 def measure(m):
     """Measure all samples."""
     n, work = m.mass.shape[0], m.work
@@ -421,7 +421,7 @@ def measure(m):
                     move_origin(m, k, T, centre, omega, h)
 
 
-@compiled
+@jit
 def move_origin(m, k, T, centre, omega, offset):
     """Move the centre of mass of the agents left to the origin of the body, of which some agents are missing."""
     multiply_transposed(T, centre, offset)
@@ -437,7 +437,7 @@ def length(x, y, z):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
+@jit
 def motion(m, k, mass, M):
     """Centre of mass, wrench, thrust and distances at sample k; agents about their centre of mass into ``m.x``."""
     r, v, f, g = m.r[k], m.v[k], m.f_u[k], m.f_C[k]
@@ -463,7 +463,7 @@ def motion(m, k, mass, M):
         m.distance[k, e] = length(x, y, z) if both else math.nan
 
 
-@compiled
+@jit
 def angular_momentum(m, k, mass, h):
     """h = sum m x cross v about the centre of mass at sample k, Eq. (17), into h (3,)."""
     V, v, x = m.cm_velocity[k], m.v[k], m.x[0]
@@ -475,7 +475,7 @@ def angular_momentum(m, k, mass, h):
         h[2] += mass[i] * (x[i, 0] * Y - x[i, 1] * X)
 
 
-@compiled
+@jit
 def spectrum(s):
     """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J.
 
@@ -513,7 +513,7 @@ def spectrum(s):
         else:
             for a in range(3 * n):
                 for b in range(3 * n):
-                    A[a, b] = filled(0.0)
+                    A[a, b] = fill_lanes(0.0)
             for e in range(m):
                 i, j = 3 * edges[e, 0], 3 * edges[e, 1]
                 for a in range(3):
@@ -535,14 +535,14 @@ def spectrum(s):
             s.values[first + l] = math.sqrt(s.least[0, l])
 
 
-@compiled
+@jit
 def least_eigenvalue_of_three(A):
     """As `linalg.least_eigenvalue`, of eight symmetric matrices at once: A (3, 3) of vectors.
 
     Jacobi's rotations, equally many for all matrices, so that none depends on those beside it.
     """
     a, b, c, d, e, f = A[0, 0], A[1, 1], A[2, 2], A[1, 0], A[2, 0], A[2, 1]
-    none = filled(0.0)
+    none = fill_lanes(0.0)
     for _ in range(_SWEEPS):
         a, b, e, f = rotate(d, a, b, e, f)
         a, c, d, f = rotate(e, a, c, none, f)
@@ -556,7 +556,7 @@ def least_eigenvalue_of_three(A):
     return min(least, where_positive(c - zero, c, largest))
 
 
-@compiled
+@jit
 def rotate(off, p, q, x, y):
     """Rotate so that an element ``off`` the diagonal of a matrix becomes zero.
 

@@ -32,7 +32,7 @@ from rigidfleet.kernel.bernstein import (
     touch_box,
     weights,
 )
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
@@ -77,7 +77,7 @@ _TURN = 0.1
 _NARROW = 1e-3
 
 
-@compiled
+@jit
 def take(kind, key, t, first, second, monitor):
     """Store a value that is worse than the worst one of its kind; a smaller ``key`` is worse."""
     if key < monitor.worst[kind]:
@@ -89,7 +89,7 @@ def take(kind, key, t, first, second, monitor):
 # -- positions -----------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def quaternion_of(points, p):
     """Greatest rate, over a step, and least length of the quaternion of the body axes, by its control points."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
@@ -103,7 +103,7 @@ def quaternion_of(points, p):
     return math.sqrt(fastest), math.sqrt(least)
 
 
-@compiled
+@jit
 def angle_of(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
@@ -112,13 +112,13 @@ def angle_of(points, p):
     return 2.0 * rate / max(length, 1e-3)
 
 
-@compiled
+@jit
 def pieces_over(angle):
     """Number of pieces into which a step is cut whose axes turn by an angle [rad]."""
     return int(min(max(1.0, math.ceil(angle / _TURN)), 1e4))
 
 
-@compiled
+@jit
 def find_attitudes(points, part, parts, p, monitor):
     """Attitude, centre and its velocity at five knots of a piece of a step, in the body formulation."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
@@ -133,7 +133,7 @@ def find_attitudes(points, part, parts, p, monitor):
         attitude_matrix(quaternion, monitor.attitudes[k])
 
 
-@compiled
+@jit
 def along(basis, points, q):
     """Column q of control points (5, n) where a curve has the Bernstein polynomials ``basis`` (5,)."""
     value = 0.0
@@ -142,7 +142,7 @@ def along(basis, points, q):
     return value
 
 
-@compiled
+@jit
 def in_world(points, i, moving, p, monitor, out):
     """Control points (5, 3) of agent i's position in the world, or of its velocity (``moving`` 1)."""
     n = p.vehicles.m.shape[0]
@@ -171,7 +171,7 @@ def in_world(points, i, moving, p, monitor, out):
 # -- distances ---------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def from_mean(points, k, i, mean):
     """Control point k of agent i, from the mean of those of the agents that are monitored."""
     return (
@@ -181,7 +181,7 @@ def from_mean(points, k, i, mean):
     )
 
 
-@compiled
+@jit
 def find_mean(points, monitor, mean):
     """Mean (5, 3) of the control points of the agents that are monitored."""
     count = 0
@@ -196,7 +196,7 @@ def find_mean(points, monitor, mean):
             mean[k, q] = total / count
 
 
-@compiled
+@jit
 def rotation_over(points, mean, monitor):
     """Rotation [rad] about each axis by which agents turn about their mean over a step.
 
@@ -227,7 +227,7 @@ def rotation_over(points, mean, monitor):
     )
 
 
-@compiled
+@jit
 def bound_moves(p, state, monitor):
     """Bounds [m] of the change of any distance over the trail's first step, in space and as seen from above.
 
@@ -268,20 +268,20 @@ def bound_moves(p, state, monitor):
     monitor.moves[1] = monitor.moves[0] + tilt * 2.0 * math.sqrt(farthest)
 
 
-@compiled
+@jit
 def put(curve, ball):
     """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
     ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
 
 
-@compiled
+@jit
 def place(points, monitor):
     """Balls that hold the agents' positions over a step, in the axes of the states."""
     for i in range(monitor.balls.shape[0]):
         put(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
 
 
-@compiled
+@jit
 def apart(i, j, axes, reach, monitor):
     """Whether agents i and j stay at least ``reach`` [m] apart over a step, by their balls, along the first ``axes``.
 
@@ -295,7 +295,7 @@ def apart(i, j, axes, reach, monitor):
     return reach > 0.0 and far >= reach * reach
 
 
-@compiled
+@jit
 def watch_pairs(kind, pairs, points, t, h, monitor):
     """Least distance, or height, between the surfaces of pairs of agents (P, 2) over a step.
 
@@ -328,7 +328,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
             take(kind, value - radii, t + at * h, i, j, monitor)
 
 
-@compiled
+@jit
 def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
     """Least of sign r[axis] - offset over a curve (5, 3)."""
     work, bound = monitor.work, math.inf
@@ -341,7 +341,7 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
             take(kind, value, t + at * h, i, -1, monitor)
 
 
-@compiled
+@jit
 def watch_speed(kind, curve, low, high, t, h, i, monitor):
     """Greatest length of the coordinates from ``low`` to before ``high`` of a velocity over a curve (5, 3)."""
     fastest, piece = 0.0, monitor.pieces[0]
@@ -360,7 +360,7 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
         take(kind, -length_at(piece, at), t + at * h, i, -1, monitor)
 
 
-@compiled
+@jit
 def clearance_of_interest(i, monitor):
     """Clearance of agent i from which on it is worse than what is stored."""
     # A clearance is stored under three names, and is of no interest only if it is worse than none of them.
@@ -370,7 +370,7 @@ def clearance_of_interest(i, monitor):
     return max(own, monitor.worst[CLEARANCE])
 
 
-@compiled
+@jit
 def take_clearance(value, t, i, b, above, monitor):
     """Store the clearance of agent i to obstacle b; of one ``above`` it, which may be landing, until it leaves."""
     low = monitor.low
@@ -383,7 +383,7 @@ def take_clearance(value, t, i, b, above, monitor):
         low[i, 0], low[i, 1], low[i, 2] = value, t, float(b)
 
 
-@compiled
+@jit
 def leave(i, monitor):
     """Agent i is away from all obstacles below it: it no longer stands on one, and was not landing."""
     low = monitor.low
@@ -394,7 +394,7 @@ def leave(i, monitor):
         low[i, 0] = math.inf
 
 
-@compiled
+@jit
 def watch_obstacles(i, curve, t, h, last, monitor):
     """Clearance of agent i's surface to obstacles over a piece of a step; ``last`` is the clearance at its end.
 
@@ -425,7 +425,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     leave(i, monitor)
 
 
-@compiled
+@jit
 def unremarkable(points, i, angle, p, monitor):
     """Whether agent i is surely neither faster nor lower nor higher, over a step, than others have been.
 
@@ -458,7 +458,7 @@ def unremarkable(points, i, angle, p, monitor):
     )  # fmt: skip
 
 
-@compiled
+@jit
 def watch_distances(first, end, p, state, monitor):
     """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``.
 
@@ -470,7 +470,7 @@ def watch_distances(first, end, p, state, monitor):
     monitor.count[LISTED_DISTANCES] = ANY_STEP
 
 
-@compiled
+@jit
 def watch_step(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
     trail, row = state.trail, row_of(step, state)
@@ -519,7 +519,7 @@ def watch_step(step, p, state, monitor):
 # -- forces ------------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def judge_forces(values, t, p, monitor):
     """Take the forces of a gauge (3N + 2m or 5N + 2m,) at time t [s] into account."""
     n, edges = p.vehicles.m.shape[0], p.graph.edges
@@ -543,7 +543,7 @@ def judge_forces(values, t, p, monitor):
         take(CONSTRAINT, -abs(c), t, edges[k, 0], edges[k, 1], monitor)
 
 
-@compiled
+@jit
 def worst_of(c, p, monitor):
     """The greatest value so far of the quantity of entry c of a gauge."""
     n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
@@ -563,7 +563,7 @@ def worst_of(c, p, monitor):
     return -monitor.worst[TENSION if c < 3 * n + m else CONSTRAINT]
 
 
-@compiled
+@jit
 def evaluate(t, step, p, w, state, monitor, values):
     """Forces at time t [s], within a step of the trail, into a gauge."""
     trail, row = state.trail, row_of(step, state)
@@ -579,7 +579,7 @@ def evaluate(t, step, p, w, state, monitor, values):
     judge_forces(values, t, p, monitor)
 
 
-@compiled
+@jit
 def promise(c, a, b, v, ta, tb, tc, p, monitor):
     """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
@@ -609,7 +609,7 @@ def promise(c, a, b, v, ta, tb, tc, p, monitor):
     return beyond / worst, top
 
 
-@compiled
+@jit
 def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
@@ -656,20 +656,20 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
             return
 
 
-@compiled
+@jit
 def row_of(step, state):
     """Row of the trail that holds one of the steps in it, which are numbered from 0."""
     return (state.count[FIRST_ROW] + step) % state.trail.clock.shape[0]
 
 
-@compiled
+@jit
 def end_of(step, state):
     """Time [s] at which a step of the trail ends."""
     row = row_of(step, state)
     return state.trail.clock[row, 0] + state.trail.clock[row, 1]
 
 
-@compiled
+@jit
 def watch_middle(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
     start, end = state.trail.clock[row_of(step, state), 0], end_of(step, state)
@@ -678,7 +678,7 @@ def watch_middle(step, before, after, p, w, state, monitor):
     look_between(before, values, after, step, start, middle, end, p, w, state, monitor)
 
 
-@compiled
+@jit
 def watch_forces(last, p, w, state, monitor):
     """Take the extremes of forces over the steps of a trail; with ``last``, no further step of the segment follows.
 
@@ -713,7 +713,7 @@ def watch_forces(last, p, w, state, monitor):
         keep_last(steps, state, monitor)
 
 
-@compiled
+@jit
 def keep_last(steps, state, monitor):
     """Leave the last of the ``steps`` alone in the trail, and keep the forces at the end of the one before it."""
     if steps > 1:

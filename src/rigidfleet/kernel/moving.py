@@ -15,7 +15,7 @@ import math
 
 from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.segments import from_obstacle, from_solid, least_along
 from rigidfleet.solids.distance import displacement, is_there
 
@@ -39,7 +39,7 @@ _FLOW_RATE, _WIDER, _WEAK = 4.0, 1.2, 1e-3
 # -- what is known -------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def expect(o, T, sight):
     """Predict the track of obstacle o by T [s]: constant velocity, with white noise of its acceleration."""
     x, P = sight.track[o], sight.spread[o]
@@ -51,7 +51,7 @@ def expect(o, T, sight):
     P[2] += q * T
 
 
-@compiled
+@jit
 def correct(o, z, sight):
     """Correct the track of obstacle o by a measured displacement z (3,) [m]."""
     x, P = sight.track[o], sight.spread[o]
@@ -66,7 +66,7 @@ def correct(o, z, sight):
     P[0] *= 1.0 - near
 
 
-@compiled
+@jit
 def velocity(t, o, solids):
     """Velocity [m/s] of obstacle o at t [s], free of the rounding that differences of places would have."""
     for k in range(solids.first[o, 3], solids.last[o, 3] - 1):
@@ -77,7 +77,7 @@ def velocity(t, o, solids):
     return 0.0, 0.0, 0.0
 
 
-@compiled
+@jit
 def in_sight(o, x, y, z, r, lost, a):
     """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
     for i in range(r.shape[0]):
@@ -88,7 +88,7 @@ def in_sight(o, x, y, z, r, lost, a):
     return False
 
 
-@compiled
+@jit
 def see(o, k, x, y, z, u, v, w, a):
     """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
     s = a.sight
@@ -109,7 +109,7 @@ def see(o, k, x, y, z, u, v, w, a):
         correct(o, seen, s)
 
 
-@compiled
+@jit
 def look(t, r, lost, a):
     """Bring what is known of all obstacles that move to t [s], with vehicles at r (N, 3)."""
     s, T = a.sight, a.period
@@ -139,13 +139,13 @@ def look(t, r, lost, a):
 # -- relative motion -----------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def is_known(o, a):
     """Whether obstacle o stands still, or moves and is known."""
     return a.sight.moves[o] == 0 or a.sight.known[o] == KNOWN
 
 
-@compiled
+@jit
 def braking_beside(i, o, a):
     """Acceleration [m/s^2] with which vehicle i can always brake relative to obstacle o, which moves."""
     x = a.sight.track[o]
@@ -154,7 +154,7 @@ def braking_beside(i, o, a):
     return max(a.b[i] - drag * speed - a.sight.swerve, _LEAST * a.b[i])
 
 
-@compiled
+@jit
 def brake_beside(i, o, v, a, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
 
@@ -170,7 +170,7 @@ def brake_beside(i, o, v, a, out):
         out[q] = (1.0 - E) / first * x[3 + q] - size * (v[q] - x[3 + q])
 
 
-@compiled
+@jit
 def way_to_rest(u, b, lag, T):
     """Way [m] to rest from a speed u [m/s], with commands held for a period: n whole ones, then one to rest."""
     change = b * T
@@ -180,14 +180,14 @@ def way_to_rest(u, b, lag, T):
     return T * (n * (u - 0.5 * n * change) + 0.5 * rest) + lag * u
 
 
-@compiled
+@jit
 def need_beside(i, o, speed, b, a):
     """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
     bound = a.sight.bound[o]
     return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / b
 
 
-@compiled
+@jit
 def stop_beside(i, o, r, v, a):
     """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
     x, out = a.sight.track[o], a.shifted
@@ -202,7 +202,7 @@ def stop_beside(i, o, r, v, a):
     return stop, speed
 
 
-@compiled
+@jit
 def room_beside(i, v, a):
     """By how much the candidate of vehicle i keeps its distances from obstacles that move [m]; infinite if it is far.
 
@@ -244,7 +244,7 @@ def room_beside(i, v, a):
     return room
 
 
-@compiled
+@jit
 def miss(r, v, c, a):
     """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration c (3,).
 
@@ -274,7 +274,7 @@ def miss(r, v, c, a):
 # -- flow ----------------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def follow_flow(i, r, v, a):
     """Lead what vehicle i is asked for round obstacles, as a flow round balls leads a fluid; whether it does.
 

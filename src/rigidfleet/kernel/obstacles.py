@@ -13,7 +13,7 @@ import math
 
 from rigidfleet.kernel.bernstein import nearest_box, point_at, span_of
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
-from rigidfleet.kernel.compiler.jit import compiled, compiled_copy
+from rigidfleet.kernel.compiler.jit import compiled_copy, jit
 from rigidfleet.kernel.monitor import (
     angle_of,
     clearance_of_interest,
@@ -39,7 +39,7 @@ from rigidfleet.solids.records import HEIGHTS
 _SHORTEST = 2.0**-32
 
 
-@compiled
+@jit
 def touch_solid(x, y, z, b, triangle, s):
     """As `bernstein.touch_box`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
@@ -56,7 +56,7 @@ def touch_solid(x, y, z, b, triangle, s):
 nearest_along = compiled_copy(nearest_box, "nearest_along", touch_box=touch_solid)
 
 
-@compiled
+@jit
 def nearest_heights(curve, b, floor, pieces, s):
     """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
     best, at = floor, -1.0
@@ -80,7 +80,7 @@ def nearest_heights(curve, b, floor, pieces, s):
     return best, at
 
 
-@compiled
+@jit
 def cut(curve, start, end, work, out):
     """Control points (5, 3) of the part of a curve between two places, by its blossom."""
     for k in range(5):
@@ -94,7 +94,7 @@ def cut(curve, start, end, work, out):
             out[k, q] = work[0]
 
 
-@compiled
+@jit
 def into_axes(curve, t, h, b, s, out):
     """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
     x0, y0, z0 = displacement(t, b, s)
@@ -107,14 +107,14 @@ def into_axes(curve, t, h, b, s, out):
         out[k, 0], out[k, 1], out[k, 2] = own_axes(x, y, z, b, s)
 
 
-@compiled
+@jit
 def into_own_axes(x, y, z, t, b, s):
     """Coordinates of a point of the world in the axes of solid b at time t [s]."""
     u, v, w = displacement(t, b, s)
     return own_axes(x - u, y - v, z - w, b, s)
 
 
-@compiled
+@jit
 def watch_solid(i, b, curve, t, h, s, monitor):
     """Clearance of agent i's surface to solid b over a piece of a step."""
     radius, part, own = monitor.radius[i], monitor.curves[1], monitor.curves[2]
@@ -149,7 +149,7 @@ def watch_solid(i, b, curve, t, h, s, monitor):
         start = end
 
 
-@compiled
+@jit
 def far_from(x, y, z, b, s):
     """Lower bound of the distance of a point from solid b, in its axes: that from the box around it."""
     if s.leaf.shape[0] > 0 and s.last[b, 0] > s.first[b, 0]:
@@ -157,7 +157,7 @@ def far_from(x, y, z, b, s):
     return signed_distance(x, y, z, b, s)
 
 
-@compiled
+@jit
 def watch_landing(i, curve, t, s, monitor):
     """At the end (time t) of a step, tell whether agent i has left all obstacles below it."""
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
@@ -175,7 +175,7 @@ def watch_landing(i, curve, t, s, monitor):
     leave(i, monitor)
 
 
-@compiled
+@jit
 def watch_step(points, start, length, p, s, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
     curve, parts = monitor.curves[0], pieces_over(angle_of(points, p))

@@ -8,7 +8,7 @@ torque, linear drag, a quadratic lag of the motors and the rotors' angular momen
 import math
 
 from rigidfleet.kernel.aerodynamics import ground_effect
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.disturbances import contact
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
@@ -18,10 +18,10 @@ from rigidfleet.solids.distance import height_below
 #: Rows of `SampledWork.y`.
 _START, _TRIAL, _RATES, _END = 0, 1, 2, 6
 
-_curve = inlined(thrust_of)
+_curve = jit_inline(thrust_of)
 
 
-@compiled
+@jit
 def point_derivative(y, command, i, vehicles, air, push, dy):
     """Derivative dy (17,) of vehicle i, an ideal point with the force ``command`` [N], limited by its own rules."""
     m = vehicles.m[i]
@@ -33,7 +33,7 @@ def point_derivative(y, command, i, vehicles, air, push, dy):
         dy[q] = 0.0
 
 
-@compiled
+@jit
 def derivative(y, command, i, vehicles, around, air, push, T, dy):
     """Derivative dy (17,) of the state y (17,) of vehicle i, see `fleet.STATES`.
 
@@ -119,7 +119,7 @@ def derivative(y, command, i, vehicles, around, air, push, T, dy):
         dy[5] += lift / m
 
 
-@compiled
+@jit
 def runge_kutta(h, commands, vehicles, around, push, work):
     """Advance all vehicles by h [s] from row 0 of ``work.y`` to row 6, the classical method of fourth order.
 
@@ -148,7 +148,7 @@ def runge_kutta(h, commands, vehicles, around, push, work):
         normalise(y[_END, 17 * i + 6 : 17 * i + 10])
 
 
-@compiled
+@jit
 def normalise(q):
     """Scale a quaternion (4,) to unit length."""
     scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -156,7 +156,7 @@ def normalise(q):
         q[k] *= scale
 
 
-@compiled
+@jit
 def evaluate(flight, call):
     """Derivatives of all vehicles, see `fleet.Evaluation`."""
     for i in range(call.S.shape[0]):

@@ -2,14 +2,14 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.problem import BODY, OPEN, TRACKING
 from rigidfleet.kernel.references import blend_slots
 
 
-@compiled
+@jit
 def copy(a, out):
     """Copy a into out, both two-dimensional."""
     for i in range(a.shape[0]):
@@ -17,7 +17,7 @@ def copy(a, out):
             out[i, j] = a[i, j]
 
 
-@compiled
+@jit
 def fill_with_nan(out):
     """Write NaN into a two-dimensional array."""
     for i in range(out.shape[0]):
@@ -25,7 +25,7 @@ def fill_with_nan(out):
             out[i, j] = math.nan
 
 
-@compiled
+@jit
 def record(times, samples, p, w, dy, out, first):
     """Evaluate the closed loop at the sampled states, and record its forces and references from row ``first`` on.
 
@@ -37,7 +37,7 @@ def record(times, samples, p, w, dy, out, first):
             record_sample(times[k], p, w, first + k, out)
 
 
-@compiled
+@jit
 def record_sample(t, p, w, k, out):
     """Copy the values of the closed loop at time t [s] from the workspace into row k of a record; NaN for none."""
     kind = p.control.kind

@@ -1,9 +1,9 @@
 """Recursions along tables, of which filters and the solution of tridiagonal systems are made."""
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 
 
-@compiled
+@jit
 def follow(s):
     """x_k += a_k x_(k-1) from the first row to the last, or x_k += a_k x_(k+1) from the last to the first.
 

@@ -2,13 +2,13 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.problem import SHAPE, SQUARED, septic_polynomial
 
-blend = inlined(septic_polynomial)
+blend = jit_inline(septic_polynomial)
 
 
-@compiled
+@jit
 def septic(t, t0, T_b):
     """Blend s from 0 to 1 over [t0, t0 + T_b] with three vanishing derivatives at either end.
 
@@ -24,7 +24,7 @@ def septic(t, t0, T_b):
     return blend(x), rate / T_b, second / T_b**2
 
 
-@inlined
+@jit_inline
 def piece_at(t, knots):
     """Piece between knots (n + 1,) [s] at t, the time since it began, and the time since the last knot, or zero."""
     low, high = 0, knots.shape[0] - 1
@@ -38,7 +38,7 @@ def piece_at(t, knots):
     return low, inside - knots[low], t - inside
 
 
-@compiled
+@jit
 def follow_ways(t, knots, ways, p, p_dot, p_ddot):
     """Slots p (N, 3) [m] on their ways at t, and their derivatives; at rest before the first knot and after the last.
 
@@ -57,7 +57,7 @@ def follow_ways(t, knots, ways, p, p_dot, p_ddot):
             p[i, q], p_dot[i, q], p_ddot[i, q] = value, moves * rate, moves * second
 
 
-@compiled
+@jit
 def blend_slots(t, reference, p, p_dot, p_ddot):
     """Slots p (N, 3) [m] in body axes at t, and their derivatives, by a blend or on their ways.
 
@@ -106,7 +106,7 @@ def blend_slots(t, reference, p, p_dot, p_ddot):
         p_ddot[i, 2] = w_dot * eZ + w * w * (e0 * eY - e1 * eX) + u * fZ + s_ddot * dZ
 
 
-@compiled
+@jit
 def distance_references(t, reference, edges, p, p_dot, p_ddot, d, d_dot, d_ddot):
     """Desired distances d (m,) [m] and two derivatives, by the reference's kind.
 

@@ -2,12 +2,12 @@
 
 import math
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.linalg import jacobi_eigen, surely_positive, where_positive
 from rigidfleet.kernel.problem import PINV_EQUAL, PINV_INERTIA_FORCE, RIGID
 
 
-@inlined
+@jit_inline
 def centre_of_mass(r, m, M, out):
     """Mass-weighted mean of r (N, 3) into out (3,); M is the sum of the masses m (N,)."""
     x = y = z = 0.0
@@ -16,7 +16,7 @@ def centre_of_mass(r, m, M, out):
     out[0], out[1], out[2] = x / M, y / M, z / M
 
 
-@inlined
+@jit_inline
 def inertia(r, m, cm, I):
     """Inertia I (3, 3) [kg m^2] of points r (N, 3) about cm, as in Eq. (19): sum m (|x|^2 1 - x x^T)."""
     a = b = c = d = e = f = 0.0
@@ -34,7 +34,7 @@ def inertia(r, m, cm, I):
     I[2, 0], I[2, 1], I[2, 2] = c, e, f
 
 
-@inlined
+@jit_inline
 def inertia_inverse(I, out):
     """Pseudo-inverse of the inertia of point masses into out (3, 3), relative cut-off 1e-9.
 
@@ -59,21 +59,21 @@ def inertia_inverse(I, out):
     out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
 
 
-@compiled
+@jit
 def multiply(A, x, out):
     """out = A x for a (3, 3) matrix."""
     for i in range(3):
         out[i] = A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2]
 
 
-@compiled
+@jit
 def multiply_transposed(A, x, out):
     """out = A^T x for a (3, 3) matrix."""
     for i in range(3):
         out[i] = A[0, i] * x[0] + A[1, i] * x[1] + A[2, i] * x[2]
 
 
-@inlined
+@jit_inline
 def mean_axes(r, v, m, M, w):
     """Centre of mass, inertia and mean-axis angular velocity omega = I^+ h, world axes.
 
@@ -98,7 +98,7 @@ def mean_axes(r, v, m, M, w):
     multiply(w.I_inv, w.cm[3], w.cm[2])
 
 
-@compiled
+@jit
 def damp_deformation(r, v, m, k_def, cm, f):
     """Add -k_def m_i (v_i - v_cm - omega x (r_i - r_cm)) to f (N, 3): no net force or torque."""
     r0, r1, r2 = cm[0, 0], cm[0, 1], cm[0, 2]
@@ -112,7 +112,7 @@ def damp_deformation(r, v, m, k_def, cm, f):
         f[i, 2] -= k * (v[i, 2] - v2 - (o0 * y - o1 * x))
 
 
-@compiled
+@jit
 def attitude_matrix(q, T):
     """T(q) (3, 3), world -> body, of a scalar-first quaternion of any length."""
     n = 1.0 / (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
@@ -127,7 +127,7 @@ def attitude_matrix(q, T):
     T[2, 2] = n * (q[0] * q[0] - q[1] * q[1] - q[2] * q[2] + q[3] * q[3])
 
 
-@compiled
+@jit
 def quaternion_rate(q, omega, out):
     """Rotational kinematics, Eq. (21): out (4,) = 1/2 Omega(omega) q, omega in body axes."""
     P, Q, R = omega[0], omega[1], omega[2]
@@ -137,7 +137,7 @@ def quaternion_rate(q, omega, out):
     out[3] = 0.5 * (R * q[0] + Q * q[1] - P * q[2])
 
 
-@compiled
+@jit
 def rotation_vector(R, phi):
     """Log of a rotation matrix R = Exp(phi) into phi (3,) [rad], |phi| <= pi."""
     # From the quaternion's largest component, which is well conditioned at every angle.
@@ -161,7 +161,7 @@ def rotation_vector(R, phi):
     phi[0], phi[1], phi[2] = scale * x, scale * y, scale * z
 
 
-@compiled
+@jit
 def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):
     """Distribute a wrench among agents as in a rigid body, without internal forces.
 
@@ -189,7 +189,7 @@ def allocate_rigid(x, m, M, F, tau, omega, I, I_inv, f):
         f[i, 2] = m[i] * (F[2] / M + a0 * Y - a1 * X + o[0] * c1 - o[1] * c0)
 
 
-@compiled
+@jit
 def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
     """The paper's input decoupling, Eqs. (24)-(27): f = H^+ [F; tau_1; ...; tau_N].
 
@@ -246,7 +246,7 @@ def allocate_pinv(x, m, M, F, tau, split, I, I_inv, f, H, V, work):
                 f[k // 3, k % 3] += s * V[k, q]
 
 
-@compiled
+@jit
 def allocate(x, m, M, F, tau, omega, method, I, I_inv, f, H, V, work):
     """Distribute a wrench among the agents by the named method; see the two functions above."""
     if method == RIGID:

@@ -11,7 +11,7 @@ import math
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
     CONSTRAINT_FORCE,
@@ -45,26 +45,26 @@ from rigidfleet.kernel.rigid_body import (
 #: Times that differ by less than this share of a step are the same.
 _SAME = 1e-9
 
-_curve = inlined(thrust_of)
-_speed = inlined(speed_of)
+_curve = jit_inline(thrust_of)
+_speed = jit_inline(speed_of)
 
 
 # -- what is known -------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def row_of(k, every, first):
     """Row of a table for the measurement at tick k, if the table begins with tick ``first``."""
     return k // every - (first + every - 1) // every
 
 
-@compiled
+@jit
 def path_at(k, i, q, tables):
     """Coordinate q of r, v of vehicle i's path at tick k, or the first one of the table; 0 without paths."""
     return tables.path[max(k - tables.first, 0), i, q] if tables.path.shape[0] > 0 else 0.0
 
 
-@compiled
+@jit
 def measure(k, flight, state):
     """Measured states of all vehicles at tick k, into ``state.seen`` and, if vehicles are linked, ``state.heard``.
 
@@ -91,7 +91,7 @@ def measure(k, flight, state):
         listen(k, flight, state)
 
 
-@compiled
+@jit
 def listen(k, flight, state):
     """Messages that arrive at tick k: what vehicle i knows of the others, into ``state.heard[i]``."""
     sensing, tables, depth = flight.sensing, flight.tables, state.sent.shape[0]
@@ -112,7 +112,7 @@ def listen(k, flight, state):
 # -- the formation law ---------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def evaluate_law(k, t, known, integral, p, w, flight, state, call):
     """Evaluate the formation law at tick k, time t [s], for known states (N, 6) and an integral (m,); results in w."""
     n, m, y = known.shape[0], integral.shape[0], state.work.law_state[0]
@@ -128,7 +128,7 @@ def evaluate_law(k, t, known, integral, p, w, flight, state, call):
     call_recorder(call.recorder, p, w, call.segment, call.record)
 
 
-@compiled
+@jit
 def integrate_constraints(dt, integral, p, w, state):
     """Add c dt to the integral (m,) of each constraint, unless a vehicle of its edge is saturated."""
     edges = p.graph.edges
@@ -137,7 +137,7 @@ def integrate_constraints(dt, integral, p, w, state):
             integral[k] += dt * w.c[k]
 
 
-@compiled
+@jit
 def expect_drag(i, v, share, vehicles, state):
     """Add a share of the drag that vehicle i meets at a velocity v (3,) in still air to its desired force.
 
@@ -161,7 +161,7 @@ def expect_drag(i, v, share, vehicles, state):
         force[q] += x[1, q]
 
 
-@compiled
+@jit
 def take_force(k, i, dt, p, w, flight, state):
     """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
     vehicles, guidance = flight.vehicles, flight.guidance
@@ -187,14 +187,14 @@ def take_force(k, i, dt, p, w, flight, state):
             worse(i, ERROR, math.sqrt(e), state.work.law_time[0], state)
 
 
-@compiled
+@jit
 def worse(i, kind, value, t, state):
     """Keep a value of vehicle i and its time if it is the greatest so far."""
     if value > state.worst[i, kind]:
         state.worst[i, kind], state.worst_time[i, kind] = value, t
 
 
-@compiled
+@jit
 def presume(k, w, flight, state):
     """Let vehicles without a link take each other to be as far off their slots at tick k as they are themselves.
 
@@ -210,7 +210,7 @@ def presume(k, w, flight, state):
                 heard[i, j, q], heard[i, j, 3 + q] = heard[i, i, q] + r, heard[i, i, 3 + q] + v
 
 
-@compiled
+@jit
 def desire(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if there are none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
@@ -244,7 +244,7 @@ def desire(k, t, p, w, flight, state, call):
     return finite
 
 
-@compiled
+@jit
 def advance_frame(t, p, state):
     """Advance the mean-axis frame from the last evaluation of the law to t [s], by the rates of the last two.
 
@@ -258,7 +258,7 @@ def advance_frame(t, p, state):
         normalise(state.frame[0])
 
 
-@compiled
+@jit
 def tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     measure(k, flight, state)
@@ -275,7 +275,7 @@ def tick(k, t, p, w, flight, state, call):
 # -- between ticks -------------------------------------------------------------------------------------
 
 
-@compiled
+@jit
 def advance(S, h, flight, state):
     """Advance all vehicles by h [s] in ``work.y``, from states S (N, 17) to row 6."""
     work = state.work
@@ -285,7 +285,7 @@ def advance(S, h, flight, state):
     runge_kutta(h, state.command, flight.vehicles, flight.air, state.push, work)
 
 
-@compiled
+@jit
 def breathe(t, h, S, p, flight, state):
     """Velocity of the air [m/s] over a step from states S (N, 17), into ``work.air``; a user's force in its middle.
 
@@ -305,7 +305,7 @@ def breathe(t, h, S, p, flight, state):
     return abs(state.push.sum()) < math.inf
 
 
-@compiled
+@jit
 def write_derivatives(c, t, p, flight, state, call):
     """Derivatives of the states of sample c: those at the start of a step without length."""
     breathe(t, 0.0, call.S[c], p, flight, state)
@@ -315,7 +315,7 @@ def write_derivatives(c, t, p, flight, state, call):
             call.dS[c, i, q] = state.work.y[2, 17 * i + q]
 
 
-@compiled
+@jit
 def write_samples(t, h, p, flight, state, call):
     """Write the samples up to t + h [s]: each is a step of its own from t."""
     work, count, times = state.work, state.count, call.times
@@ -352,7 +352,7 @@ def write_samples(t, h, p, flight, state, call):
         count[SAMPLES] = c + 1
 
 
-@compiled
+@jit
 def keep_path(i, h, work, points):
     """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
     own = slice(17 * i, 17 * i + 17)
@@ -371,7 +371,7 @@ def keep_path(i, h, work, points):
         points[3, column], points[4, column] = 0.25 * (3.0 * d2 + v1), v1
 
 
-@compiled
+@jit
 def take_extremes(i, t, h, vehicles, state):
     """Extremes of vehicle i over a step from t [s]: at its end, the acceleration at its start.
 
@@ -401,7 +401,7 @@ def take_extremes(i, t, h, vehicles, state):
         state.worst[i, UPRIGHT], state.worst_time[i, UPRIGHT] = upright, t + h
 
 
-@compiled
+@jit
 def advance_fleet(t, h, p, flight, state):
     """Advance all vehicles from t by h [s], and record the step in the trail, if there is one.
 
@@ -425,7 +425,7 @@ def advance_fleet(t, h, p, flight, state):
     return True
 
 
-@compiled
+@jit
 def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 

@@ -3,7 +3,7 @@
 import math
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
 
 #: Greatest number of tangents by which the nearest point of a segment to an obstacle is sought.
@@ -12,7 +12,7 @@ _TANGENTS = 40
 _STEPS = 100
 
 
-@compiled
+@jit
 def from_solid(x, y, z, o, solids, normal):
     """Signed distance [m] of a point from obstacle o, as it stands without motion; writes its gradient (3,)."""
     x, y, z = own_axes(x, y, z, o, solids)
@@ -25,7 +25,7 @@ def from_solid(x, y, z, o, solids, normal):
     return signed_distance(x, y, z, o, solids)
 
 
-@compiled
+@jit
 def between_segments(p, q, r, s):
     """Least distance [m] between the segments from p to q and from r to s (3,); Ericson 2005, section 5.1.9."""
     d0, d1, d2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -52,7 +52,7 @@ def between_segments(p, q, r, s):
     return math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
+@jit
 def between_hulls(p, last, a, q, end, b, enough, x):
     """Least distance [m] between the hulls of p[0], p[1], p[last], a (2, 3) and of q[0], q[1], q[end], b; x (3,): work.
 
@@ -88,7 +88,7 @@ def between_hulls(p, last, a, q, end, b, enough, x):
     return bound
 
 
-@compiled
+@jit
 def slope(p, q, x, o, solids, normal):
     """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
     u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -96,7 +96,7 @@ def slope(p, q, x, o, solids, normal):
     return value, normal[0] * u + normal[1] * v + normal[2] * w
 
 
-@compiled
+@jit
 def from_obstacle(p, q, o, solids, enough, normal):
     """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
 
@@ -125,7 +125,7 @@ def from_obstacle(p, q, o, solids, enough, normal):
     return bound, value, x
 
 
-@compiled
+@jit
 def least_along(x, rate, rise, T):
     """Least value of x + rate t + rise t^2 / 2 over [0, T]."""
     least = min(x, x + T * (rate + 0.5 * T * rise))

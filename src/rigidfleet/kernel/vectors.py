@@ -4,7 +4,7 @@ A vector holds eight consecutive states of one flight, or the same state of eigh
 ``abs`` and ``max`` act on each of its numbers.
 
 - ``in_vectors(rows)``: float64 rows (k, n), n a multiple of 8, viewed as vectors (k, n / 8); rows of vectors unchanged;
-- ``filled(x)``: a vector of eight numbers x;
+- ``fill_lanes(x)``: a vector of eight numbers x;
 - ``rough_inverse(v)``: 1/v to four digits, in a fraction of a quotient's time;
 - ``inverse_root_of(v)``: 1/sqrt(v), exact to the last bit but one;
 - ``where_positive(v, a, b)``: a where v > 0, b elsewhere;
@@ -14,7 +14,6 @@ These are names of `rigidfleet.kernel.compiler.simd`. Functions around them woul
 """
 
 from rigidfleet.kernel.compiler.simd import (
-    filled,
     in_vectors,
     inverse_root_of,
     rough_inverse,
@@ -23,7 +22,7 @@ from rigidfleet.kernel.compiler.simd import (
 )
 
 __all__ = [
-    "filled",
+    "fill_lanes",
     "in_vectors",
     "inverse_root_of",
     "rough_inverse",

@@ -5,7 +5,7 @@ key, the value and the remedy. Everything that a user sees counts from 1, as in 
 the entries in a key such as `phases[3].until`. Arrays that `Mission` returns count agents from 0.
 """
 
-from rigidfleet.mission.describe import counted, ending, goal
+from rigidfleet.mission.describe import ending, goal, size_in_words
 from rigidfleet.mission.kinds import KINDS, Establish, Fly, Hold, Phase, Reshape, Settle, Turn
 from rigidfleet.mission.loading import as_mission, json_schema, load_mission
 from rigidfleet.mission.model import Mission
@@ -54,11 +54,11 @@ __all__ = [
     "Sphere",
     "Turn",
     "as_mission",
-    "counted",
     "ending",
     "goal",
     "json_schema",
     "load_mission",
     "mission_names",
     "mission_text",
+    "size_in_words",
 ]

@@ -21,7 +21,7 @@ _SIGMAS = 3.0
 _LEFT_OUT = 0.02
 
 
-def braking(
+def braking_accelerations(
     models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
 ) -> Floats:
     """Acceleration (N,) [m/s^2] that each vehicle has left in any direction, negative if none.
@@ -29,17 +29,17 @@ def braking(
     A point has F/m - g - w: the admissible accelerations are the ball of radius F/m about gravity, and w is the share
     of wind and wrong masses. The thrust of a quadrotor tilts by no more than its limit, and does not pull down.
     """
-    away = _disturbed(models, gravity, disturbances)
-    found = []
+    away = _disturbing_accelerations(models, gravity, disturbances)
+    accelerations = []
     for model in models:
         b = model.thrust_limit / model.mass - gravity
         if not model.point:
             b = min(b, gravity * math.sin(math.radians(model.tilt_limit_deg)))
-        found.append(b)
-    return np.array(found) - away
+        accelerations.append(b)
+    return np.array(accelerations) - away
 
 
-def _disturbed(
+def _disturbing_accelerations(
     models: Sequence[VehicleModel], gravity: float, disturbances: Disturbances | None
 ) -> Floats:
     """Acceleration (N,) [m/s^2] by wind, gusts of three standard deviations, and wrong masses."""
@@ -49,14 +49,14 @@ def _disturbed(
     if disturbances.gusts is not None:
         wind += _SIGMAS * float(np.linalg.norm(intensity(disturbances.gusts, wind)))
     error = np.broadcast_to(np.array(disturbances.mass_error, dtype=float), len(models))
-    found = [
+    by_wind = [
         (max(model.linear_drag) + max(model.body_drag) * wind) * wind / model.mass
         if not model.point
         else model.drag * wind / model.mass
         for model in models
     ]
     limit = np.array([model.thrust_limit / model.mass for model in models])
-    return np.array(found) + np.where(error > 0.0, limit, gravity) * np.abs(error)
+    return np.array(by_wind) + np.where(error > 0.0, limit, gravity) * np.abs(error)
 
 
 def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | None) -> Floats:
@@ -75,7 +75,7 @@ def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | 
     return delay + np.array(own)
 
 
-def foresight(
+def reaction_lags(
     models: Sequence[VehicleModel], disturbances: Disturbances | None, gravity: float
 ) -> Floats:
     """Lags (N, 3, 3) of `Avoidance.ahead`; 0 of points.
@@ -85,30 +85,30 @@ def foresight(
     """
     noise = None if disturbances is None else disturbances.noise
     delay = 0.0 if noise is None else noise.delay
-    found = np.zeros((len(models), 3, 3))
+    lags = np.zeros((len(models), 3, 3))
     for i, model in enumerate(models):
         if not model.point:
             k_R, k_omega = model.attitude_gains
             motor, turn = max(model.motor_time), k_omega / k_R
             spin = model.mass * gravity * model.arm / math.sqrt(2.0) / max(model.inertia[:2])
             smooth = max(2.0 * motor, 2.0 * math.radians(model.tilt_limit_deg) / (spin * turn))
-            found[i, :2] = delay + turn, 1.0 / k_R, smooth
-            found[i, 2] = delay + motor, 0.0, smooth + turn - motor
-    return found
+            lags[i, :2] = delay + turn, 1.0 / k_R, smooth
+            lags[i, 2] = delay + motor, 0.0, smooth + turn - motor
+    return lags
 
 
-def widening(
-    given: Avoidance, models: Sequence[VehicleModel], disturbances: Disturbances | None
+def extra_radii(
+    table: Avoidance, models: Sequence[VehicleModel], disturbances: Disturbances | None
 ) -> Floats:
     """By how much each vehicle is taken to be larger (N,) [m]: by noise, and by what lags leave out."""
-    if given.margin is not None:
-        return np.full(len(models), given.margin)
+    if table.margin is not None:
+        return np.full(len(models), table.margin)
     noise = None if disturbances is None else disturbances.noise
     own = np.array([0.0 if model.point else _LEFT_OUT for model in models])
     return own + (0.0 if noise is None else _SIGMAS * noise.position)
 
 
-def unproved(
+def why_unproved(
     models: Sequence[VehicleModel], d: Disturbances | None, obstacles: Sequence[Any] = ()
 ) -> str:
     """Why the guard's guarantee is no theorem for these vehicles and obstacles; empty if it is one."""
@@ -118,13 +118,13 @@ def unproved(
         return "obstacles move"
     if d is None:
         return ""
-    for found, words in (
+    for applies, words in (
         (d.noise is not None, "states are measured with noise or late"),
         (any(d.wind) or d.gusts is not None, "the wind is not known"),
         (np.any(d.mass_error), "masses are not known"),
         (d.lost, "vehicles are lost"),
     ):
-        if found:
+        if applies:
             return words
     return ""
 
@@ -157,7 +157,7 @@ def rules(m: Draft) -> Breaches:
         return
     names = m.agents.vehicle
     models = [resolve(m.vehicles[name]) for name in names]
-    left = braking(models, m.gravity, d)
+    left = braking_accelerations(models, m.gravity, d)
     for name in dict.fromkeys(names):
         i, where = names.index(name), ("vehicles", name, "thrust_limit")
         if math.isinf(left[i]):

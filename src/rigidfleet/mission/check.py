@@ -28,7 +28,7 @@ from rigidfleet.mission import (
     vehicles,
 )
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import Keys, look_up, model_of, near_shape
+from rigidfleet.mission.findings import Keys, look_up, model_of, suggest_shape
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
@@ -81,7 +81,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         ((), losses.rules),
         (("disturbances",), disturbances.sizes),
         ((), vehicles.flight_rules),
-        (("agents", "fixed"), _fixed),
+        (("agents", "fixed"), _fixed_agents),
         ((), avoidance.rules),
     ):
         m.keep(path, rules(m))
@@ -124,7 +124,7 @@ def _tables(m: Draft) -> None:
     """Validate the keys of the header and the tables; invalid ones are left out."""
     for key in m.data:
         if key not in Contents.model_fields:
-            m.unknown((key,), Contents.model_fields)
+            m.add_unknown_key((key,), Contents.model_fields)
     own = {key: value for key, value in m.data.items() if key in MissionHeader.model_fields}
     if header := m.validate(MissionHeader, own, ()):
         m.parts |= {key: getattr(header, key) for key in MissionHeader.model_fields}
@@ -155,7 +155,7 @@ def _with_points(m: Draft, agents: Any) -> Any:
     try:
         points = start.points()
     except ValueError as error:
-        known = "" if start.shape in SHAPES else near_shape(start.shape)
+        known = "" if start.shape in SHAPES else suggest_shape(start.shape)
         remedy = known or "change the shape, its size, or the number of agents"
         m.add((*path, "shape"), str(error), remedy)
         return None
@@ -205,7 +205,7 @@ def _agents(m: Draft) -> Breaches:
         yield Breach("saturate", "no limit to saturate at is given", "give thrust_limit [N]")
 
 
-def _fixed(m: Draft) -> Breaches:
+def _fixed_agents(m: Draft) -> Breaches:
     """Fixed agents exist, and nothing is to move them or to change what they hold."""
     if m.findings or not m.agents.fixed:
         return

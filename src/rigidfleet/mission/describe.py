@@ -10,7 +10,7 @@ from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.values import AUTO
 
 
-def counted(agents: int, formations: int, phases: Sequence[Phase]) -> str:
+def size_in_words(agents: int, formations: int, phases: Sequence[Phase]) -> str:
     """Size of a mission: 3 agents, 2 formations, 12 phases, 90 s."""
     parts = [(agents, "agent"), (formations, "formation"), (len(phases), "phase")]
     most = "at most " if any(phase.settle for phase in phases) else ""

@@ -11,7 +11,7 @@ import numpy as np
 
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity
-from rigidfleet.mission.findings import near_shape
+from rigidfleet.mission.findings import suggest_shape
 from rigidfleet.typing import Floats
 
 #: Defaults of a new mission: mass of a vehicle [kg], its radius [m], size of the shape [m], waypoint [m].
@@ -126,13 +126,13 @@ def draft(
         establish=f"{blend + _SETTLE}.0",
         climb=f"{climb}.0",
     )
-    return aligned(head + "".join(text for text, _ in flights) + _TAIL)
+    return align_comments(head + "".join(text for text, _ in flights) + _TAIL)
 
 
 def shape_known(shape: str) -> None:
     """Raise ValueError, with the most similar name, if there is no such shape."""
     if shape not in shapes.SHAPES:
-        raise ValueError(f"there is no shape {shape!r}: {near_shape(shape)}")
+        raise ValueError(f"there is no shape {shape!r}: {suggest_shape(shape)}")
 
 
 def shape_for(agents: int | None) -> str:
@@ -197,13 +197,13 @@ def output_step(n: int, lasts: float) -> str:
 
 def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
     """Return a phase for each waypoint and its duration [s]; the first one starts at the position (3,) [m]."""
-    found = []
+    flights = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
         time = _time(to - at)
-        found.append((_FLY.format(position=_row(to), time=f"{time}.0"), time))
+        flights.append((_FLY.format(position=_row(to), time=f"{time}.0"), time))
         at = to
-    return found
+    return flights
 
 
 def _time(way: Floats) -> int:
@@ -211,7 +211,7 @@ def _time(way: Floats) -> int:
     return max(4, blend_time(float(np.linalg.norm(way))))
 
 
-def aligned(text: str) -> str:
+def align_comments(text: str) -> str:
     """Align the comments beside keys in one column."""
     beside = re.compile(r"^([^#\n]*[^#\s]) +# ?(.*)$", re.MULTILINE)
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)

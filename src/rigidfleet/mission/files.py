@@ -68,11 +68,13 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
         A file is outside the folder, cannot be read, or has not the numbers asked for.
     """
     digests = []
-    for named in list(_named(data)):
+    for named in list(_files_named(data)):
         from rigidfleet.formation.point_files import read_bytes
 
         name = named.table[named.key]
-        content = b"".join(read_bytes(_inside(path, named.where, x)) for x in _names(path, named))
+        content = b"".join(
+            read_bytes(_file_inside(path, named.where, x)) for x in _names_of_files(path, named)
+        )
         rows, colours, notes = named.read(content, str(path.parent / name))
         origin = f"{named.becomes} of {name!r}, {_DIGEST}{hashlib.sha256(content).hexdigest()}"
         if notes:
@@ -89,12 +91,12 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"
         text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
-    if digests and not _says(text, data):  # where a file is named within a line
+    if digests and not _text_has(text, data):  # where a file is named within a line
         text = "".join(digests) + to_toml(data)
     return data, text
 
 
-def _says(text: str, data: dict[str, Any]) -> bool:
+def _text_has(text: str, data: dict[str, Any]) -> bool:
     """Whether TOML text says what data say."""
     try:
         return tomllib.loads(text) == data
@@ -102,19 +104,19 @@ def _says(text: str, data: dict[str, Any]) -> bool:
         return False
 
 
-def digests(text: str) -> str:
+def digest_lines(text: str) -> str:
     """The lines of a mission's text that tell the digests of files, for a text that is written anew from its data."""
-    found = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?$", text, re.MULTILINE)
-    return "".join(f"{line}\n" for line in dict.fromkeys(found))
+    lines = re.findall(rf"^# .*{_DIGEST}[0-9a-f]{{64}}(?:{_DOUBTS}.*)?$", text, re.MULTILINE)
+    return "".join(f"{line}\n" for line in dict.fromkeys(lines))
 
 
-def doubts(text: str) -> list[str]:
+def notes_on_files(text: str) -> list[str]:
     """What is said of the files of a mission's text, each with what was read of it."""
     lines = re.findall(rf"^[ \t]*# (.*), {_DIGEST}[0-9a-f]{{64}}{_DOUBTS}(.*)$", text, re.MULTILINE)
     return [f"{what}: {notes}" for what, notes in dict.fromkeys(lines)]
 
 
-def _names(path: Path, named: _Named) -> list[str]:
+def _names_of_files(path: Path, named: _Named) -> list[str]:
     """Names of the files of a name: itself, or those in a folder.
 
     Raises
@@ -123,38 +125,38 @@ def _names(path: Path, named: _Named) -> list[str]:
         The folder has no files, or is outside the mission's.
     """
     name = named.table[named.key]
-    found = _inside(path, named.where, name)
-    if not named.folder or not found.is_dir():
+    place = _file_inside(path, named.where, name)
+    if not named.folder or not place.is_dir():
         return [name]
     from rigidfleet.foreign.files import groups_of_files
 
     try:
-        inside = [file for group in groups_of_files(found) for file in group]
+        inside = [file for group in groups_of_files(place) for file in group]
     except TrajectoryError as error:
-        raise _unread(str(path), named.where, error) from None
-    return [str(Path(name) / file.relative_to(found)) for file in inside]
+        raise _file_error(str(path), named.where, error) from None
+    return [str(Path(name) / file.relative_to(place)) for file in inside]
 
 
-def _unread(name: str, where: str, error: TrajectoryError) -> MissionError:
+def _file_error(name: str, where: str, error: TrajectoryError) -> MissionError:
     problem = str(error).removeprefix(f"{name}: ").rstrip(".")
     return MissionError([Finding(name, where, None, problem, "")])
 
 
-def _named(data: dict[str, Any]) -> Iterator[_Named]:
+def _files_named(data: dict[str, Any]) -> Iterator[_Named]:
     forms, agents, things, phases = (
         data.get(key) for key in ("formations", "agents", "obstacles", "phases")
     )
     for k, phase in _with_file(phases, "follow", "trajectories"):
         said = {key: phase[key] for key in ("units", "axes") if isinstance(phase.get(key), str)}
-        read = partial(_trajectories, yaw=phase.get("yaw") == "file", said=said)
+        read = partial(_read_trajectories, yaw=phase.get("yaw") == "file", said=said)
         yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
     for name, form in forms.items() if isinstance(forms, dict) else ():
         if isinstance(form, dict) and isinstance(form.get("slots"), str):
-            yield _Named(form, "slots", "slots", f"formations.{name}.slots", _points)
+            yield _Named(form, "slots", "slots", f"formations.{name}.slots", _read_points)
     if isinstance(agents, dict) and isinstance(agents.get("position"), str):
-        yield _Named(agents, "position", "position", "agents.position", _points)
+        yield _Named(agents, "position", "position", "agents.position", _read_points)
     for k, thing in _with_file(things, "heights", "heights"):
-        yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _heights)
+        yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _read_heights)
 
 
 def _with_file(tables: Any, kind: str, becomes: str) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -165,7 +167,7 @@ def _with_file(tables: Any, kind: str, becomes: str) -> Iterator[tuple[int, dict
             yield k, own
 
 
-def _inside(path: Path, where: str, name: str) -> Path:
+def _file_inside(path: Path, where: str, name: str) -> Path:
     """The file of a name, which may not leave the folder of the mission, not by a link either.
 
     Raises
@@ -175,9 +177,9 @@ def _inside(path: Path, where: str, name: str) -> Path:
     """
     folder = path.parent.resolve()
     try:
-        found = (folder / name).resolve()
-        if not Path(name).is_absolute() and found.is_relative_to(folder):
-            return found
+        file = (folder / name).resolve()
+        if not Path(name).is_absolute() and file.is_relative_to(folder):
+            return file
         problem = "leaves the folder of the mission"
     except (OSError, RuntimeError, ValueError):
         problem = "is no name of a file"
@@ -185,14 +187,14 @@ def _inside(path: Path, where: str, name: str) -> Path:
     raise MissionError([Finding(str(path), where, name, problem, remedy)])
 
 
-def _points(data: bytes, name: str) -> Content:
+def _read_points(data: bytes, name: str) -> Content:
     from rigidfleet.formation.point_files import parse_points
 
-    found = parse_points(data, name)
-    return Content(found.slots.tolist(), found.colours)
+    points = parse_points(data, name)
+    return Content(points.slots.tolist(), points.colours)
 
 
-def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Content:
+def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Content:
     """Pieces of each vehicle; with a ``yaw`` if that is asked for. What the file leaves in doubt is not flown.
 
     Where a file has samples, they are joined by the spline with the least jerk (C4): it is not only judged but flown.
@@ -205,7 +207,7 @@ def _trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) -> Co
     try:
         read = read_trajectories(name, units=said.get("units"), axes=said.get("axes"))
     except TrajectoryError as error:
-        raise _unread(name, "", error) from None
+        raise _file_error(name, "", error) from None
     for doubt in read.notes:
         if isinstance(doubt, Doubt):
             raise unread(
@@ -243,24 +245,24 @@ def without_data(heights: Any) -> str:
     return f"has {len(cells):,} cells without data, the first in row {i + 1}, column {j + 1}: {z[i, j]:g}"
 
 
-def _heights(data: bytes, name: str) -> Content:
+def _read_heights(data: bytes, name: str) -> Content:
     """Numbers of a CSV or NPY file, row by row."""
     try:
         if name.lower().endswith(".npy"):
-            found = np.load(io.BytesIO(data), allow_pickle=False)
+            heights = np.load(io.BytesIO(data), allow_pickle=False)
         else:
             rows = list(csv.reader(data.decode("utf-8-sig").splitlines()))
-            found = np.array([row for row in rows if any(x.strip() for x in row)], dtype=float)
-        found = np.asarray(found, dtype=float)
+            heights = np.array([row for row in rows if any(x.strip() for x in row)], dtype=float)
+        heights = np.asarray(heights, dtype=float)
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
         raise unread(name, "is not a table of numbers", remedy) from None
-    if found.ndim == 2 and (why := without_data(found)):
+    if heights.ndim == 2 and (why := without_data(heights)):
         raise unread(name, why, FILL)
-    if found.ndim != 2 or not found.size:
+    if heights.ndim != 2 or not heights.size:
         remedy = "give two or more rows of heights [m]"
         raise unread(name, "is not a table of numbers", remedy)
-    if found.size > bounds.HEIGHTS:
-        problem = f"has {found.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
+    if heights.size > bounds.HEIGHTS:
+        problem = f"has {heights.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
         raise unread(name, problem, "use a coarser grid")
-    return Content(found.tolist())
+    return Content(heights.tolist())

@@ -50,7 +50,7 @@ class FindingCollector:
         more = [
             Finding(
                 self.origin,
-                _key(kind),
+                _key_path(kind),
                 None,
                 f"{n - _TOLD:,} more of this kind",
                 "correct all of them",
@@ -63,7 +63,7 @@ class FindingCollector:
     def add(self, path: Keys, problem: str, remedy: str, *value: object) -> None:
         """Record a finding. Unless a value is given, it is the one that the user wrote at the path."""
         self._wrong |= {path[:k] for k in range(1, len(path) + 1)}
-        key = _key(path)
+        key = _key_path(path)
         if (key, problem) in self._findings:
             return
         kind = _kind(path, problem)
@@ -74,7 +74,7 @@ class FindingCollector:
         shown = value[0] if value else look_up(self.data, path)
         self._findings[key, problem] = Finding(self.origin, key, shown, problem, remedy)
 
-    def unknown(self, path: Keys, known: Iterable[str]) -> None:
+    def add_unknown_key(self, path: Keys, known: Iterable[str]) -> None:
         """Record an unknown key of a table. Only the first ones get a suggestion, as finding one takes long."""
         guess = self._told[_kind(path, _UNKNOWN)] < _TOLD
         self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
@@ -99,7 +99,7 @@ class FindingCollector:
         elif "kind" not in data:
             self.add((*path, "kind"), "is missing", choice)
         elif not isinstance(data["kind"], str) or data["kind"] not in kinds:
-            self.add((*path, "kind"), "unknown kind", near(data["kind"], kinds) or choice)
+            self.add((*path, "kind"), "unknown kind", suggest(data["kind"], kinds) or choice)
         else:
             return kinds[data["kind"]]
         return None
@@ -112,7 +112,7 @@ class FindingCollector:
         Keys with errors are left out, so that later checks can use the others. None if that leaves no valid model.
         """
         if not isinstance(data, dict):
-            self.add(path, "must be a table", f"write [{_key(path)}] with its keys below it")
+            self.add(path, "must be a table", f"write [{_key_path(path)}] with its keys below it")
             return None
         data = {**defaults, **data} if defaults else data
         try:
@@ -147,9 +147,9 @@ class FindingCollector:
         if path == ("lqr", "attitude") and error["loc"] != path[1:]:
             return  # inherited from lqr, where it is reported
         if error["type"] == "extra_forbidden":
-            self.unknown(path, owner.model_fields)
+            self.add_unknown_key(path, owner.model_fields)
         else:
-            self.add(path, *_explain(error, path, owner))
+            self.add(path, *_problem_and_remedy(error, path, owner))
 
 
 #: Values that users write where the format has "none".
@@ -166,7 +166,7 @@ def look_up(data: Any, path: Keys, default: Any = None) -> Any:
     return data
 
 
-def near(word: object, known: Iterable[str]) -> str:
+def suggest(word: object, known: Iterable[str]) -> str:
     """Return 'did you mean ...?' if a known word is similar, else ''."""
     import difflib
 
@@ -175,9 +175,9 @@ def near(word: object, known: Iterable[str]) -> str:
     return f"did you mean '{words[match[0]]}'?" if match else ""
 
 
-def near_shape(word: object) -> str:
+def suggest_shape(word: object) -> str:
     """Suggest a named shape for an unknown name, or list all of them."""
-    match = near(word, [*SHAPES, *POLYGONS])
+    match = suggest(word, [*SHAPES, *POLYGONS])
     meant = next((name for name in POLYGONS if f"'{name}'" in match), None)
     if meant is not None:
         return f"did you mean 'polygon' with {POLYGONS[meant]} agents?"
@@ -187,11 +187,11 @@ def near_shape(word: object) -> str:
 def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
     """Problem and remedy of an unknown key."""
     names = list(known)
-    told = successor(key) or near(key, names)
-    return _UNKNOWN, told or f"remove it; known keys: {', '.join(names)}"
+    suggestion = successor(key) or suggest(key, names)
+    return _UNKNOWN, suggestion or f"remove it; known keys: {', '.join(names)}"
 
 
-def _key(path: Keys) -> str:
+def _key_path(path: Keys) -> str:
     def step(at: str | int) -> str:
         if isinstance(at, int):
             return "[*]" if at == _ANY else f"[{at + 1}]"
@@ -226,7 +226,7 @@ def _models(annotation: Any) -> Iterator[type[Part]]:
         yield annotation
 
 
-def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
+def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
     """Problem and remedy of an error of pydantic."""
     kind, context = error["type"], error.get("ctx", {})
     name = next((step for step in reversed(path) if isinstance(step, str)), "")
@@ -237,9 +237,9 @@ def _explain(error: Any, path: Keys, owner: type[Part]) -> tuple[str, str]:
             return "is missing", f"add {meaning or name}"
         case "literal_error":
             words = _words(context["expected"])
-            told = successor(name, error["input"]) or near(error["input"], words)
+            suggestion = successor(name, error["input"]) or suggest(error["input"], words)
             usual = "none" if error["input"] in _OFF and "none" in words else words[0]
-            return f"must be {context['expected']}", told or f"use {usual}"
+            return f"must be {context['expected']}", suggestion or f"use {usual}"
         case "greater_than_equal" if 0 < context["ge"] < 1 and not error["input"] > 0:
             return "must be > 0", meaning
         case "too_short" if context["min_length"] == 1:

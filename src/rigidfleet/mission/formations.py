@@ -15,7 +15,7 @@ from rigidfleet.formation.rest import places_beside
 from rigidfleet.math import proximity
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import FindingCollector, Keys, near_shape
+from rigidfleet.mission.findings import FindingCollector, Keys, suggest_shape
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Formation
 
@@ -181,7 +181,7 @@ def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breac
 def _shape(m: Draft, form: Formation, shape: str, n: int | None, path: Keys) -> Breaches:
     """A shape has a name, a size, and suits the number of agents."""
     if shape not in shapes.SHAPES:
-        yield Breach("shape", "unknown shape", near_shape(shape))
+        yield Breach("shape", "unknown shape", suggest_shape(shape))
     elif form.size is None:
         if m.right(path, "size"):
             yield Breach("size", "is missing", "add size, the edge length [m]")

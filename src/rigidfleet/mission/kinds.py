@@ -107,8 +107,8 @@ class AnyPhase(Part):
     @property
     def angles(self) -> list[str]:
         """Commanded angles in words; empty to keep the attitude commanded before."""
-        given = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
-        return [f"{name} {angle:g}°" for name, angle in given if angle or name == "yaw"]
+        angles = zip(("roll", "pitch", "yaw"), self.attitude_deg or (), strict=False)
+        return [f"{name} {angle:g}°" for name, angle in angles if angle or name == "yaw"]
 
     @property
     def meets(self) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ def mission_of_file(text: str, origin: str) -> Mission:
     return Mission.from_plain(data, origin, text=text)
 
 
-def as_mission(given: Mission | str | Path) -> Mission:
+def as_mission(mission: Mission | str | Path) -> Mission:
     """Return the `Mission` that was given, or load it by its shipped name or path.
 
     Raises
@@ -49,11 +49,11 @@ def as_mission(given: Mission | str | Path) -> Mission:
     MissionError
         As `load_mission` does.
     """
-    if isinstance(given, Mission):
-        return given
-    if isinstance(given, str | Path):
-        return load_mission(given)
-    raise wrong_type("a mission (a shipped name, a path or a Mission)", given)
+    if isinstance(mission, Mission):
+        return mission
+    if isinstance(mission, str | Path):
+        return load_mission(mission)
+    raise wrong_type("a mission (a shipped name, a path or a Mission)", mission)
 
 
 def json_schema() -> dict[str, Any]:

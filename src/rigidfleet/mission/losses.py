@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.mission.findings import Keys, near
+from rigidfleet.mission.findings import Keys, suggest
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
@@ -155,7 +155,7 @@ def _landings(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
     if name is not None:
         where = (_TABLE, "landing_formation")
         if name not in forms:
-            remedy = near(name, forms) or f"formations: {', '.join(forms)}"
+            remedy = suggest(name, forms) or f"formations: {', '.join(forms)}"
             yield Breach(where, "there is no such formation", remedy)
             return
         slots = forms[name].slot_array(n) if sound(m, name) else None

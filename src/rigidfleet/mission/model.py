@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.kept import kept
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
@@ -23,8 +23,8 @@ from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import with_own_names, with_scales
 from rigidfleet.mission.check import check, defaults
-from rigidfleet.mission.describe import counted, ending, goal
-from rigidfleet.mission.files import digests
+from rigidfleet.mission.describe import ending, goal, size_in_words
+from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end
@@ -62,7 +62,7 @@ class Fleet(NamedTuple):
 A = TypeVar("A", bound="Floats | Ints | None")
 
 
-def _once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
+def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
     """Compute an array of each formation, by its name, once, and return a copy; edges are the same array always.
 
     By that, phases see at once that they have the edges of the phase before.
@@ -192,7 +192,7 @@ class Mission(Contents, Shown):
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""
-        return counted(self.n_agents, len(self.formations), self.phases)
+        return size_in_words(self.n_agents, len(self.formations), self.phases)
 
     def __repr__(self) -> str:
         return f"<Mission {self.name}: {self.size_in_words}>"
@@ -204,14 +204,14 @@ class Mission(Contents, Shown):
         return Sheet(self.name, self.title, [self.phase_table, Line(self.size_in_words)])
 
     @property
-    def phase_table(self) -> Table:
+    def phase_table(self) -> FactTable:
         """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
             Row((n, p.name, p.kind, goal(p), ending(p), p.control))
             for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
-        return Table(heads, rows, heads[1:])
+        return FactTable(heads, rows, heads[1:])
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
@@ -227,7 +227,7 @@ class Mission(Contents, Shown):
     @property
     def about(self) -> str:
         """What its text tells of the files that were read: lines with their digests."""
-        return self._about or digests(self._text)
+        return self._about or digest_lines(self._text)
 
     @property
     def origin(self) -> str:
@@ -260,7 +260,7 @@ class Mission(Contents, Shown):
         each change, from the positions of the agents at that time. A formation that is taken again from elsewhere is
         another one here, "NAME (2)".
         """
-        return self._assigned[0]
+        return self._assignment[0]
 
     def assigned_turn(self, before: str | None, after: str) -> Floats | None:
         """Rotation (3, 3) of a formation's slots onto those ``before``, if slots were assigned for this change.
@@ -268,10 +268,10 @@ class Mission(Contents, Shown):
         Each formation is in its own axes. ``before`` None means the start positions, in the axes in which formations
         are drawn. The optimality of an assignment, and the clearance on its paths, hold only with this rotation.
         """
-        return self._assigned[1].get((before, after))
+        return self._assignment[1].get((before, after))
 
     @cached_property
-    def _assigned(self) -> tuple[dict[str, Ints], dict[tuple[str | None, str | None], Floats]]:
+    def _assignment(self) -> tuple[dict[str, Ints], dict[tuple[str | None, str | None], Floats]]:
         """Slots (N,) of each formation, and the rotations used for their assignment, by (before, after).
 
         Where slots are tracked to a commanded attitude, paths are straight, and the rotation is given, not optimised.
@@ -282,15 +282,15 @@ class Mission(Contents, Shown):
             return orders, turns
         before: str | None = None
         known = True  # relative positions of the agents are known; distances alone do not determine them
-        asked: Floats | None = None  # commanded attitude
+        commanded: Floats | None = None  # commanded attitude
         lies: Floats | None = self.drawn_attitude  # of the axes of `places`; None if unknown
         places = self.fleet.position @ self.drawn_attitude.T
         flown: set[str] = set()
         for p in self.phases:
             if p.moves and (angles := p.attitude_deg) is not None:
-                lies = asked = dcm_from_euler(np.deg2rad(angles))
+                lies = commanded = dcm_from_euler(np.deg2rad(angles))
             if p.turns_away:
-                lies = asked = None
+                lies = commanded = None
             if (vertical := p.vertical) is not None and vertical.each:
                 before, up = None, np.eye(3)[2] if lies is None else lies[:, 2]
                 who = (
@@ -307,11 +307,11 @@ class Mission(Contents, Shown):
             axes: Floats | None = np.eye(3)  # axes of this formation in those of the one before
             if self.free_attitude(p):
                 axes = lies = None
-                asked = None if p.control == "tracking" else asked
+                commanded = None if p.control == "tracking" else commanded
             elif (establishing := p.establishing) is not None:
-                asked = self.establish_attitude(establishing, asked)
-                axes = None if lies is None else lies @ asked.T
-                lies = asked
+                commanded = self.establish_attitude(establishing, commanded)
+                axes = None if lies is None else lies @ commanded.T
+                lies = commanded
             slots = self._slots(name)
             if slots is None:
                 known = False
@@ -345,15 +345,15 @@ class Mission(Contents, Shown):
             else dcm_from_euler(np.deg2rad([b.roll_deg, b.pitch_deg, b.yaw_deg]))
         )
 
-    def establish_attitude(self, phase: Establish, asked: Floats | None) -> Floats:
+    def establish_attitude(self, phase: Establish, commanded: Floats | None) -> Floats:
         """Attitude (3, 3) in which a phase establishes its formation, if the attitude is not free.
 
-        This is the attitude that the phase commands, else the one commanded before (``asked``), else the drawn one.
+        This is the attitude that the phase commands, else the one commanded before, else the drawn one.
         """
         angles = phase.attitude_deg
         if angles is not None:
             return dcm_from_euler(np.deg2rad(angles))
-        return self.drawn_attitude if asked is None else asked
+        return self.drawn_attitude if commanded is None else commanded
 
     def free_attitude(self, phase: Phase) -> bool:
         """Whether a phase leaves the attitude of its formation free.
@@ -372,12 +372,12 @@ class Mission(Contents, Shown):
     def _made(self) -> dict[tuple[str, str], Any]:
         return {}
 
-    @_once
+    @_compute_once
     def _slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation in their own order."""
         return self.formations[name].slot_array(self.n_agents)
 
-    @_once
+    @_compute_once
     def formation_edges(self, name: str) -> Ints:
         """Edges (m, 2) of a formation, agents from 0, i < j."""
         edges = self.formations[name].edge_array(self.n_agents)
@@ -385,7 +385,7 @@ class Mission(Contents, Shown):
             return edges
         return np.sort(np.argsort(self.assigned_slots[name])[edges], axis=1)
 
-    @_once
+    @_compute_once
     def formation_slots(self, name: str) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their geometric centre, in the order of the agents.
 
@@ -394,7 +394,7 @@ class Mission(Contents, Shown):
         slots = self._slots(name)
         return None if slots is None else slots[self.assigned_slots[name]]
 
-    @_once
+    @_compute_once
     def slots_about_cm(self, name: str | None) -> Floats | None:
         """Slots (N, 3) [m] of a formation about their centre of mass; None without a formation, or if it has none."""
         slots = None if name is None else self.formation_slots(name)
@@ -409,12 +409,12 @@ class Mission(Contents, Shown):
             return (colour,) * self.n_agents
         return tuple(colour[slot] for slot in self.assigned_slots[name].tolist())
 
-    @_once
+    @_compute_once
     def formation_distances(self, name: str) -> Floats:
         """Length (m,) [m] of each edge of a formation."""
-        given = self.formations[name].distances
-        if given is not None:
-            return np.array(given, dtype=np.float64)
+        own = self.formations[name].distances
+        if own is not None:
+            return np.array(own, dtype=np.float64)
         slots = self.formation_slots(name)
         assert slots is not None  # checked: without distances there is a shape or slots
         return distances(slots, self.formation_edges(name))
@@ -425,9 +425,9 @@ class Mission(Contents, Shown):
         "auto" is a quarter of the smallest non-zero eigenvalue w of mbar J M^-1 J^T at the formation, without the
         vehicles that are ``lost`` (N,), and at most 0.03. During a change, or without slots, it is 0.03.
         """
-        given = self.constraint.damping
-        if given != "auto":
-            return given
+        own = self.constraint.damping
+        if own != "auto":
+            return own
         slots = self.formation_slots(name) if name else None
         if name is None or slots is None:
             return _DAMPING[1]
@@ -494,8 +494,8 @@ class Mission(Contents, Shown):
         """The vehicle of each agent; None if all are point masses that give any force at once."""
         if not self.agents.vehicle:
             return None
-        found = {name: resolve(vehicle) for name, vehicle in self.vehicles.items()}
-        return [found[name] for name in self.agents.vehicle]
+        models = {name: resolve(vehicle) for name, vehicle in self.vehicles.items()}
+        return [models[name] for name in self.agents.vehicle]
 
     @cached_property
     def true_mass(self) -> Floats:
@@ -552,9 +552,9 @@ class Mission(Contents, Shown):
         pairs, times = self.links_lost
         when = self.first_loss
         who = np.flatnonzero(self.lost_at == when)
-        told = [agent_names(who)] if len(who) else []
-        told += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
-        return " and ".join(told)
+        words = [agent_names(who)] if len(who) else []
+        words += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
+        return " and ".join(words)
 
     @property
     def on_loss(self) -> Literal["continue", "hold", "land"]:
@@ -567,15 +567,15 @@ def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     least, most = _DAMPING
     m = masses.tolist()
     # J M^-1 J^T is at least J J^T / max m: with enough of this, no mass of a sweep needs its own decomposition.
-    w = sum(m) / len(m) / max(m) * _smallest(slots, edges, None)
+    w = sum(m) / len(m) / max(m) * _smallest_eigenvalue(slots, edges, None)
     if not w > 4 * most:
-        w = _smallest(slots, edges, masses)
+        w = _smallest_eigenvalue(slots, edges, masses)
     return min(max(w / 4, least), most)
 
 
 # Saves a twentieth of a short flight, such as narrow-passage.
 @kept
-def _smallest(slots: Floats, edges: Ints, masses: Floats | None) -> float:
+def _smallest_eigenvalue(slots: Floats, edges: Ints, masses: Floats | None) -> float:
     """The smallest non-zero eigenvalue w of mbar J M^-1 J^T, or of J J^T without masses."""
     J = constraint_jacobian.jacobian(slots[None], edges)
     return float(constraint_jacobian.smallest_of(J, masses)[0]) ** 2

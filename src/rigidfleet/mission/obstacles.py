@@ -134,12 +134,12 @@ class Box(Moving):
     @property
     def corners(self) -> tuple[float, ...] | None:
         """Lowest and highest corner (6,) [m]; None if the box is turned or moves."""
-        if self.turned or len(self.motion[1]):
+        if self.is_turned or len(self.motion[1]):
             return None
         return (*self.min, *self.max)
 
     @property
-    def turned(self) -> bool:
+    def is_turned(self) -> bool:
         """Whether the box is not parallel to the world axes."""
         return bool(self.roll_deg or self.pitch_deg or self.yaw_deg)
 
@@ -147,7 +147,7 @@ class Box(Moving):
     def form(self) -> Form:
         """The box; turned by ``turn`` from world axes to its own."""
         angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
-        return records.box(self.min, self.max, dcm_from_euler(angles) if self.turned else None)
+        return records.box(self.min, self.max, dcm_from_euler(angles) if self.is_turned else None)
 
     @property
     def centre_of_form(self) -> Any:

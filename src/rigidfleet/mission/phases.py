@@ -15,7 +15,7 @@ from rigidfleet.foreign.curves import CHANNELS, greatest_jumps, rows_to_curve
 from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
-from rigidfleet.mission.findings import Keys, near
+from rigidfleet.mission.findings import Keys, suggest
 from rigidfleet.mission.formations import sound
 from rigidfleet.mission.kinds import (
     ANGLES,
@@ -458,7 +458,7 @@ def _exists(m: Draft, name: str, *where: str | int) -> Breaches:
     known = m.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
         names = f"formations: {', '.join(known)}" if known else "add a table [formations.NAME]"
-        yield Breach(where, "there is no such formation", near(name, known) or names, name)
+        yield Breach(where, "there is no such formation", suggest(name, known) or names, name)
 
 
 def _blendable(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:

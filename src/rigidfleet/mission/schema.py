@@ -71,7 +71,7 @@ from rigidfleet.mission.values import (
     Whole,
     from_zero,
     number_or_list,
-    signed,
+    of_either_sign,
 )
 from rigidfleet.typing import Floats, Ints
 
@@ -312,7 +312,7 @@ class Constraint(Part):
     beta: Gain = Field(
         math.sqrt(12), description="beta [1/s], > 0; the feedback gain of c is beta^2"
     )
-    gamma: Annotated[float, Strict(), signed(GAIN, 3)] = Field(
+    gamma: Annotated[float, Strict(), of_either_sign(GAIN, 3)] = Field(
         8.0, description="feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2"
     )
     stabilisation: Literal["pid", "none"] = Field(

@@ -18,7 +18,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission.draft import (
     LIFT,
     MOST_AGENTS,
-    aligned,
+    align_comments,
     blend_time,
     output_step,
     shape_known,
@@ -89,14 +89,14 @@ def points_scene(name: str, points: Points, source: str, *, by_name: bool = Fals
     return ShowFormation(name, slots, f"{about}slots = [\n{rows}]\n{lights}")
 
 
-def _rested(one: ShowFormation, agents: int) -> ShowFormation:
+def _with_rest(one: ShowFormation, agents: int) -> ShowFormation:
     """A scene in which the vehicles that have no point rest at its sides."""
     waiting = agents - len(one.slots)
     if waiting < 1:
         return one
     slots = np.concatenate([one.slots, places_beside(one.slots, waiting)])
-    told = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
-    return ShowFormation(one.name, slots, one.table + told)
+    line = f'rest = "sides"                  # {waiting} vehicles wait, dark\n'
+    return ShowFormation(one.name, slots, one.table + line)
 
 
 def show(
@@ -127,7 +127,7 @@ def show(
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
     pads = scene(ground, agents, spacing)._replace(name="pads")
-    tables, scenes = {"pads": pads}, [_rested(one, agents) for one in scenes]
+    tables, scenes = {"pads": pads}, [_with_rest(one, agents) for one in scenes]
     for i, one in enumerate(scenes):
         key, k = one.name, 2
         while key == "pads" or tables.get(key, one).table != one.table:
@@ -163,7 +163,7 @@ def show(
         raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
     what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"
     what = " ".join(what.split())  # a name may have line breaks
-    return aligned(
+    return align_comments(
         _HEAD.format(
             name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
             what=what, title=json.dumps(what, ensure_ascii=False),

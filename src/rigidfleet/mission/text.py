@@ -9,7 +9,7 @@ from typing import Any
 from rigidfleet._common.arguments import as_path
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import bounds
-from rigidfleet.mission.findings import near
+from rigidfleet.mission.findings import suggest
 
 _SHIPPED = Path(__file__).parents[1] / "missions"
 
@@ -91,7 +91,7 @@ def unread(origin: str, problem: str, remedy: str) -> MissionError:
 
 def _not_found(name: str) -> Finding:
     known = mission_names()
-    remedy = near(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
+    remedy = suggest(Path(name).stem, known) or f"shipped missions: {', '.join(known)}"
     return Finding(name, "", None, "no such file and no shipped mission of this name", remedy)
 
 

@@ -37,7 +37,7 @@ Number = Annotated[float, Strict(), Field(ge=-HUGE, le=HUGE)]
 Positive = Annotated[float, Strict(), Field(gt=0, le=HUGE)]
 
 
-def signed(bound: Bound, power: int = 1) -> Any:
+def of_either_sign(bound: Bound, power: int = 1) -> Any:
     """A number of either sign within the bound, or its power."""
     return Field(ge=-(bound.most**power), le=bound.most**power)
 
@@ -51,7 +51,7 @@ def from_zero(bound: Bound) -> Any:
     return Field(ge=0, le=bound.most)
 
 
-Coordinate = Annotated[float, Strict(), signed(LENGTH)]
+Coordinate = Annotated[float, Strict(), of_either_sign(LENGTH)]
 Length = Annotated[float, Strict(), _positive(LENGTH)]
 LengthOrZero = Annotated[float, Strict(), from_zero(LENGTH)]
 Time = Annotated[float, Strict(), _positive(TIME)]
@@ -63,8 +63,8 @@ Spread = Annotated[float, Strict(), from_zero(SPEED)]
 Acceleration = Annotated[float, Strict(), _positive(ACCELERATION)]
 Jerk = Annotated[float, Strict(), _positive(JERK)]
 Mass = Annotated[float, Strict(), _positive(MASS)]
-Angle = Annotated[float, Strict(), signed(ANGLE)]
-Gain = Annotated[float, Strict(), signed(GAIN)]
+Angle = Annotated[float, Strict(), of_either_sign(ANGLE)]
+Gain = Annotated[float, Strict(), of_either_sign(GAIN)]
 Weight = Annotated[float, Strict(), from_zero(WEIGHT)]
 Cost = Annotated[float, Strict(), _positive(WEIGHT)]
 Tolerance = Annotated[float, Strict(), _positive(TOLERANCE)]
@@ -76,13 +76,13 @@ Flag = Annotated[bool, Strict()]
 AgentNumber = Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)]
 _Three = Field(min_length=3, max_length=3)
 Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[tuple[Annotated[float, Strict(), signed(SPEED)], ...], _Three]
+Velocity = Annotated[tuple[Annotated[float, Strict(), of_either_sign(SPEED)], ...], _Three]
 #: A velocity, or "free": any.
 VelocityOrFree = Annotated[
     Annotated[Velocity, Tag("list")] | Annotated[Literal["free"], Tag("word")],
     Discriminator(lambda value: "word" if isinstance(value, str) else "list"),
 ]
-Force = Annotated[tuple[Annotated[float, Strict(), signed(FORCE)], ...], _Three]
+Force = Annotated[tuple[Annotated[float, Strict(), of_either_sign(FORCE)], ...], _Three]
 Rates = Annotated[tuple[Angle, ...], _Three]
 Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]
 

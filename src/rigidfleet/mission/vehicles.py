@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from rigidfleet.mission.findings import look_up, near
+from rigidfleet.mission.findings import look_up, suggest
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Vehicle
 
@@ -263,7 +263,7 @@ def fleet_table(m: Draft, agents: Any) -> Any:
     known = tables if isinstance(tables, dict) else {}
     for name in dict.fromkeys(names):
         if name not in known:
-            remedy = near(name, known) or f"add a table [vehicles.{name}]"
+            remedy = suggest(name, known) or f"add a table [vehicles.{name}]"
             m.add(where, f"there is no vehicle '{name}'", remedy, name)
             return None
     for name in known:

@@ -6,7 +6,12 @@ import numpy as np
 
 from rigidfleet.kernel import avoidance, fleet
 from rigidfleet.mission import Mission
-from rigidfleet.mission.avoidance import braking, foresight, reaction_times, widening
+from rigidfleet.mission.avoidance import (
+    braking_accelerations,
+    extra_radii,
+    reaction_lags,
+    reaction_times,
+)
 from rigidfleet.solids.records import join
 
 
@@ -27,7 +32,7 @@ def avoidance_in_flight(
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
     return avoidance.avoidance(
         period=flight.every * flight.steps * flight.h,
-        b=braking(models, mission.gravity, mission.disturbances),
+        b=braking_accelerations(models, mission.gravity, mission.disturbances),
         lift=limit / mass,
         mass=mass,
         g=mission.gravity,
@@ -40,11 +45,11 @@ def avoidance_in_flight(
         clearance=settings.clearance,
         drag=drag,
         lag=reaction_times(models, mission.disturbances),
-        ahead=foresight(models, mission.disturbances, mission.gravity),
+        ahead=reaction_lags(models, mission.disturbances, mission.gravity),
         tilt=np.array(
             [np.inf if model.point else np.radians(model.tilt_limit_deg) for model in models]
         ),
-        spare=widening(settings, models, mission.disturbances),
+        spare=extra_radii(settings, models, mission.disturbances),
         rate=settings.rate,
         share=settings.share,
         release=settings.release,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, shown
+from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import peaks, quadrotors
 from rigidfleet.plotting import style as st
@@ -37,7 +37,6 @@ class EdgeGroup:
     """Edges that are drawn in the same way."""
 
     edges: list[int]
-    lengths: tuple[float, ...]  # [m] in each formation in turn; NaN if the edge is not active
     colour: str
     label: str
 
@@ -65,7 +64,7 @@ def edge_groups(result: Result) -> list[EdgeGroup]:
     if m > SINGLE:
         groups.sort(key=lambda g: np.nan_to_num(lengths[g[0]], nan=0.0).tolist())
     return [
-        EdgeGroup(g, tuple(lengths[g[0]].tolist()), colour, _edge_label(result, g, lengths[g[0]]))
+        EdgeGroup(g, colour, _edge_label(result, g, lengths[g[0]]))
         for g, colour in zip(groups, st.colour_scale(len(groups)), strict=True)
     ]
 
@@ -80,7 +79,7 @@ def _groups_by_formation(result: Result, lengths: Floats) -> list[EdgeGroup]:
         own = lengths[edges][:, held]
         of = " and ".join(st.clean_name(name, 20) for name, h in zip(names, held, strict=True) if h)
         label = f"{len(edges)} edges of {of}: {own.min():.3g} to {own.max():.3g} m"
-        groups.append(EdgeGroup(edges.tolist(), tuple(lengths[edges[0]].tolist()), colour, label))
+        groups.append(EdgeGroup(edges.tolist(), colour, label))
     return groups
 
 
@@ -107,20 +106,16 @@ def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> No
 
 def edge_handles(result: Result) -> list[Line2D]:
     """Legend entries of the groups of edges."""
-    from matplotlib.lines import Line2D
-
     groups = edge_groups(result)
     chosen = [groups[i] for i in st.spaced_indices(len(groups), 9)]
-    return [Line2D([], [], color=g.colour, label=g.label) for g in chosen]
+    return [st.legend_entry(g.label, color=g.colour) for g in chosen]
 
 
 def _reference_handle(*values: Floats) -> list[Line2D]:
     """Legend entry of references, if there are any."""
-    from matplotlib.lines import Line2D
-
     if not any(np.isfinite(v).any() for v in values):
         return []
-    return [Line2D([], [], color=st.INK, linewidth=0.8, linestyle=st.DASHES, label="reference")]
+    return [st.legend_entry("reference", **st.REFERENCE)]
 
 
 def draw_distances(ax: Axes, result: Result) -> None:
@@ -154,7 +149,6 @@ def distances(result: Result) -> Figure:
         st.draw_legend(
             ax, [*edge_handles(result), *_reference_handle(result.distance_reference)], title
         )
-    st.name_phases([ax], result)
     return fig
 
 
@@ -202,13 +196,11 @@ def widen_limits(ax: Axes, least: float) -> None:
 
 
 def _draw_body_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
-    from matplotlib.lines import Line2D
-
-    ring = Line2D(
-        [], [], linestyle="", marker="o", markersize=5.5, markerfacecolor="white",
-        markeredgecolor=st.INK, label="waypoint",
+    ring = st.legend_entry(
+        "waypoint", linestyle="", marker="o", markersize=5.5, markerfacecolor="white",
+        markeredgecolor=st.INK,
     )  # fmt: skip
-    flown = Line2D([], [], color=st.FLOWN, linewidth=2.4, label="flown")
+    flown = st.legend_entry("flown", color=st.FLOWN, linewidth=2.4)
     st.draw_legend(ax, [flown, *references, *([ring] if targets else [])])
 
 
@@ -237,7 +229,6 @@ def cm(result: Result) -> Figure:
     )  # fmt: skip
     references = _reference_handle(result.cm_reference, result.cm_velocity_reference)
     _draw_body_legend(axes[0, 1], references, targets=bool(places or speeds))
-    st.name_phases(axes[0], result)
     return fig
 
 
@@ -274,7 +265,6 @@ def attitude(result: Result) -> Figure:
     if not np.isfinite([flown, wanted]).any():
         fig, axes = st.time_figure(result, title, 1)
         st.write_note(axes[0, 0], "no body frame attached")
-        st.name_phases(axes[0], result)
         return fig
     turned = np.degrees(result.rates), np.degrees(result.rates_reference)
     shares = _row_shares((flown, wanted), turned)
@@ -284,7 +274,6 @@ def attitude(result: Result) -> Figure:
     _draw_components(result, axes[:, 1], *turned, turning, ("p", "q", "r"), "deg/s")
     references = _reference_handle(wanted, result.rates_reference)
     _draw_body_legend(axes[0, 1], references, targets=bool(targets or turning))
-    st.name_phases(axes[0], result)
     return fig
 
 
@@ -323,7 +312,6 @@ def inputs(result: Result) -> Figure:
         widen_limits(below, min(0.1, 0.1 * peaks.peak_before_breakdown(result, result.thrust)))
         peaks.mark_extremes(below, result, result.thrust, "N", peaks.agent_name, name="thrust")
     st.draw_agents_legend(above, result.n_agents)
-    st.name_phases([above], result)
     return fig
 
 
@@ -353,7 +341,6 @@ def constraint_force(result: Result) -> Figure:
         peaks.leave_out_final_peak(below, result, tension)
         peaks.mark_extremes(below, result, tension, "N", edge, name="tension", always=False)
         st.draw_legend(below, edge_handles(result))
-    st.name_phases([above], result)
     return fig
 
 
@@ -370,7 +357,6 @@ def disturbance(result: Result) -> Figure:
         if peaks.draw_from_zero(above, result, force, "N"):
             st.draw_agents_legend(above, result.n_agents)
     quadrotors.draw_off_slot(below, result)
-    st.name_phases([above], result)
     return fig
 
 
@@ -402,8 +388,6 @@ def shape_error(result: Result) -> Floats:
 
 def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     """Draw the errors |c| of the edges, the greatest, and that of all pairs; return legend entries of the last two."""
-    from matplotlib.lines import Line2D
-
     ax.set_ylabel("error |c| of an edge [m]")
     size, shape = np.abs(result.constraint), shape_error(result)
     handles = []
@@ -411,12 +395,12 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
         known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
         st.draw_line(ax, result.time[known], shape[known], **look)
-        handles.append(Line2D([], [], label="greatest error of all pairs", **look))
+        handles.append(st.legend_entry("greatest error of all pairs", **look))
     if np.isfinite(size).any():
         draw_edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
         look = {"color": st.INK, "linewidth": 1.3}
         st.draw_line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
-        handles.append(Line2D([], [], label="greatest |c| of an edge", **look))
+        handles.append(st.legend_entry("greatest |c| of an edge", **look))
     if not handles:
         st.write_note(ax, "neither edges nor slots")
         return []
@@ -449,7 +433,6 @@ def constraint_error(result: Result) -> Figure:
     handles = draw_error(ax, result)
     if handles:
         st.draw_legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
-    st.name_phases([ax], result)
     return fig
 
 
@@ -527,7 +510,6 @@ def clearance(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Clearance between surfaces", len(names), height=height)
     for name, ax in zip(names, axes[:, 0], strict=True):
         draw_least(ax, result, name)
-    st.name_phases(axes[0], result)
     return fig
 
 
@@ -545,8 +527,7 @@ def motion(result: Result) -> Figure:
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes[:, 0], strict=True):
-        ax.set_ylabel(f"{q.called.replace(' ', chr(10))} [{shown(q.unit)}]")
+        ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
         quadrotors.draw_limited(ax, result, q.name)
     st.draw_agents_legend(axes[0, 0], result.n_agents)
-    st.name_phases(axes[0], result)
     return fig

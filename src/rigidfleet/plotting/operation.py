@@ -67,7 +67,6 @@ def _draw_operation(result: Result, agents: Sequence[int]) -> Figure:
             st.draw_limit(ax, top, f"limit {top:g} m/s")
     draw_least(apart, result, "separation")
     draw_least(clear, result, "clearance")
-    st.name_phases([above], result)
     return fig
 
 

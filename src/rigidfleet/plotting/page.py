@@ -27,8 +27,6 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
 
 def _draw_attitude(ax: Axes, result: Result) -> None:
     """Three Euler angles in one axes, dark to light; without an attitude, the constraint error."""
-    from matplotlib.lines import Line2D
-
     flown, wanted, _ = curves.flown_and_wanted_euler(result)
     if not np.isfinite(flown).any():
         entries = curves.draw_error(ax, result)
@@ -42,7 +40,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
         look: dict[str, Any] = {"color": st.TONES[i], "linewidth": width, "zorder": 2.3 - 0.1 * i}
         st.draw_line(ax, result.time, flown[:, i], **look)
         st.draw_reference(ax, result.time, wanted[:, i])
-        handles.append(Line2D([], [], label=name, **look))
+        handles.append(st.legend_entry(name, **look))
     _legend_above(ax, handles)
     if not st.note_if_still(ax, np.concatenate([flown, wanted]), "deg"):
         curves.widen_limits(ax, 0.1)
@@ -73,14 +71,14 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    key = textwrap.wrap("Phases:  " + st.number_phases(over_time, result), 150)
+    key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     entries = space.legend_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),
         bbox_to_anchor=(0.5, 0.058), labelspacing=0.2,
     )  # fmt: skip
     fig.text(
-        0.5, 0.05, "\n".join(key[:3]), ha="center", va="top", fontsize=7.5, color=st.GREY,
+        0.5, 0.05, key, ha="center", va="top", fontsize=7.5, color=st.GREY,
         parse_math=False,
     )  # fmt: skip
     return fig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, shown
+from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import in_style
@@ -70,7 +70,6 @@ def rotors(result: Result) -> Figure:
         _draw_greatest(above, result)
         st.draw_agents_legend(above, result.n_agents)
         _draw_nearest(below, result)
-    st.name_phases([above], result)
     return fig
 
 
@@ -98,8 +97,6 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
     """The four rotors of the vehicle that comes nearest to its limit, enlarged."""
-    from matplotlib.lines import Line2D
-
     limits, force = rotor_limits(result.mission), rotor_forces(result)
     peak = np.fmax.reduce(force, axis=(0, 2)) / limits
     i = int(np.nanargmax(peak))
@@ -115,7 +112,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
         st.draw_limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
     ax.set_ylabel(f"rotors of agent {i + 1} [N]")
     entries = [
-        Line2D([], [], color=colour, label=name)
+        st.legend_entry(name, color=colour)
         for name, colour in zip(LABELS["rotor"], colours, strict=True)
     ]
     st.draw_legend(ax, entries, "nearest to its limit")
@@ -137,7 +134,6 @@ def vehicles(result: Result) -> Figure:
         st.draw_agents_legend(above, result.n_agents)
     draw_off_slot(middle, result)
     _draw_saturation(below, result, saturated)
-    st.name_phases([above], result)
     return fig
 
 
@@ -156,7 +152,7 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
         return
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
-    limit, unit = q.limit_of(result.mission), shown(q.unit)
+    limit, unit = q.limit_of(result.mission), display_unit(q.unit)
     if peaks.draw_from_zero(ax, result, values, unit, between=between) and limit is not None:
         top = max(ax.get_ylim()[1], 1.2 * limit)
         ax.set_ylim(-0.04 * top, top)

@@ -29,16 +29,15 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
 
     If the distances fix no shape, classical scaling of the shortest paths in the graph gives positions.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import shortest_path
+
     slots = mission.formation_slots(name)
     if slots is not None:
         return slots, True
     n, edges = mission.n_agents, mission.formation_edges(name)
     lengths = mission.formation_distances(name)
-    d = np.full((n, n), np.inf)
-    np.fill_diagonal(d, 0.0)
-    d[edges[:, 0], edges[:, 1]] = d[edges[:, 1], edges[:, 0]] = lengths
-    for k in range(n):
-        d = np.minimum(d, d[:, k : k + 1] + d[k : k + 1])
+    d = shortest_path(coo_array((lengths, edges.T), (n, n)), directed=False)
     # Between components that no edge joins
     d[np.isinf(d)] = 1.5 * d[np.isfinite(d)].max(initial=1.0)
     centring = np.eye(n) - 1 / n

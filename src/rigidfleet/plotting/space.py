@@ -290,7 +290,7 @@ def _azimuth(view: Scene) -> float:
         seen = points @ camera(azimuth, _ELEVATION)[:2].T
         return float(np.linalg.det(np.cov(seen, rowvar=False)))
 
-    # Of nearly equivalent views, take the one nearest to the middle.
+    # Of nearly equivalent views, take the one nearest to the middle
     candidates = sorted(range(-75, -14, 5), key=lambda a: abs(a + 55))
     if len(points) < 3:
         return candidates[0]
@@ -403,14 +403,12 @@ def _draw_box(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> No
 
 def legend_handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
-    from matplotlib.lines import Line2D
-
-    waypoints = [Line2D([], [], **_CROSS, label="waypoint")] if view.waypoints else []
+    waypoints = [st.legend_entry("waypoint", **_CROSS)] if view.waypoints else []
     if has_lights(result):
         return waypoints
     ends = [
-        Line2D([], [], **marker_look(st.GREY, 5, hollow=True), label="start"),
-        Line2D([], [], **marker_look(st.GREY, 5, marker="s"), label="end"),
+        st.legend_entry("start", **marker_look(st.GREY, 5, hollow=True)),
+        st.legend_entry("end", **marker_look(st.GREY, 5, marker="s")),
     ]
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 

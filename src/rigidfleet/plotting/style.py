@@ -11,7 +11,6 @@ from contextvars import ContextVar
 from functools import wraps
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -40,6 +39,7 @@ FLOWN = "#8FA3B8"
 TONES = ("#1F2A36", "#66798D", "#A9B8C6")
 BAND = "#F1F3F5"
 DASHES = (0, (4, 2.5))
+REFERENCE: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": DASHES}
 ALERT = "#B00020"
 #: Background of lights.
 NIGHT = "#0B0E16"
@@ -50,7 +50,6 @@ _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
 _DOT = _DPI / 100  # a hundredth of an inch [pixels]
 _OUTSIDE = 100  # cost of a text that leaves its axes
-_SLANT = 38.0  # slant of phase names that do not fit horizontally [deg]
 _LONGEST = 28  # greatest length of a phase name
 _POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
 #: Number of agents or edges beyond which the spread is drawn instead of each line.
@@ -65,7 +64,6 @@ _ROUNDING = 1e-9  # smaller deviations are not mentioned
 Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
 #: Positions along the width of an axes, ends and middle first.
 _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
-_places: WeakKeyDictionary[Annotation, Sequence[Place]] = WeakKeyDictionary()
 #: Whether figures have titles, and their width [mm]; None for the usual one.
 _shape: ContextVar[tuple[bool, float | None]] = ContextVar("shape", default=(True, None))
 
@@ -218,7 +216,9 @@ def time_figure(
         draw_time_axis(ax, result)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]")
-    return fig, axes.reshape(stacked).T if stacked else axes
+    axes = axes.reshape(stacked).T if stacked else axes
+    _name_phases(axes[0], result)
+    return fig, axes
 
 
 def draw_head(fig: Figure, result: Result, title: str) -> None:
@@ -259,6 +259,13 @@ def draw_time_axis(ax: Axes, result: Result) -> None:
         ax.axvline(t[-1], color=ALERT, linewidth=0.8)
 
 
+def legend_entry(label: str, **look: Any) -> Line2D:
+    """What a legend has of a line that looks so."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **look)
+
+
 def draw_line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
     """Line through samples y (K,) at t (K,), thinned if there are more than can be seen."""
     return ax.plot(*thin_out(t, y), **look)[0]
@@ -279,7 +286,7 @@ def thin_out(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]
 
 def draw_reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
     """Draw a reference as a dashed line."""
-    return draw_line(ax, t, y, color=INK, linewidth=0.8, linestyle=DASHES, zorder=3)
+    return draw_line(ax, t, y, **REFERENCE, zorder=3)
 
 
 def draw_limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
@@ -304,7 +311,8 @@ def annotate(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
         path_effects=halo(), parse_math=False, annotation_clip=False, zorder=6, gid="words", **look,
     )  # fmt: skip
     label.set_in_layout(False)
-    _places[label] = places
+    figure: Any = ax.figure
+    figure.words.append((label, places))
 
 
 def corner_places() -> list[Place]:
@@ -329,14 +337,13 @@ def places_around(x: float, y: float) -> list[Place]:
     return near[:6] + beside + near[6:]
 
 
-def place_words(fig: Figure) -> None:
+def place_words(fig: Any) -> None:
     """Lay the figure out, and move annotated text to where it covers nothing, or least."""
-    every = [(text, places) for text, places in _places.items() if text.get_figure() is fig]
     engine = fig.get_layout_engine()
     if engine is not None:
         engine.execute(fig)
     for ax in fig.axes:
-        labels = [(text, places) for text, places in every if text.axes is ax]
+        labels = [(text, places) for text, places in fig.words if text.axes is ax]
         waiting = {text for text, _ in labels}
         for label, places in labels:
             waiting.remove(label)
@@ -449,13 +456,12 @@ def draw_spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
 
 def spread_handles(what: str, colour: str) -> list[Any]:
     """Legend entries of `draw_spread`."""
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     return [
         Patch(color=colour, alpha=0.25, linewidth=0, label=f"all {what}"),
         Patch(color=colour, alpha=0.7, linewidth=0, label="nine in ten"),
-        Line2D([], [], color=colour, linewidth=1.4, label="median"),
+        legend_entry("median", color=colour, linewidth=1.4),
     ]
 
 
@@ -476,13 +482,10 @@ def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
 
 def agent_handles(n: int, **look: Any) -> list[Line2D]:
     """Legend entries of the agents: all of them, or some evenly spread ones."""
-    from matplotlib.lines import Line2D
-
     colours = agent_colours(n)
     entries = _ENTRIES if n <= MANY else 4
     return [
-        Line2D([], [], color=colours[i], label=f"agent {i + 1}", **look)
-        for i in spaced_indices(n, entries)
+        legend_entry(f"agent {i + 1}", color=colours[i], **look) for i in spaced_indices(n, entries)
     ]
 
 
@@ -528,110 +531,65 @@ def clean_name(name: str, longest: int = _LONGEST) -> str:
     return words if len(words) <= longest else words[: longest - 1].rstrip() + "…"
 
 
-def name_phases(axes: Iterable[Axes], result: Result) -> None:
-    """Write the phases' names along the top of axes, without overlaps, before the figure is laid out.
+def _name_phases(axes: Sequence[Axes], result: Result) -> None:
+    """Write the phases' names along the top of axes; if one is too long, their numbers, with a key below the figure.
 
-    If all names fit, each stands horizontally over its phase. Otherwise they are slanted, moved apart where
-    phases are short, with a line to their phase. If even this is too narrow, the shortest phases have no name.
+    This comes before the layout, which makes room for the names: its width of the axes is estimated, with 20 % to spare
+    for a legend beside them.
     """
-    for ax in list(axes)[: 1 if is_narrow() else None]:
-        labels = _upright(ax, result) or _slanting(ax, result)
-        for label in labels:
-            label.set_gid("phase")
+    axes = axes[: 1 if is_narrow() else None]
+    labels, fit = [], True
+    for ax in axes:
+        per_second = 0.8 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
+        for name, start, end in _phase_spans(ax, result):
+            label = _label_phase(ax, clean_name(name, 60), start, end, fontsize=8)
+            fit = fit and label.get_window_extent().width <= per_second * (end - start)
+            labels.append(label)
+    if fit:
+        return
+    for label in labels:
+        label.remove()
+    letters = int(14 * figure_width(WIDTH))
+    key = textwrap.fill(number_phases(axes, result), letters, max_lines=5, placeholder=" …")
+    axes[0].figure.supxlabel(key, fontsize=7.5, color=GREY, parse_math=False)
+
+
+def _label_phase(ax: Axes, text: str, start: float, end: float, fontsize: float) -> Text:
+    return ax.text(
+        (start + end) / 2, 1.02, text, fontsize=fontsize, color=GREY, ha="center", va="bottom",
+        transform=ax.get_xaxis_transform(), parse_math=False, gid="phase",
+    )  # fmt: skip
 
 
 def number_phases(axes: Iterable[Axes], result: Result) -> str:
-    """Write the phases' numbers along the top of small axes; return the key to them.
+    """Write the phases' numbers along the top of axes; return the key to them.
 
     A number that does not fit is left out.
     """
     for ax in axes:
         right = -math.inf
         for i, (_, start, end) in enumerate(_phase_spans(ax, result)):
-            label = ax.text(
-                (start + end) / 2, 1.01, str(i + 1), fontsize=6.5, color=GREY, ha="center",
-                va="bottom", transform=ax.get_xaxis_transform(), gid="phase",
-            )  # fmt: skip
+            label = _label_phase(ax, str(i + 1), start, end, fontsize=6.5)
             box = label.get_window_extent()
-            if box.x0 < right + _DOT:
+            if box.x0 < right + 2 * _DOT:
                 label.remove()
             else:
                 right = box.x1
-    # The default name of a phase is its kind and number.
-    names = (
-        f"{i + 1} {clean_name(p.kind if p.name == f'{p.kind} {i + 1}' else p.name)}"
-        for i, p in enumerate(result.phases)
-    )
-    return "  ·  ".join(name.replace(" ", "\N{NO-BREAK SPACE}") for name in names)
+    # A line of the key breaks between names alone
+    names = (f"{i + 1} {clean_name(name)}  ·" for i, name in enumerate(_phase_names(result)))
+    return "Phases:  " + "  ".join(x.replace(" ", "\N{NO-BREAK SPACE}") for x in names)[:-3]
 
 
-def _upright(ax: Axes, result: Result) -> list[Text]:
-    labels = []
-    for name, start, end in _phase_spans(ax, result):
-        label = ax.text(
-            (start + end) / 2, 1.02, clean_name(name, 60), fontsize=8, color=GREY, ha="center",
-            va="bottom", transform=ax.get_xaxis_transform(), parse_math=False,
-        )  # fmt: skip
-        labels.append(label)
-        if label.get_window_extent().width > 0.9 * _per_second(ax) * (end - start):
-            for drawn in labels:
-                drawn.remove()
-            return []
-    return labels
-
-
-def _slanting(ax: Axes, result: Result) -> list[Text]:
-    scale, t0 = _per_second(ax), ax.get_xlim()[0]
-    size = 7.5
-    # Slanted texts need a distance that depends on their height and slant.
-    pitch = 1.25 * size * ax.figure.dpi / 72 / math.sin(math.radians(_SLANT))
-    room = int(scale * np.diff(ax.get_xlim())[0] / pitch)
-    longest = sorted(_phase_spans(ax, result), key=lambda span: span[1] - span[2])[:room]
-    spans = sorted(longest, key=lambda span: span[1])
-    middle = np.array([(start + end) / 2 - t0 for _, start, end in spans]) * scale
-    place = np.maximum(_apart(middle, pitch), pitch * np.arange(len(middle)))
-    above = 6 * ax.figure.dpi / 72 / ax.bbox.height
-    labels = []
-    middle, place = middle / scale + t0, place / scale + t0
-    for (name, *_), at in zip(spans, place.tolist(), strict=True):
-        label = ax.text(
-            at, 1 + above, clean_name(name), fontsize=size, color=GREY, ha="left", va="baseline",
-            rotation=_SLANT, rotation_mode="anchor", transform=ax.get_xaxis_transform(),
-            parse_math=False,
-        )  # fmt: skip
-        labels.append(label)
-    gap = np.full_like(place, np.nan)  # all pointers are one line
-    ax.plot(
-        np.column_stack([middle, place, gap]).ravel(), [1, 1 + 0.8 * above, np.nan] * len(place), color=FAINT,
-        linewidth=0.6, clip_on=False, transform=ax.get_xaxis_transform(),
-    )  # fmt: skip
-    return labels
+def _phase_names(result: Result) -> list[str]:
+    """Names of the phases; a name by default, kind and number, without its number."""
+    return [p.kind if p.name == f"{p.kind} {i}" else p.name for i, p in enumerate(result.phases, 1)]
 
 
 def _phase_spans(ax: Axes, result: Result) -> list[tuple[str, float, float]]:
     """Name, start and end [s] of each phase that the axes show."""
     low, high = ax.get_xlim()
     return [
-        (p.name, max(p.t_start, low), min(p.t_end, high)) for p in result.phases if p.t_start < high
+        (name, max(p.t_start, low), min(p.t_end, high))
+        for name, p in zip(_phase_names(result), result.phases, strict=True)
+        if p.t_start < high
     ]
-
-
-def _per_second(ax: Axes) -> float:
-    """Pixels per second, underestimated: the layout comes later, as it needs the names.
-
-    It widens axes beside which nothing stands by up to 20 %, and narrows those beside a legend by up to 9 %.
-    """
-    return 0.9 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
-
-
-def _apart(places: Floats, pitch: float) -> Floats:
-    """Ascending positions, moved as little as possible (least squares) to be at least `pitch` apart."""
-    # Pool adjacent violators on the positions minus their least distances.
-    blocks: list[list[float]] = []
-    for value in places - pitch * np.arange(len(places)):
-        blocks.append([float(value), 1.0])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            (b, n), (a, m) = blocks.pop(), blocks.pop()
-            blocks.append([(a * m + b * n) / (m + n), m + n])
-    level = np.repeat([b[0] for b in blocks], [int(b[1]) for b in blocks])
-    return level + pitch * np.arange(len(places))

@@ -19,17 +19,17 @@ _WORTH, _SHORT = 0.05, 0.1
 _COMPARED = 200
 
 
-def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def assignment_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Notes if another assignment to the slots of the first formation is shorter or safer."""
     first = next((p.establishing for p in mission.phases if p.establishing is not None), None)
     slots = mission.formation_slots(first.formation) if first is not None else None
     if first is None or slots is None or not 2 <= mission.n_agents <= _COMPARED:
         return
     index, masses = mission.phases.index(first), mission.fleet.mass
-    if index >= len(found.planned_phases):
+    if index >= len(preflight.planned_phases):
         return
     for name in ("as it is", "shortest", "safe"):
-        other, planned = mission, found.planned_phases[index]
+        other, planned = mission, preflight.planned_phases[index]
         if name not in ("as it is", mission.assignment):
             other = mission.with_assignment(name)
             planned = preview(other, index + 1)[0][index]
@@ -39,9 +39,9 @@ def assignment_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         length = float(np.linalg.norm(np.diff(x, axis=0), axis=2).sum())
         clearance = assignment.closest_approach(*planned.path_ends, mission.agents.radius)[0]
         order = tuple(other.assigned_slots[first.formation].tolist())
-        found.assignments[name] = Assignment(order, length, clearance)
+        preflight.assignments[name] = Assignment(order, length, clearance)
     radius = mission.fleet.radius
-    now, short, safe = found.assignments.values()
+    now, short, safe = preflight.assignments.values()
     if short.path_length < (1 - _WORTH) * now.path_length - _SHORT:
         text = (
             f'assignment = "shortest" reduces the total path length from {now.path_length:.1f} m to'

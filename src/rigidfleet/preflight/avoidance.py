@@ -10,7 +10,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.preflight.findings import Remark
 
 
-def evades(mission: Mission, topic: str, limit: float = 0.0) -> bool:
+def is_left_to_avoidance(mission: Mission, topic: str, limit: float = 0.0) -> bool:
     """Whether [avoidance] has to keep vehicles off obstacles, or a separation [m], where the plan does not."""
     a = mission.avoidance
     if a is None or topic not in ("collision", "obstacle"):
@@ -42,10 +42,10 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
             if room < worst:
                 worst, who = room, f"agents {j + 1} and {i + 1}"
         for o in np.flatnonzero(a.sight.moves == 0):
-            found = from_obstacle(r[i], stop[i], o, a.solids, np.nan, a.normal)
-            if found[0] - a.reach[i] < worst:
+            nearest = from_obstacle(r[i], stop[i], o, a.solids, np.nan, a.normal)
+            if nearest[0] - a.reach[i] < worst:
                 worst, who = (
-                    found[0] - a.reach[i],
+                    nearest[0] - a.reach[i],
                     f"agent {i + 1} and '{mission.obstacles[o].name}'",
                 )
     if who:

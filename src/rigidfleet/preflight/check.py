@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
-from rigidfleet.mission.files import doubts
+from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import reserves, vehicle_lags
@@ -64,42 +64,42 @@ def check(
     formations = check_formations(mission, search=search, progress=progress)
     progress("planned paths")
     planned, known = preview(mission)
-    found = Preflight(mission, formations, check_gains(mission, formations), planned)
-    found.speed = greatest_speed(planned, slice(3))
-    found.vertical_speed = greatest_speed(planned, slice(2, 3))
+    preflight = Preflight(mission, formations, check_gains(mission, formations), planned)
+    preflight.speed = greatest_speed(planned, slice(3))
+    preflight.vertical_speed = greatest_speed(planned, slice(2, 3))
     if not known:
-        found.judged_to = float(planned[-1].time[-1]) if planned else 0.0
+        preflight.judged_to = float(planned[-1].time[-1]) if planned else 0.0
     if lags := vehicle_lags(mission):
         progress("margins")
-        found.margins = check_margins(mission, planned, lags)
-        found.vehicles = check_vehicles(mission, planned)
-        found.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
+        preflight.margins = check_margins(mission, planned, lags)
+        preflight.vehicles = check_vehicles(mission, planned)
+        preflight.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
-    found.remarks = [
-        *(Remark("note", "files", text) for text in doubts(mission.about)),
+    preflight.remarks = [
+        *(Remark("note", "files", text) for text in notes_on_files(mission.about)),
         *formation_remarks(mission, formations),
-        *gain_remarks(mission, found),
-        *margin_remarks(found),
-        *separation_remarks(mission, found),
-        *downwash_remarks(mission, found),
-        *assignment_remarks(mission, found),
-        *thrust_remarks(mission, found),
-        *vehicle_remarks(mission, found),
+        *gain_remarks(mission, preflight),
+        *margin_remarks(preflight),
+        *separation_remarks(mission, preflight),
+        *downwash_remarks(mission, preflight),
+        *assignment_remarks(mission, preflight),
+        *thrust_remarks(mission, preflight),
+        *vehicle_remarks(mission, preflight),
         *braking_remarks(mission),
-        *disturbance_remarks(mission, found),
-        *offset_remarks(mission, found),
-        *obstacle_remarks(mission, found),
-        *limit_remarks(mission, found),
-        *waypoint_remarks(mission, found),
-        *loss_remarks(mission, found),
+        *disturbance_remarks(mission, preflight),
+        *offset_remarks(mission, preflight),
+        *obstacle_remarks(mission, preflight),
+        *limit_remarks(mission, preflight),
+        *waypoint_remarks(mission, preflight),
+        *loss_remarks(mission, preflight),
     ]
     if not known:
         why = "later positions depend on distances alone and are known only in flight"
         if len(planned) < len(mission.phases) and samples_per_phase(mission) < FEWEST_SAMPLES:
             why = "more agents and phases would take too long"
-        text = f"paths are checked only up to {found.judged_to:g} s: {why}"
-        found.remarks.append(Remark("note", "paths", text))
-    if any(planned.leg.phase.control == "body" for planned in found.planned_phases):
+        text = f"paths are checked only up to {preflight.judged_to:g} s: {why}"
+        preflight.remarks.append(Remark("note", "paths", text))
+    if any(planned.leg.phase.control == "body" for planned in preflight.planned_phases):
         text = "paths in phases with control = 'body' are estimates, less close the faster the formation turns"
-        found.remarks.append(Remark("note", "paths", text))
-    return found
+        preflight.remarks.append(Remark("note", "paths", text))
+    return preflight

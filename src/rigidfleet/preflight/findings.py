@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rigidfleet._common.facts import Fact, Line, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, Shown, worst_values
 from rigidfleet._common.plain import plain
 from rigidfleet._common.text import agent_names
 from rigidfleet.math import proximity
@@ -229,12 +229,12 @@ class VehicleCheck:
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
-            "rotor_force": _named(
+            "rotor_force": _by_name(
                 ("force_n", "time_s", "who", "limit_n", "phase"), self.rotor_force
             ),
-            "tilt": _named(("tilt_deg", "time_s", "who", "phase"), self.tilt),
-            "jump": _named(("acceleration_m_s2", "tilt_deg", "time_s", "phase"), self.jump),
-            "beyond": _named(("share", "who", "phase", "needs"), self.beyond),
+            "tilt": _by_name(("tilt_deg", "time_s", "who", "phase"), self.tilt),
+            "jump": _by_name(("acceleration_m_s2", "tilt_deg", "time_s", "phase"), self.jump),
+            "beyond": _by_name(("share", "who", "phase", "needs"), self.beyond),
         }
 
 
@@ -311,9 +311,9 @@ class Preflight(Shown):
         verdict = "no problems found" if self.passed else "the flight will fail"
         parts = [
             self.mission.phase_table,
-            Table(heads, [*map(Row, self._rows())], heads, bare=True),
+            FactTable(heads, [*map(Row, self._rows())], heads, bare=True),
             worst_values("planned", self._worst()),
-            Table(heads, remarks, heads, bare=True),
+            FactTable(heads, remarks, heads, bare=True),
             Line(f"{name}: {verdict}", "ok" if self.passed else "fails"),
         ]
         return Sheet(name, f"valid: {self.mission.size_in_words}", parts)
@@ -355,7 +355,7 @@ class Preflight(Shown):
                 yield "gains", _gain_words(self.gains)
         if self.margins is not None:
             yield from self.margins.rows
-        yield from self._proved()
+        yield from self._proof()
         if self.reserve:
             text = f"automatic times leave {self.reserve:.2g} s times the greatest jerk of limits of acceleration, tilt"
             text += " and thrust, and times the greatest acceleration of those of speed, for lag and drag of vehicles"
@@ -377,7 +377,7 @@ class Preflight(Shown):
             text = f"straight paths are assumed in {names}, where only distances guide the agents"
             yield "guessed", text
 
-    def _proved(self) -> Iterator[tuple[str, str]]:
+    def _proof(self) -> Iterator[tuple[str, str]]:
         """The least of the certificates, and the phases that have none."""
         certificates = self.certificates
         if not certificates:
@@ -389,7 +389,7 @@ class Preflight(Shown):
         )
         lacking = [p.phase for p in self.planned_phases if p.certificate is None]
         if lacking:
-            text += f"; {some(lacking)} not proved, as no slots are tracked"
+            text += f"; {names_in_words(lacking)} not proved, as no slots are tracked"
         yield "proved", text
 
     @property
@@ -433,9 +433,9 @@ class Preflight(Shown):
             if (d := self.disturbed) is None
             else {
                 **{f"{name}_n": getattr(d, name) for name in _FORCES},
-                "thrust": _named(("thrust_n", "time_s", "who", "limit_n"), d.thrust),
-                "offset": _named(("offset_m", "who"), d.offset),
-                "lost": [_named(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
+                "thrust": _by_name(("thrust_n", "time_s", "who", "limit_n"), d.thrust),
+                "offset": _by_name(("offset_m", "who"), d.offset),
+                "lost": [_by_name(("agent", "time_s"), (i + 1, t)) for i, t in d.lost],
             },
             "paths": {
                 "judged_to_s": self.judged_to,
@@ -443,7 +443,7 @@ class Preflight(Shown):
                     planned.phase for planned in self.planned_phases if not planned.exact
                 ],
                 **{
-                    name: _named((key, "time_s", "who", "limit_n"), getattr(self, name))
+                    name: _by_name((key, "time_s", "who", "limit_n"), getattr(self, name))
                     for name, (key, _) in _WORST.items()
                 },
                 "certificates": [
@@ -457,9 +457,12 @@ class Preflight(Shown):
                     for phase, c in self.certificates.items()
                 ],
                 "clearance": [
-                    _named(("obstacle", "clearance_m", "time_s", "who"), c) for c in self.clearance
+                    _by_name(("obstacle", "clearance_m", "time_s", "who"), c)
+                    for c in self.clearance
                 ],
-                "gaps": [_named(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps],
+                "gaps": [
+                    _by_name(("between", "wide_m", "takes_m", "time_s"), g) for g in self.gaps
+                ],
                 "assignments": {
                     name: {
                         "order": [s + 1 for s in a.order],
@@ -573,12 +576,12 @@ def _margin_words(m: Margins) -> str:
     return f"stable; bears {delay}, {math.degrees(m.phase):.0f} deg of phase, {gain}"
 
 
-def some(names: Sequence[str]) -> str:
+def names_in_words(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
     text = ", ".join(f"'{name}'" for name in names[:_TOLD])
     more = f" and {len(names) - _TOLD:,} more" if len(names) > _TOLD else ""
     return f"{text}{more} {'is' if len(names) == 1 else 'are'}"
 
 
-def _named(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
+def _by_name(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:
     return None if values is None else dict(zip(names, values, strict=False))

@@ -18,7 +18,7 @@ from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.planning import solvers
 from rigidfleet.planning.reference import reference_kind
-from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, some
+from rigidfleet.preflight.findings import DENSE, FormationCheck, Remark, names_in_words
 from rigidfleet.rigidity import (
     Kind,
     Rigidity,
@@ -55,29 +55,29 @@ def check_formations(
 ) -> list[FormationCheck]:
     """Check all formations and return them in their order. Those that are flown have priority if work is limited."""
     held = {name: _held_by(mission, name) for name in mission.formations}
-    left, found = _FORMING, {}
+    left, checks = _FORMING, {}
     for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
         progress(f"formation '{name}', {k} of {len(held)}")
-        work = _work(mission, name, search=search)
+        work = _work_time(mission, name, search=search)
         if k > 1 and work > left:
             edges = mission.formation_edges(name)
             method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
-            found[name] = FormationCheck(name, None, held[name], method=method, skipped=True)
+            checks[name] = FormationCheck(name, None, held[name], method=method, skipped=True)
         else:
             left -= work
-            found[name] = _formation(mission, name, held[name], search=search)
-    return [_spaced(mission, found[name]) for name in mission.formations]
+            checks[name] = _formation_check(mission, name, held[name], search=search)
+    return [_with_spacing(mission, checks[name]) for name in mission.formations]
 
 
-def _spaced(mission: Mission, found: FormationCheck) -> FormationCheck:
+def _with_spacing(mission: Mission, check: FormationCheck) -> FormationCheck:
     """The check with what concerns a show: the spacing of the slots, and the lights."""
-    slots = mission.formation_slots(found.name)
+    slots = mission.formation_slots(check.name)
     spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
-    colours = len({*(mission.formation_colours(found.name) or ())})
-    return replace(found, spacing=spacing, colours=colours)
+    colours = len({*(mission.formation_colours(check.name) or ())})
+    return replace(check, spacing=spacing, colours=colours)
 
 
-def _work(mission: Mission, name: str, *, search: bool) -> float:
+def _work_time(mission: Mission, name: str, *, search: bool) -> float:
     """Estimated time to check a formation [s]."""
     n, m = mission.n_agents, len(mission.formation_edges(name))
     if min(m, 3 * n) > DENSE:
@@ -85,7 +85,7 @@ def _work(mission: Mission, name: str, *, search: bool) -> float:
     return 0.1 * search + 5e-10 * min(m, 3 * n) ** 2 * max(m, 3 * n) + 2e-3
 
 
-def _formation(
+def _formation_check(
     mission: Mission, name: str, held: Literal["tracking", "distances", "nothing"], *, search: bool
 ) -> FormationCheck:
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
@@ -94,15 +94,15 @@ def _formation(
         return FormationCheck(name, None, held, method=method)
     masses, space = mission.agents.mass, mission.formations[name].dimension or mission.dimension
     if min(len(edges), 3 * mission.n_agents) > DENSE:
-        start = _spanned(mission.fleet.position, centred(mission.fleet.velocity))
-        if held == "distances" and max(start, _spanned(slots)) == 2:
+        start = _dimension_spanned(mission.fleet.position, centred(mission.fleet.velocity))
+        if held == "distances" and max(start, _dimension_spanned(slots)) == 2:
             space = 2  # which they do not leave
         points = flatten(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
         return FormationCheck(name, None, held, method=method, spectrum=ends)
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
     endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
-    if not search or endless or contradiction(mission, name) is not None:
+    if not search or endless or worst_contradiction(mission, name) is not None:
         return FormationCheck(name, rigidity, held, method=method)
     start, space = mission.agents.position, rigidity.own.space
     others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
@@ -120,15 +120,15 @@ def _held_by(mission: Mission, name: str) -> Literal["tracking", "distances", "n
     return "tracking" if controls == {"tracking"} else "distances"
 
 
-def contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
+def worst_contradiction(mission: Mission, name: str) -> tuple[int, float] | None:
     """Edge whose given distance differs most from that of the slots, and this error [m]; None within tolerance."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
         return None
-    given = mission.formation_distances(name)
-    error = np.abs(distance_geometry.distances(slots, edges) - given)
+    lengths = mission.formation_distances(name)
+    error = np.abs(distance_geometry.distances(slots, edges) - lengths)
     worst = int(error.argmax())
-    most = mission.formations[name].greatest_error(given.min())
+    most = mission.formations[name].greatest_error(lengths.min())
     return (worst, float(error[worst])) if error[worst] > most else None
 
 
@@ -136,10 +136,10 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
     """Remarks on formations that are not rigid, contradict themselves, or share their distances with other shapes."""
     exact = mission.constraint.solver == "exact"
     if skipped := [f.name for f in formations if f.skipped]:
-        yield _note(f"to limit the time of the check, {some(skipped)} skipped")
+        yield _note(f"to limit the time of the check, {names_in_words(skipped)} skipped")
     if idle := [f.name for f in formations if f.held_by == "nothing"]:
-        yield _note(f"{some(idle)} not used in any phase")
-    yield from _confined(mission)
+        yield _note(f"{names_in_words(idle)} not used in any phase")
+    yield from _flat_start(mission)
     soft = {
         f.name
         for f in formations
@@ -151,11 +151,11 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         if f.held_by == "nothing":
             continue
         alone = f.held_by == "distances"
-        if (off := contradiction(mission, f.name)) is not None:
+        if (off := worst_contradiction(mission, f.name)) is not None:
             i, j = mission.formation_edges(f.name)[off[0]] + 1
-            given = mission.formation_distances(f.name)[off[0]]
+            length = mission.formation_distances(f.name)[off[0]]
             yield _fails(
-                f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {given:.4g} m,"
+                f"'{f.name}' will have another shape than its slots: agents {i} and {j} are given {length:.4g} m,"
                 f" which differs from that of their slots by {off[1]:.3g} m"
             )
         r = f.rigidity
@@ -191,13 +191,13 @@ def formation_remarks(mission: Mission, formations: list[FormationCheck]) -> Ite
         yield from _other_shapes(mission, f, alone=alone)
 
 
-def _spanned(points: Floats, *moves: Floats) -> int:
+def _dimension_spanned(points: Floats, *moves: Floats) -> int:
     """Dimension of the space that points and movements (N, 3) about their means keep to."""
     x = np.vstack([centred(points), *moves, *(-move for move in moves)])
     return distance_geometry.dimension(x)
 
 
-def _confined(mission: Mission) -> Iterator[Remark]:
+def _flat_start(mission: Mission) -> Iterator[Remark]:
     """Remark on agents that start on a line or in a plane, which forces along their edges cannot move them off."""
     unequal, moves = len(set(mission.agents.mass)) > 1, [centred(mission.fleet.velocity)]
     formed = turned = False
@@ -214,8 +214,8 @@ def _confined(mission: Mission) -> Iterator[Remark]:
         if name is not None and not len(mission.formation_edges(name)):
             return  # no forces between agents
         slots = mission.slots_about_cm(name)
-        start = _spanned(mission.fleet.position, *moves)
-        if slots is None or start >= _spanned(slots):
+        start = _dimension_spanned(mission.fleet.position, *moves)
+        if slots is None or start >= _dimension_spanned(slots):
             continue
         # Where they share coordinates, not even rounding moves them off.
         shared = ~np.ptp([mission.fleet.position, moves[0]], axis=1).any(axis=0)
@@ -244,17 +244,17 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]
         if phase.control != "tracking" and name in soft:
             # The paper's matrix H shares weights equally among unequal masses, and tears the shape.
             torn = phase.control == "body" and unequal and mission.allocation.method == "pinv"
-            space = 3 if torn else _spanned(r, v, unequal * np.array([phase.input_force]))
+            space = 3 if torn else _dimension_spanned(r, v, unequal * np.array([phase.input_force]))
             pairs = complete_graph(len(r))
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-            led = None if torn else lead_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
+            end = None if torn else lead_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
             most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
             most *= mission.formations[name].greatest_error(apart.min())
             off, before = np.inf, out.get(name, (0, 0.0))
-            if led is not None:
-                slots = led
-                off = np.abs(distance_geometry.distances(led, pairs) - apart).max() / most
+            if end is not None:
+                slots = end
+                off = np.abs(distance_geometry.distances(end, pairs) - apart).max() / most
             out[name] = max(before[0], space), max(before[1], off)
         r, v = slots, 0 * v
     return out
@@ -292,7 +292,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
     if first is not None and first.formation == f.name:
         by = reference_kind(mission, first, start, slots)
     end = None if others.leads_to is None else others.shapes[others.leads_to].kind
-    if by == "shape" and slots is not None and _flattens(start, slots):
+    if by == "shape" and slots is not None and _passes_plane(start, slots):
         yield _note(
             f"the agents start with the handedness of the mirror image of '{f.name}' and must pass through a plane,"
             " where distances alone may return them to the mirror image. Swap two slots or track slots"
@@ -312,7 +312,7 @@ def _other_shapes(mission: Mission, f: FormationCheck, *, alone: bool) -> Iterat
         )
 
 
-def _flattens(start: Floats, slots: Floats) -> bool:
+def _passes_plane(start: Floats, slots: Floats) -> bool:
     """Whether straight paths of four agents from a start to spatial slots (4, 3) pass through a plane."""
     if len(slots) != 4 or distance_geometry.dimension(slots) < 3:
         return False

@@ -35,9 +35,9 @@ def check_gains(mission: Mission, formations: list[FormationCheck]) -> GainsChec
     return GainsCheck(stabilised, margin, settling, over, force)
 
 
-def gain_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def gain_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on missing or slow feedback, if distances guide the agents."""
-    g, phases = found.gains, mission.phases
+    g, phases = preflight.gains, mission.phases
     if all(phase.control == "tracking" for phase in phases) or not len(mission.edges):
         return
     if not g.stabilised:

@@ -22,13 +22,13 @@ from rigidfleet.preflight.trajectory import (
 from rigidfleet.rigidity import analyse
 
 
-def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on lost links, and on the way of those left after the first loss."""
     yield from _links(mission)
     first = mission.first_loss
     if mission.on_loss == "continue" or not np.isfinite(first):
         return
-    legs = [planned.leg for planned in found.planned_phases]
+    legs = [planned.leg for planned in preflight.planned_phases]
     at = next((x for x in legs if x.start < first <= x.end), None)
     if at is None:
         text = f"{mission.first_lost} may be lost after the planned paths, at {first:g} s: what follows is not checked"
@@ -45,7 +45,9 @@ def loss_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     )
     yield Remark("note", "loss", text)
     most = max(samples_per_phase(mission), FEWEST_SAMPLES)
-    part = Preflight(mission, found.formations, found.gains, [planned_phase(x, most) for x in way])
+    part = Preflight(
+        mission, preflight.formations, preflight.gains, [planned_phase(x, most) for x in way]
+    )
     judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
     for judge in judges:
         yield from judge(mission, part)

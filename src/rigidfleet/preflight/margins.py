@@ -45,15 +45,17 @@ def check_margins(
     """
     tracking = tracking_law(mission, lags)
     laws, skipped = formation_laws(mission, way, lags)
-    found: dict[str, FormationMargins] = {}
+    by_place: dict[str, FormationMargins] = {}
     for law in laws:
-        found[law.where] = _worse(found.get(law.where), law.loops, law.law, law.growth)
+        by_place[law.where] = _smaller_margins(
+            by_place.get(law.where), law.loops, law.law, law.growth
+        )
     alone = None if tracking is None else margins(tracking.loops, tracking.law)
-    return MarginsCheck(alone, found, skipped)
+    return MarginsCheck(alone, by_place, skipped)
 
 
 @dataclass(frozen=True)
-class Looped:
+class ClosedLoops:
     """Loops of one shape, or of single vehicles, and the law that closes them.
 
     Attributes
@@ -70,41 +72,41 @@ class Looped:
     growth: float
 
 
-def tracking_law(mission: Mission, lags: Sequence[Lag]) -> Looped | None:
+def tracking_law(mission: Mission, lags: Sequence[Lag]) -> ClosedLoops | None:
     """The tracking of single vehicles; None if no phase tracks slots."""
     if not any(phase.control == "tracking" for phase in mission.phases):
         return None
-    return Looped("tracking", tracking_loops(lags), feedback(mission, None, None), GROWTH)
+    return ClosedLoops("tracking", tracking_loops(lags), feedback(mission, None, None), GROWTH)
 
 
 def formation_laws(
     mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
-) -> tuple[list[Looped], bool]:
+) -> tuple[list[ClosedLoops], bool]:
     """The loops of each formation and of the ways between them, and whether some were left out to limit the work."""
-    found: list[Looped] = []
+    laws: list[ClosedLoops] = []
     seen: set[tuple[object, ...]] = set()
     work, skipped = 0, False
     pairs = list(zip(mission.phases, way, strict=False))
-    for phase, planned in sorted(pairs, key=lambda pair: _changes(pair[1])):  # ways come last
+    for phase, planned in sorted(pairs, key=lambda pair: _changes_shape(pair[1])):  # ways come last
         name = planned.shapes[1]
         if name is None or not len(edges := mission.formation_edges(name)):
             continue
-        law = feedback(mission, phase, None if _changes(planned) else name)
+        law = feedback(mission, phase, None if _changes_shape(planned) else name)
         # On a way that ends, slow growth does no harm: weak shapes pass.
-        growth = 1.0 / np.ptp(planned.time) if _changes(planned) else GROWTH
+        growth = 1.0 / np.ptp(planned.time) if _changes_shape(planned) else GROWTH
         for r in _shapes(planned, phase):
-            key = (_where(planned), law, *_seen_from_above(r))
+            key = (_place_in_words(planned), law, *_seen_from_above(r))
             if key in seen:
                 continue
             seen.add(key)
             loops = formation_loops(r, edges, mission.agents.mass, law, lags)
             size = sum(len(loop.S[0]) ** 3 for loop in loops)
-            if work + size > _WORK and found:
+            if work + size > _WORK and laws:
                 skipped = True
                 continue
             work += size
-            found.append(Looped(_where(planned), loops, law, growth))
-    return found, skipped
+            laws.append(ClosedLoops(_place_in_words(planned), loops, law, growth))
+    return laws, skipped
 
 
 def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGains:
@@ -133,13 +135,13 @@ def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGai
     )
 
 
-def _changes(planned: PlannedPhase) -> bool:
+def _changes_shape(planned: PlannedPhase) -> bool:
     return planned.path_ends is not None and planned.shapes[0] != planned.shapes[1]
 
 
-def _where(planned: PlannedPhase) -> str:
+def _place_in_words(planned: PlannedPhase) -> str:
     before, after = planned.shapes
-    if not _changes(planned):
+    if not _changes_shape(planned):
         return f"'{after}'"
     return f"on the way to '{after}'" if before is None else f"'{before}' to '{after}'"
 
@@ -166,7 +168,7 @@ def _seen_from_above(r: Floats) -> tuple[bytes, bytes]:
     return first, second
 
 
-def _worse(
+def _smaller_margins(
     known: FormationMargins | None, loops: Sequence[Loop], law: LoopGains, growth: float
 ) -> FormationMargins:
     """The smaller margins of those ``known`` and those of a further shape."""
@@ -184,33 +186,33 @@ def _worse(
     return FormationMargins(worst, pole)
 
 
-def margin_remarks(found: Preflight) -> Iterator[Remark]:
+def margin_remarks(preflight: Preflight) -> Iterator[Remark]:
     """Remarks on loops that lag and delay make unstable, or that have small margins."""
-    if found.margins is None:
+    if preflight.margins is None:
         return
-    tracking, formations = found.margins.tracking, found.margins.formations
-    if tracking is not None and _little(tracking):
-        yield _judged("tracking", tracking, "lower tracking.Q")
+    tracking, formations = preflight.margins.tracking, preflight.margins.formations
+    if tracking is not None and _is_small(tracking):
+        yield _margin_remark("tracking", tracking, "lower tracking.Q")
     # Where the tracking alone is unstable, no constraint law is to blame.
-    bad = {where: f for where, f in formations.items() if _little(f.margins)}
+    bad = {where: f for where, f in formations.items() if _is_small(f.margins)}
     if bad and (tracking is None or tracking.stable):
         worst = min(bad.values(), key=lambda f: (f.margins.stable, f.margins.phase))
-        if found.gains.stabilised:
+        if preflight.gains.stabilised:
             pole = min(f.largest_pole for f in bad.values())
             remedy = f"a triple pole of the constraint law is stable up to p = {pole:.3g} /s"
         else:
             remedy = "lower the gains"
-        yield _judged(f"constraint law ({', '.join(bad)})", worst.margins, remedy)
-    if found.margins.skipped:
+        yield _margin_remark(f"constraint law ({', '.join(bad)})", worst.margins, remedy)
+    if preflight.margins.skipped:
         text = "to limit the time of the check, margins leave some shapes out"
         yield Remark("note", "margins", text)
 
 
-def _little(m: Margins) -> bool:
+def _is_small(m: Margins) -> bool:
     return not m.stable or m.phase < _PHASE or m.gain[1] < _GAIN
 
 
-def _judged(what: str, m: Margins, remedy: str) -> Remark:
+def _margin_remark(what: str, m: Margins, remedy: str) -> Remark:
     if not m.stable:
         text = f"{what}: unstable with the vehicles' lag and delay; {remedy}"
         return Remark("fails", "margins", text)

@@ -9,8 +9,8 @@ import numpy as np
 
 from rigidfleet.mission import Box, Ground, Mission, Obstacle
 from rigidfleet.planning.clearance import CLOSE, closest, pace
-from rigidfleet.preflight.avoidance import evades
-from rigidfleet.preflight.findings import Preflight, Remark, some
+from rigidfleet.preflight.avoidance import is_left_to_avoidance
+from rigidfleet.preflight.findings import Preflight, Remark, names_in_words
 from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats
 
@@ -24,16 +24,19 @@ _PASSED = 100_000_000
 _NEAREST = 20
 
 
-def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on hit obstacles. Clearances of many obstacles are computed for the near ones only."""
-    radius, way = mission.fleet.radius, found.planned_phases
+    radius, way = mission.fleet.radius, preflight.planned_phases
     if not (mission.obstacles and way):
         return
     # Bounding box of each phase, and a lower bound (L, B) of its distance to each obstacle.
     within = np.array(
         [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
-    far = np.stack([_beyond(within, thing) for thing in mission.obstacles], axis=1) - radius.max()
+    far = (
+        np.stack([_distance_bound(within, thing) for thing in mission.obstacles], axis=1)
+        - radius.max()
+    )
     held, met, skipped = 0, 0, []
     unproved: dict[int, float] = {}
     paces = [pace(planned) for planned in way]
@@ -68,32 +71,32 @@ def obstacle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
                 verb = "hits" if exact else "may hit"
                 text = f"agent {i + 1} {verb} '{thing.name}' at {t:.2f} s in '{phase}'"
                 if isinstance(thing, Ground):
-                    text += _too_low(mission, found, phase, thing.height)
-                evaded = thing.solid.moves and evades(mission, "obstacle")
+                    text += _too_low(mission, preflight, phase, thing.height)
+                evaded = thing.solid.moves and is_left_to_avoidance(mission, "obstacle")
                 if evaded:
                     text += " as planned; [avoidance] has to evade it"
                 remark = Remark("fails" if exact and not evaded else "note", "obstacle", text)
                 remarks.setdefault(b, []).append(remark)
     for b in sorted(shown):
         clearance, t, i, _ = shown[b]
-        found.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
+        preflight.clearance.append((mission.obstacles[b].name, clearance, t, f"agent {i + 1}"))
     for b in sorted(remarks):
         yield from remarks[b]
     if unproved:
         names = [mission.obstacles[b].name for b in sorted(unproved)]
         text = (
-            f"to limit the time of the check, the clearance told of {some(names)} proved to"
+            f"to limit the time of the check, the clearance told of {names_in_words(names)} proved to"
             f" {max(unproved.values()):.2g} m only"
         )
         yield Remark("note", "obstacle", text)
     if skipped:
         names = [mission.obstacles[b].name for b in sorted(skipped)]
-        text = f"to limit the time of the check, {some(names)} skipped"
+        text = f"to limit the time of the check, {names_in_words(names)} skipped"
         yield Remark("note", "obstacle", text)
-    yield from _gaps(mission, found, radius)
+    yield from _gaps(mission, preflight, radius)
 
 
-def _beyond(within: Floats, thing: Obstacle) -> Floats:
+def _distance_bound(within: Floats, thing: Obstacle) -> Floats:
     """Lower bound (L,) [m] of the distance of boxes (L, 2, 3), given by lowest and highest corner, to an obstacle.
 
     Minus infinity where a box overlaps the obstacle's extent: how deep it reaches into the obstacle is not known.
@@ -103,9 +106,9 @@ def _beyond(within: Floats, thing: Obstacle) -> Floats:
     return np.where(apart.any(axis=1), np.linalg.norm(apart, axis=1), -np.inf)
 
 
-def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> str:
+def _too_low(mission: Mission, preflight: Preflight, phase: str, ground: float) -> str:
     """Why a vehicle touches the ground [m] in a phase, and the altitude that its formation needs."""
-    planned = next(planned for planned in found.planned_phases if planned.phase == phase)
+    planned = next(planned for planned in preflight.planned_phases if planned.phase == phase)
     masses, radius = mission.fleet.mass, mission.fleet.radius
     z = planned.position[..., 2]
     cm = z @ masses / masses.sum()
@@ -119,7 +122,7 @@ def _too_low(mission: Mission, found: Preflight, phase: str, ground: float) -> s
     )
 
 
-def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark]:
+def _gaps(mission: Mission, preflight: Preflight, radius: Floats) -> Iterator[Remark]:
     """Remarks on gaps between two boxes along the axes, at rest, through which the centre of mass passes.
 
     A gap lies between the nearest boxes on both sides of the centre of mass along an axis.
@@ -131,7 +134,7 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
     low, high = np.array([box.min for box in boxes]), np.array([box.max for box in boxes])
     least: dict[tuple[int, int, int], tuple[float, float, str]] = {}
     looked, to = 0, math.inf
-    for planned in found.planned_phases:
+    for planned in preflight.planned_phases:
         looked += len(planned.time) * len(boxes)
         if looked > _PASSED:
             to = float(planned.time[0])
@@ -158,7 +161,7 @@ def _gaps(mission: Mission, found: Preflight, radius: Floats) -> Iterator[Remark
     for (one, two, axis), (takes, t, phase) in sorted(least.items()):
         between = f"'{boxes[one].name}' and '{boxes[two].name}'"
         wide = float(low[two, axis] - high[one, axis])
-        found.gaps.append((between, wide, takes, t))
+        preflight.gaps.append((between, wide, takes, t))
         if takes > wide:
             text = (
                 f"the gap between {between} is {wide:.2f} m wide, but the formation needs {takes:.2f} m"

@@ -20,7 +20,7 @@ from rigidfleet.math.margins import shares
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import air_force, jets
-from rigidfleet.preflight.avoidance import evades
+from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.margins import feedback
 from rigidfleet.preflight.obstacles import obstacle_remarks
@@ -42,7 +42,7 @@ def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     """Offsets (K, N, 3) [m] of the vehicles from their slots in each planned phase; zeros where none are tracked."""
     tracked = [planned.leg.phase.control == "tracking" for planned in way]
     pushes = [
-        _pushed(mission, planned) if one else np.zeros_like(planned.position)
+        _unknown_accelerations(mission, planned) if one else np.zeros_like(planned.position)
         for planned, one in zip(way, tracked, strict=True)
     ]
     if not any(pushed.any() for pushed in pushes):
@@ -54,22 +54,22 @@ def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     laws[:, 0, 1] = laws[:, 1, 2] = laws[:, 2, 3] = 1.0
     laws[0, 2, :3] = -law.ki, -law.k1, -law.k2
     laws[1, 2, :3] = -law.gamma, -(law.beta**2), -2.0 * law.alpha
-    now, found = np.zeros((2, 3, 3 * mission.n_agents)), []
+    now, by_phase = np.zeros((2, 3, 3 * mission.n_agents)), []
     for planned, pushed, one in zip(way, pushes, tracked, strict=True):
         if not one:
             now = np.zeros_like(now)
-            found.append(pushed)
+            by_phase.append(pushed)
             continue
         flat, steps = pushed.reshape(len(pushed), -1), expm(laws * np.diff(planned.time[:2])[0])
         answers = np.empty((len(flat), 2, flat.shape[1]))
         for k, push in enumerate(flat):
             answers[k] = now[:, 1]
             now = steps[:, :3, :3] @ now + steps[:, :3, 3:] * push
-        found.append(_held(mission, planned, pushed, answers))
-    return found
+        by_phase.append(_offsets_with_edges(mission, planned, pushed, answers))
+    return by_phase
 
 
-def _pushed(mission: Mission, planned: PlannedPhase) -> Floats:
+def _unknown_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
     """Acceleration (K, N, 3) [m/s^2] by forces that no law knows."""
     d, v, mass = mission.disturbances, planned.velocity, mission.fleet.mass[:, None]
     up = np.array([0.0, 0.0, 1.0])
@@ -84,7 +84,9 @@ def _pushed(mission: Mission, planned: PlannedPhase) -> Floats:
     return force / mass
 
 
-def _held(mission: Mission, planned: PlannedPhase, pushed: Floats, answers: Floats) -> Floats:
+def _offsets_with_edges(
+    mission: Mission, planned: PlannedPhase, pushed: Floats, answers: Floats
+) -> Floats:
     """Offsets (K, N, 3) of the tracking (K, 0, 3N), but of the constraint law (K, 1, 3N) in what edges hold."""
     free = answers[:, 0].reshape(pushed.shape)
     name, masses = planned.leg.after.formation, mission.fleet.mass
@@ -102,41 +104,41 @@ def _held(mission: Mission, planned: PlannedPhase, pushed: Floats, answers: Floa
     return free
 
 
-def offset_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def offset_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on limits that steady offsets break: the flight will fail if nine tenths of an offset do.
 
     Where all of it does, a note. Limits that the plan itself breaks are told elsewhere. Gusts of two standard
     deviations may make up for an offset.
     """
-    told: dict[tuple[str, bool], Remark] = {}
-    gusts = 0.0 if found.disturbed is None else found.disturbed.gusts
+    remarks: dict[tuple[str, bool], Remark] = {}
+    gusts = 0.0 if preflight.disturbed is None else preflight.disturbed.gusts
     gusts *= 2.0 / 3.0 / (mission.tracking_gains[0] * float(mission.fleet.mass.min()))
-    way = found.planned_phases
+    way = preflight.planned_phases
     for planned, off in zip(way, offsets(mission, way), strict=True):
         far = float(np.linalg.norm(off, axis=2).max())
         if planned.leg.end > mission.first_loss or far < _LEAST:
             continue
-        broken = partial(_broken, mission, found, planned)
+        broken = partial(_broken_limits, mission, preflight, planned)
         if not (now := broken(off)):
             continue
         own, surely = broken(0.0 * off), broken(max(0.0, _SURE - gusts / far) * off)
         for topic in (topic for topic in now if topic not in own):
-            evaded = evades(mission, topic, mission.limits.separation or 0.0)
+            evaded = is_left_to_avoidance(mission, topic, mission.limits.separation or 0.0)
             fails = planned.exact and topic in surely and not evaded
             text = f"steady disturbances push vehicles up to {far:.2g} m off their slots in '{planned.phase}'"
             remark = Remark("fails" if fails else "note", topic, f"{text}: {now[topic]}")
-            told.setdefault((topic, fails), remark)
-    yield from told.values()
+            remarks.setdefault((topic, fails), remark)
+    yield from remarks.values()
 
 
-def _broken(
-    mission: Mission, found: Preflight, planned: PlannedPhase, off: Floats
+def _broken_limits(
+    mission: Mission, preflight: Preflight, planned: PlannedPhase, off: Floats
 ) -> dict[str, str]:
     """Topic and words of the limits that a planned phase breaks with offsets (K, N, 3) [m]."""
     leg, phase, limits = planned.leg, planned.leg.phase, mission.limits
     masses, r, far = mission.fleet.mass, planned.position + off, np.linalg.norm(off, axis=2)
     moved = [replace(planned, position=r, path_ends=None)]
-    there = Preflight(mission, found.formations, found.gains, moved)
+    there = Preflight(mission, preflight.formations, preflight.gains, moved)
     remarks = [*separation_remarks(mission, there), *downwash_remarks(mission, there)]
     remarks += geofence_remarks(mission, there.planned_phases[0])
     if not phase.lands:  # that ends where vehicles stand
@@ -169,7 +171,7 @@ def _broken(
         turn = rigid_body.kabsch(r[k], planned.position[k], masses, near=np.eye(3))
         by = float(np.degrees(np.linalg.norm(att.rotation_vector_from_dcm(turn))))
         held.append(("attitude", "", by, WAYPOINT_TOLERANCE["attitude"]))
-    last, name = planned is found.planned_phases[-1], leg.after.formation
+    last, name = planned is preflight.planned_phases[-1], leg.after.formation
     if name and (phase.shaping is not None or last) and 1 < len(masses) <= STACKED:
         # To first order: a turn of the whole changes no distance.
         i, j = proximity.all_pairs(len(masses))

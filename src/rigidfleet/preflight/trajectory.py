@@ -23,7 +23,7 @@ from rigidfleet.planning.limits import limits_of
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.reference import pose_at
 from rigidfleet.planning.vehicles import air_force
-from rigidfleet.preflight.avoidance import evades
+from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, SLACK, Disturbed, Preflight, Remark
 from rigidfleet.rigidity import jacobian
 from rigidfleet.typing import Floats
@@ -32,7 +32,7 @@ from rigidfleet.typing import Floats
 _CLEARLY = 0.02
 
 
-def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the minimum separation, and on each change of formation in which paths cross."""
     if mission.n_agents < 2:
         return
@@ -40,7 +40,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     lowest = mission.limits.separation_altitude
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
     least = np.inf, 0.0, (0, 0)
-    for number, planned in enumerate(found.planned_phases):
+    for number, planned in enumerate(preflight.planned_phases):
         ends: list[tuple[float, float, tuple[int, ...]]] = []
         positions = planned.position if planned.path_ends is None else np.array(planned.path_ends)
         # Where separation begins at an altitude, agents below it are left to the verdict.
@@ -59,7 +59,7 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             least = min(least, crossing)
             beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
             if beyond and separation < min(ends)[0] - SLACK:
-                yield _crossing(mission, planned, crossing, limit)
+                yield _crossing_remark(mission, planned, crossing, limit)
         for k, at in enumerate(ends):
             least = min(least, at)
             # The start positions are known even if the path from there is not.
@@ -67,23 +67,23 @@ def separation_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             if exact not in worst or at[0] < worst[exact][0]:
                 worst[exact] = *at, planned.phase
     if np.isfinite(least[0]):
-        found.separation = least[0], least[1], agent_names(least[2])
+        preflight.separation = least[0], least[1], agent_names(least[2])
     for exact, (separation, t, who, phase) in worst.items():
         if separation <= 0 or separation < limit - SLACK:
-            text = _near(who, separation, t, phase, limit, exact=exact)
-            yield _collision(mission, text, limit, exact=exact)
+            text = _nearness_in_words(who, separation, t, phase, limit, exact=exact)
+            yield _collision_remark(mission, text, limit, exact=exact)
 
 
-def _collision(mission: Mission, text: str, limit: float, *, exact: bool) -> Remark:
+def _collision_remark(mission: Mission, text: str, limit: float, *, exact: bool) -> Remark:
     """Remark on planned paths that come too close, which is a note where the guard of [avoidance] keeps the limit."""
     if not exact:
         text += "; straight paths are assumed, as only distances guide the agents"
-    elif evades(mission, "collision", limit):
+    elif is_left_to_avoidance(mission, "collision", limit):
         text, exact = f"{text}. So it is planned; [avoidance] has to keep them apart", False
     return Remark("fails" if exact else "note", "collision", text)
 
 
-def _near(
+def _nearness_in_words(
     who: tuple[int, ...], separation: float, t: float, phase: str, limit: float, *, exact: bool
 ) -> str:
     if separation <= 0:
@@ -91,7 +91,7 @@ def _near(
     return f"{agent_names(who)} have a separation of {separation:.2f} m at {t:.2f} s in '{phase}' (limit {limit:g} m)"
 
 
-def _crossing(
+def _crossing_remark(
     mission: Mission,
     planned: PlannedPhase,
     at: tuple[float, float, tuple[int, ...]],
@@ -102,7 +102,7 @@ def _crossing(
     needed = sum(mission.agents.radius[i] for i in who) + limit
     origin = "the start" if before is None else f"'{before}'"
     text = (
-        f"{_near(who, separation, t, planned.phase, limit, exact=planned.exact)}: their paths from"
+        f"{_nearness_in_words(who, separation, t, planned.phase, limit, exact=planned.exact)}: their paths from"
         f" {origin} to '{after}' cross with {max(0.0, separation + needed - limit):.2f} m from centre to centre. "
     )
     assert after is not None  # the phase changes the formation
@@ -116,14 +116,14 @@ def _crossing(
         text += 'Assign agents to near slots: assignment = "each"'
     if not promised and apart < math.sqrt(2) * needed:
         text += f"; and {spaced}"
-    return _collision(mission, text, limit, exact=planned.exact)
+    return _collision_remark(mission, text, limit, exact=planned.exact)
 
 
-def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on vehicles in the downwash of another one."""
     radius, limit = mission.fleet.radius, mission.limits.separation_below
     worst: dict[bool, tuple[float, float, tuple[int, ...], str]] = {}
-    for planned in found.planned_phases:
+    for planned in preflight.planned_phases:
         height, pair = proximity.headroom(planned.position, radius)
         k = int(height.argmin())
         if height[k] < worst.get(planned.exact, (np.inf,))[0]:
@@ -143,20 +143,20 @@ def downwash_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             yield Remark("fails" if exact else "note", "downwash", text)
 
 
-def thrust_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def thrust_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on planned thrust beyond a limit."""
     masses, limits = mission.fleet.mass, mission.fleet.thrust_limit
-    weight, way = np.array([0.0, 0.0, mission.gravity]), found.planned_phases
+    weight, way = np.array([0.0, 0.0, mission.gravity]), preflight.planned_phases
     if way:
         needs = [masses * np.linalg.norm(planned.acceleration + weight, axis=2) for planned in way]
-        found.thrust, planned = _nearest_to_limit(way, needs, limits)
-        force, t, who, limit = found.thrust
+        preflight.thrust, planned = _nearest_to_limit(way, needs, limits)
+        force, t, who, limit = preflight.thrust
         smooth = mission.smooth and planned.exact  # judged with the other limits of the plan
         if force > limit * (1 + 1e-3) and not smooth:
             text = f"{who} needs {force:.1f} N at {t:.2f} s in '{planned.phase}'"
             text += f" (limit {limit:g} N)"
             yield Remark("fails" if planned.exact else "note", "thrust", text)
-    yield from _step_thrust(mission, found)
+    yield from _step_thrust(mission, preflight)
 
 
 def _nearest_to_limit(
@@ -181,10 +181,10 @@ def greatest_speed(way: list[PlannedPhase], axes: slice) -> tuple[float, float, 
     return speed, t, who
 
 
-def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def disturbance_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the effects of wind, gusts, noise and mass errors that follow from the planned paths."""
     d = mission.disturbances
-    if d is None or not found.planned_phases:
+    if d is None or not preflight.planned_phases:
         return
     believed, true, drag = mission.fleet.mass, mission.true_mass, mission.drag
     wind, up = np.array(d.wind), np.array([0.0, 0.0, 1.0])
@@ -196,11 +196,11 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
     if d.noise is not None:
         noise = 3 * believed * math.hypot(k1 * d.noise.position, k2 * d.noise.velocity)
     needs = []
-    for planned in found.planned_phases:
+    for planned in preflight.planned_phases:
         force = true[:, None] * (planned.acceleration + g * up)
         force -= drag[:, None] * (wind - planned.velocity)
         needs.append(np.linalg.norm(force, axis=2) + gusts + noise)
-    most, _ = _nearest_to_limit(found.planned_phases, needs, mission.fleet.thrust_limit)
+    most, _ = _nearest_to_limit(preflight.planned_phases, needs, mission.fleet.thrust_limit)
     steady = air_force(mission, np.tile(wind, (len(drag), 1)))
     steady -= ((true - believed) * g)[:, None] * up
     off = np.linalg.norm(steady, axis=1) / (k1 * believed)
@@ -208,7 +208,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         off[:] = 0.0  # in the end
     far = int(off.argmax())
     lost = tuple((lost.agent - 1, lost.time) for lost in d.lost)
-    found.disturbed = Disturbed(
+    preflight.disturbed = Disturbed(
         float((drag * speed).max()), float(gusts.max()), float((np.abs(true - believed) * g).max()),
         float(noise.max()), most, (float(off[far]), f"agent {far + 1}"), lost,
     )  # fmt: skip
@@ -231,7 +231,7 @@ def disturbance_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
         yield Remark("note", "disturbances", text)
 
 
-def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def _step_thrust(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on the forces at a step of the reference: J M^-1 J^T lambda = -beta^2 c."""
     c, masses = mission.constraint, mission.fleet.mass
     if c.stabilisation == "none":
@@ -239,7 +239,7 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
     limits = mission.fleet.thrust_limit
     starts = [
         mission.fleet.position,
-        *(planned.position[-1] for planned in found.planned_phases),
+        *(planned.position[-1] for planned in preflight.planned_phases),
     ]
     for phase, r in zip(mission.phases, starts, strict=False):
         shaping = phase.shaping
@@ -265,11 +265,11 @@ def _step_thrust(mission: Mission, found: Preflight) -> Iterator[Remark]:
             yield Remark("fails" if c.solver in ("exact", "pinv") else "note", "thrust", text)
 
 
-def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on goals that the body misses even without errors of control: its regulator has too little time."""
     masses = mission.fleet.mass
     begun = True  # whether the phase begins when and where it is planned
-    for planned in found.planned_phases:
+    for planned in preflight.planned_phases:
         leg = planned.leg
         phase, goal, exact = leg.phase, leg.after.goal, begun
         begun = begun and phase.settle is None
@@ -294,10 +294,10 @@ def waypoint_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
             }
         for what, off in meets.items():
             if off > (1.0 + _CLEARLY) * WAYPOINT_TOLERANCE[what]:
-                yield _missed(mission, planned, what, off, exact=exact)
+                yield _miss_remark(mission, planned, what, off, exact=exact)
 
 
-def _missed(
+def _miss_remark(
     mission: Mission, planned: PlannedPhase, what: str, off: float, *, exact: bool
 ) -> Remark:
     """Remark on a goal that is missed by this much in position, velocity, attitude or rates."""
@@ -317,15 +317,15 @@ def _missed(
     )
 
 
-def limit_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on speed, acceleration and geofence beyond their limits."""
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
-    for planned in found.planned_phases:
+    for planned in preflight.planned_phases:
         phase = planned.leg.phase
         if (mission.smooth or phase.led) and phase.control == "tracking":
-            yield from _broken(mission, planned, hopeless)
+            yield from _limits_of_reference(mission, planned, hopeless)
         else:
-            yield from _sampled(mission, planned)
+            yield from _limits_at_samples(mission, planned)
         yield from geofence_remarks(mission, planned)
 
 
@@ -341,23 +341,27 @@ def geofence_remarks(mission: Mission, planned: PlannedPhase) -> Iterator[Remark
             yield Remark("fails" if planned.exact else "note", "geofence", text)
 
 
-def _broken(mission: Mission, planned: PlannedPhase, hopeless: set[str]) -> Iterator[Remark]:
+def _limits_of_reference(
+    mission: Mission, planned: PlannedPhase, hopeless: set[str]
+) -> Iterator[Remark]:
     """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
     over = timing.broken(mission, planned.leg)
-    if not over or over[0].limit.of.called in hopeless:
+    if not over or over[0].limit.of.name_in_words in hopeless:
         return
     key, least = timing.least_time(mission, planned.leg)
     if least is None:
         remedy = f"no {key} of this phase keeps all limits"
-        hopeless.add(over[0].limit.of.called)
+        hopeless.add(over[0].limit.of.name_in_words)
     else:
         remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
     yield Remark(
-        "fails", over[0].limit.of.called, f"{timing.said(over[0], planned.leg.phase)}; {remedy}"
+        "fails",
+        over[0].limit.of.name_in_words,
+        f"{timing.said(over[0], planned.leg.phase)}; {remedy}",
     )
 
 
-def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
+def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
     """Remarks on speed and acceleration of samples beyond their limits."""
     x = np.stack([planned.position, planned.velocity, planned.acceleration], axis=1)
     for limit in limits_of(mission):
@@ -365,11 +369,11 @@ def _sampled(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:
         if q not in MOTIONS or q.order > 2:
             continue
         size = limit.values(x, np.arange(mission.n_agents))
-        of = f" of {q.called}" if q.way else ""
+        of = f" of {q.name_in_words}" if q.way else ""
         k, i = np.unravel_index(int(size.argmax()), size.shape)
         if size[k, i] > most * (1 + 1e-3):
             text = (
                 f"agent {i + 1} reaches {size[k, i]:.3g} {q.unit}{of} at {planned.time[k]:.2f} s in"
                 f" '{planned.phase}' (limit {most:g} {q.unit})"
             )
-            yield Remark("fails" if planned.exact else "note", q.called, text)
+            yield Remark("fails" if planned.exact else "note", q.name_in_words, text)

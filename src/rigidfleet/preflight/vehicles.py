@@ -48,26 +48,28 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     tracked = [planned for planned in way if planned.leg.phase.control == "tracking"]
     if models is None or not tracked or all(model.point for model in models):
         return None
-    asked, angle, found = asked_yaw(mission), first_yaw(mission), []
+    setting, angle, needs = asked_yaw(mission), first_yaw(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
         time = np.linspace(leg.start, leg.end, max(11, min(count, _PLACES // n)))
-        turn = turn_along(leg.reference, leg.motion, leg.start, asked, angle)
-        slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, asked, turn)
+        turn = turn_along(leg.reference, leg.motion, leg.start, setting, angle)
+        slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, setting, turn)
         angle, yaw = turned[0, :, -1], turned.transpose(2, 0, 1)
         x = series.derivatives(slots).transpose(3, 0, 2, 1)
         for i, model in enumerate(models):
             if not model.point:
-                need = _needed(model, x[:, :, i], yaw[:, :, i], mission.gravity)
-                found.append(_asked(model, need, time, f"agent {i + 1}", planned.phase))
-    force = max((asks.force for asks in found), key=lambda force: force[0] / force[3])
-    tilt = max((asks.tilt for asks in found), key=lambda tilt: tilt[0])
-    beyond = max((asks.beyond for asks in found), key=lambda beyond: beyond[0])
-    return VehicleCheck(force, tilt, _jump(mission, tracked), beyond if beyond[0] > 0.0 else None)
+                need = _needs_of_path(model, x[:, :, i], yaw[:, :, i], mission.gravity)
+                needs.append(_needs_of_phase(model, need, time, f"agent {i + 1}", planned.phase))
+    force = max((asks.force for asks in needs), key=lambda force: force[0] / force[3])
+    tilt = max((asks.tilt for asks in needs), key=lambda tilt: tilt[0])
+    beyond = max((asks.beyond for asks in needs), key=lambda beyond: beyond[0])
+    return VehicleCheck(
+        force, tilt, _greatest_jump(mission, tracked), beyond if beyond[0] > 0.0 else None
+    )
 
 
-class _Asks(NamedTuple):
+class _Needs(NamedTuple):
     """What a phase asks of one vehicle, as in `VehicleCheck`."""
 
     force: tuple[float, float, str, float, str]
@@ -75,7 +77,7 @@ class _Asks(NamedTuple):
     beyond: tuple[float, str, str, str]
 
 
-def _asked(model: VehicleModel, need: Flat, time: Floats, who: str, phase: str) -> _Asks:
+def _needs_of_phase(model: VehicleModel, need: Flat, time: Floats, who: str, phase: str) -> _Needs:
     rotor = need.rotor_forces(
         np.array(model.inertia),
         mixing(model.arm, model.torque_coefficient / model.thrust_coefficient),
@@ -91,14 +93,14 @@ def _asked(model: VehicleModel, need: Flat, time: Floats, who: str, phase: str) 
         if aslant.sum() > weak.sum()
         else f"rotor forces of {rotor.min():.3g} to {rotor.max():.3g} N (rotors give {least:.3g} to {most:.3g} N)"
     )
-    return _Asks(
+    return _Needs(
         (float(rotor[k].max()), float(time[k]), who, most, phase),
         (float(tilt[j]), float(time[j]), who, phase),
         (float((weak | aslant).mean()), who, phase, needs),
     )
 
 
-def _needed(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Flat:
+def _needs_of_path(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Flat:
     """What a path (K, 5, 3) asks of a vehicle: the force of m (a + g) and of drag, and its derivatives."""
     force = model.mass * x[:, 2:] + np.array(model.linear_drag) * x[:, 1:4]
     speed = np.linalg.norm(x[:, 1], axis=1)[:, None]
@@ -107,7 +109,9 @@ def _needed(model: VehicleModel, x: Floats, yaw: Floats, g: float) -> Flat:
     return flat(force, yaw)
 
 
-def _jump(mission: Mission, way: Sequence[PlannedPhase]) -> tuple[float, float, float, str] | None:
+def _greatest_jump(
+    mission: Mission, way: Sequence[PlannedPhase]
+) -> tuple[float, float, float, str] | None:
     """The greatest jump of the reference's acceleration [m/s^2], of the tilt [deg], its time [s], and the phase."""
     worst = None
     for before, after in pairwise(way):
@@ -128,30 +132,30 @@ def _jump(mission: Mission, way: Sequence[PlannedPhase]) -> tuple[float, float, 
     return worst
 
 
-def vehicle_remarks(mission: Mission, found: Preflight) -> Iterator[Remark]:
+def vehicle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on rotors that the plan asks too much of, on jumps, and on vehicles in the jets of others."""
-    if found.vehicles is None:
+    if preflight.vehicles is None:
         return
-    exact = {planned.phase for planned in found.planned_phases if planned.exact}
-    if found.vehicles.beyond is not None:
-        share, who, phase, need = found.vehicles.beyond
+    exact = {planned.phase for planned in preflight.planned_phases if planned.exact}
+    if preflight.vehicles.beyond is not None:
+        share, who, phase, need = preflight.vehicles.beyond
         fails = share > mission.limits.saturation and phase in exact
         text = (
             f"{who} cannot give what the plan asks of it for {percent(share)} of phase '{phase}', which needs {need};"
             " give the phase more time, the vehicle less mass, or another yaw"
         )
         yield Remark("fails" if fails else "note", "rotors", text)
-    jump = found.vehicles.jump
+    jump = preflight.vehicles.jump
     if jump is not None and jump[0] > _JUMP:
         text = (
             f"the reference's acceleration jumps by {jump[0]:.2f} m/s^2 ({jump[1]:.1f} deg of tilt) at {jump[2]:.2f} s,"
             f" where '{jump[3]}' begins; no vehicle follows a jump. Use smoothness = 'jerk'"
         )
         yield Remark("note", "jumps", text)
-    yield from _jets(mission, found.planned_phases)
+    yield from _jet_remarks(mission, preflight.planned_phases)
 
 
-def _jets(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
+def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
     """Remark on the vehicle that another one's jet pushes down the most, as a share of its weight."""
     models = mission.vehicle_models
     assert models is not None

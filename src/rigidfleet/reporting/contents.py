@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet import plotting
-from rigidfleet._common.facts import Cell, Level, Row, Table, value
-from rigidfleet._common.quantities import QUANTITIES, quantity, shown
+from rigidfleet._common.facts import Cell, FactTable, Level, Row, value
+from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
@@ -52,44 +52,44 @@ def contents(
     """
     if not flights:
         raise ValueError("a report needs a result")
-    names = list(labels) if labels is not None else _named(flights)
+    names = list(labels) if labels is not None else _names_of(flights)
     judged = list(verdicts) if verdicts is not None else [assess(flight) for flight in flights]
     if not len(names) == len(judged) == len(flights):
         raise ValueError(f"{len(flights)} results need as many labels and verdicts")
     missions = [flight.mission for flight in flights]
     several = len(flights) > 1
     colours = plotting.agent_colours(len(flights))
-    found = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
+    pages = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
-    controlled = any(each["gains"] is not None and each["gains"].rows for each in found)
+    controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
     response = overlay.response(missions, names) if controlled else None
     return {
         "title": " · ".join(names),
         "several": several,
-        "flights": found,
+        "flights": pages,
         "figures": [] if several else _figures(flights[0]),
         "passed": all(verdict.passed for verdict in judged),
         "safety": _safety_table(flights, judged, names),
-        "numbers": _numbers(flights, judged, names) if several else None,
-        "keys": _keys(missions, names) if several else None,
+        "numbers": _numbers_table(flights, judged, names) if several else None,
+        "keys": _keys_table(missions, names) if several else None,
         "overlays": _overlays(flights, names) if several else [],
         "controlled": controlled,
-        "response": None if response is None else _embedded(response),
+        "response": None if response is None else _data_url(response),
         "version": __version__,
         "covers": _covers(flights),
     }
 
 
-def _named(flights: Sequence[Result]) -> list[str]:
+def _names_of(flights: Sequence[Result]) -> list[str]:
     """Names of the missions, numbered if a name occurs twice."""
     names = [flight.mission.name for flight in flights]
     count = Counter(names)
     seen: Counter[str] = Counter()
-    found = []
+    numbered = []
     for name in names:
         seen[name] += 1
-        found.append(f"{name} ({seen[name]})" if count[name] > 1 else name)
-    return found
+        numbered.append(f"{name} ({seen[name]})" if count[name] > 1 else name)
+    return numbered
 
 
 # -- one flight --------------------------------------------------------------------------------------
@@ -112,11 +112,11 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "facts": _facts(result),
         "phases": mission.phase_table,
-        "checks": [part for part in verdict.facts().shown if isinstance(part, Table)],
-        "vehicles": _vehicles(result),
+        "checks": [part for part in verdict.facts().shown if isinstance(part, FactTable)],
+        "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
-        "gains": _gains(result),
+        "gains": _gains_table(result),
         "versions": _versions(result),
         "text": result.mission_text,
     }
@@ -166,15 +166,15 @@ def _models(mission: Mission) -> str:
     return ": " * bool(count) + ", ".join(f"{n} × {name}" for name, n in count.items())
 
 
-def _gains(result: Result) -> Table | None:
+def _gains_table(result: Result) -> FactTable | None:
     """The gains in words; None of trajectories that others made, which have none."""
     if result.interpolation is not None:
         return None
     heads = ("gains", "value", "meaning")
-    return Table(heads, [*map(Row, gains.explained(result.mission))], heads, bare=True)
+    return FactTable(heads, [*map(Row, gains.gain_lines(result.mission))], heads, bare=True)
 
 
-def _vehicles(result: Result) -> Table:
+def _vehicles_table(result: Result) -> FactTable:
     """Extremes of each vehicle; if there are too many, of those with the greatest thrust."""
     n, mission = result.n_agents, result.mission
 
@@ -213,12 +213,12 @@ def _vehicles(result: Result) -> Table:
         Row((Cell(str(i + 1), colour=colours[i]), *(column[i] for column in columns.values())))
         for i in shown.tolist()
     ]
-    return Table(("agent", *columns), rows)
+    return FactTable(("agent", *columns), rows)
 
 
 def _versions(result: Result) -> list[tuple[str, str]]:
     known = result.statistics
-    found = [*result.versions.items(), ("platform", result.platform)]
+    rows = [*result.versions.items(), ("platform", result.platform)]
     for name, key, form in (
         ("integrator steps", "steps", "{}"),
         ("rejected steps", "rejected", "{}"),
@@ -227,8 +227,8 @@ def _versions(result: Result) -> list[tuple[str, str]]:
         ("computing time", "wall_s", "{:.3g} s"),
     ):
         if known.get(key) is not None:
-            found.append((name, form.format(known[key])))
-    return found
+            rows.append((name, form.format(known[key])))
+    return rows
 
 
 # -- safety table -----------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ def _versions(result: Result) -> list[tuple[str, str]]:
 
 def _safety_table(
     flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
-) -> Table:
+) -> FactTable:
     """A row for each quantity of any flight; beside the quantity, what is known of one flight, or a cell for each."""
     columns = [
         {row.quantity: row for row in safety(*each)} for each in zip(flights, verdicts, strict=True)
@@ -248,26 +248,26 @@ def _safety_table(
             for row in columns[0].values()
         ]
         heads = ("quantity", "limit", "worst", "margin", "when", "who")
-        return Table(heads, rows, ("margin", "when", "who"))
+        return FactTable(heads, rows, ("margin", "when", "who"))
     rows = [
         Row((cell, *(_safety_cell(name, column.get(name)) for column in columns)))
         for name, cell in names.items()
     ]
-    return Table(("quantity", *labels), rows, labels)
+    return FactTable(("quantity", *labels), rows, labels)
 
 
 def _level(row: Safety) -> Level:
     return "" if row.limit is None else "ok" if row.passed else "fails"
 
 
-def _nothing(name: str) -> str:
+def _words_for_nothing(name: str) -> str:
     return quantity(name.replace(" ", "_")).nothing or "nothing to measure"
 
 
 def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
     """Limit, worst value, margin, when and who."""
     if (worst := row.worst) is None:
-        return row.fact.bound, _nothing(row.quantity), "", "", ""
+        return row.fact.bound, _words_for_nothing(row.quantity), "", "", ""
     left = ""
     if row.margin is not None:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
@@ -279,7 +279,7 @@ def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
 def _safety_cell(name: str, row: Safety | None) -> Cell:
     """The worst value of one of several flights, with its limit, whom and when."""
     if row is None:
-        return Cell(_nothing(name))
+        return Cell(_words_for_nothing(name))
     limit, worst, _, when, who = _safety_cells(row)
     small = ", ".join(str(x) for x in (limit, who, getattr(when, "text", "")) if x)
     return Cell(str(worst), small, level=_level(row))
@@ -288,34 +288,34 @@ def _safety_cell(name: str, row: Safety | None) -> Cell:
 # -- what differs ------------------------------------------------------------------------------------
 
 
-def _numbers(
+def _numbers_table(
     flights: Sequence[Result], verdicts: Sequence[Verdict], labels: Sequence[str]
-) -> Table:
+) -> FactTable:
     """Numbers of the flights side by side, with how much they differ from those of the first."""
     measures: list[tuple[str, str, Callable[[Result, Verdict], float | None]]] = [
         ("length of the flight", "s", lambda r, _: float(r.time[-1])),
         ("failed checks", "", lambda _, v: float(sum(not f.passed for f in v.checks))),
-        ("greatest waypoint miss", "m", partial(_checked, "waypoint_position")),
-        ("mean thrust of a vehicle", "N", lambda r, _: _mean(r)),
-        *((q.text, shown(q.unit), partial(_checked, q.name)) for q in QUANTITIES.values()),
+        ("greatest waypoint miss", "m", partial(_worst_of, "waypoint_position")),
+        ("mean thrust of a vehicle", "N", lambda r, _: _mean_thrust(r)),
+        *((q.text, display_unit(q.unit), partial(_worst_of, q.name)) for q in QUANTITIES.values()),
     ]
     rows = []
     for name, unit, measure in measures:
-        found = [measure(*each) for each in zip(flights, verdicts, strict=True)]
-        if all(x is None for x in found):
+        values = [measure(*each) for each in zip(flights, verdicts, strict=True)]
+        if all(x is None for x in values):
             continue
-        cells = [Cell("–" if x is None else value(x), _change(found[0], x)) for x in found]
+        cells = [Cell("–" if x is None else value(x), _change(values[0], x)) for x in values]
         rows.append(Row((f"{name} [{unit}]" if unit else name, *cells)))
-    return Table(("quantity", *labels), rows)
+    return FactTable(("quantity", *labels), rows)
 
 
-def _checked(name: str, _: Result, verdict: Verdict) -> float | None:
+def _worst_of(name: str, _: Result, verdict: Verdict) -> float | None:
     """The worst value that a check found."""
     check = verdict.by_name.get(name)
     return None if check is None else check.worst
 
 
-def _mean(result: Result) -> float | None:
+def _mean_thrust(result: Result) -> float | None:
     """Mean thrust of a vehicle over time [N]."""
     mean = result.thrust.mean(axis=1)
     length = float(result.time[-1] - result.time[0])
@@ -324,7 +324,7 @@ def _mean(result: Result) -> float | None:
     return float(np.trapezoid(mean, result.time)) / length
 
 
-def _same(a: float | None, b: float | None) -> bool:
+def _are_close(a: float | None, b: float | None) -> bool:
     if a is None or b is None:
         return a is b
     return math.isclose(a, b, rel_tol=_SAME, abs_tol=1e-9)
@@ -332,7 +332,7 @@ def _same(a: float | None, b: float | None) -> bool:
 
 def _change(first: float | None, x: float | None) -> str:
     """Change of a number from that of the first flight, if it is meaningful."""
-    if first is None or x is None or _same(first, x) or abs(first) < 1e-6:
+    if first is None or x is None or _are_close(first, x) or abs(first) < 1e-6:
         return ""
     percent = 100 * (x - first) / abs(first)
     if abs(percent) >= 300:
@@ -340,9 +340,9 @@ def _change(first: float | None, x: float | None) -> str:
     return f"{percent:+.0f} %".replace("-", "−") if abs(percent) >= 0.5 else ""
 
 
-def _keys(missions: Sequence[Mission], labels: Sequence[str]) -> Table:
+def _keys_table(missions: Sequence[Mission], labels: Sequence[str]) -> FactTable:
     """Keys of the mission files that differ between missions."""
-    flat = [dict(_flat(mission.to_dict())) for mission in missions]
+    flat = [dict(_flat_keys(mission.to_dict())) for mission in missions]
     rows = []
     for key in dict.fromkeys(key for one in flat for key in one):
         values = [one.get(key, "not set") for one in flat]
@@ -351,17 +351,17 @@ def _keys(missions: Sequence[Mission], labels: Sequence[str]) -> Table:
     if len(rows) > _KEYS:
         more = Row((f"and {len(rows) - _KEYS} more keys", *["…"] * len(missions)))
         rows = [*rows[:_KEYS], more]
-    return Table(("key", *labels), rows, labels)
+    return FactTable(("key", *labels), rows, labels)
 
 
-def _flat(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
+def _flat_keys(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
     """Keys in the notation of messages (phases[2].until), and their values as text."""
     if isinstance(data, Mapping):
         for name, item in data.items():
-            yield from _flat(item, f"{key}.{name}" if key else str(name))
+            yield from _flat_keys(item, f"{key}.{name}" if key else str(name))
     elif isinstance(data, list) and data and all(isinstance(item, Mapping) for item in data):
         for number, item in enumerate(data, start=1):
-            yield from _flat(item, f"{key}[{number}]")
+            yield from _flat_keys(item, f"{key}[{number}]")
     else:
         yield key, str(data)
 
@@ -399,10 +399,10 @@ def _figure(result: Result, name: str) -> dict[str, str]:
 
 
 def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:
-    return {"name": name.replace("_", " "), "image": _embedded(svg), "caption": caption}
+    return {"name": name.replace("_", " "), "image": _data_url(svg), "caption": caption}
 
 
-def _embedded(svg: bytes) -> str:
+def _data_url(svg: bytes) -> str:
     # An image keeps its ids and styles to itself. Runs of spaces are preserved as drawn.
     svg = svg.replace(b"</style>", b" text{white-space:pre}</style>", 1)
     return f"data:image/svg+xml;base64,{b64encode(svg).decode()}"

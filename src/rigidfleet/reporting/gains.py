@@ -26,10 +26,10 @@ class GainLine(NamedTuple):
     meaning: str
 
 
-def explained(mission: Mission) -> list[GainLine]:
+def gain_lines(mission: Mission) -> list[GainLine]:
     """The gains of a mission, one by one."""
-    constraint = _constraint(mission) if len(mission.edges) else []
-    return [*constraint, *_tracking(mission), *_regulators(mission)]
+    constraint = _constraint_lines(mission) if len(mission.edges) else []
+    return [*constraint, *_tracking_lines(mission), *_regulator_lines(mission)]
 
 
 def response(mission: Mission, t: list[float]) -> list[float] | None:
@@ -40,26 +40,26 @@ def response(mission: Mission, t: list[float]) -> list[float] | None:
     return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
 
 
-def _constraint(mission: Mission) -> list[GainLine]:
+def _constraint_lines(mission: Mission) -> list[GainLine]:
     c = mission.constraint
-    found = []
+    lines = []
     if c.stabilisation == "none":
-        found.append(GainLine("constraint force", "no feedback", "distance errors remain and grow"))
+        lines.append(GainLine("constraint force", "no feedback", "distance errors remain and grow"))
     else:
         gain = f"α = {c.alpha:.4g} /s, β = {c.beta:.4g} /s, γ = {c.gamma:.4g} /s³"
         poles = ", ".join(_pole(s) for s in pid.poles(c.alpha, c.beta, c.gamma))
-        found += [
+        lines += [
             GainLine("constraint feedback", gain, "a distance error c obeys c‴ + 2α c″ + β² c′ + γ c = 0"),
             GainLine("poles of the error", f"{poles} /s", "all have negative real parts: every error decays"),
         ]  # fmt: skip
         if c.gamma > 0:
             margin = 2 * c.alpha * c.beta**2 / c.gamma
             meaning = f"errors decay until γ reaches {margin:.3g} times its value (2αβ² > γ)"
-            found.append(GainLine("stability margin", f"{margin:.3g}", meaning))
+            lines.append(GainLine("stability margin", f"{margin:.3g}", meaning))
         if (settled := c.settling_time) is not None:
             beyond = 100 * pid.overshoot(c.alpha, c.beta, c.gamma)
             why = "the integral must return to zero" if c.gamma > 0 else "there is no integral term"
-            found += [
+            lines += [
                 GainLine("settling", f"{settled:.3g} s", "time until an error stays below 2 %"),
                 GainLine(
                     "overshoot", f"{beyond:.3g} %", f"an error passes zero by this share: {why}"
@@ -72,12 +72,12 @@ def _constraint(mission: Mission) -> list[GainLine]:
         "pinv": f"cut-off at {c.cutoff:g} of the largest w",
     }[c.solver]
     value = f"{c.solver} ({setting})" if setting else c.solver
-    found.append(GainLine("solver", value, _SOLVERS[c.solver]))
+    lines.append(GainLine("solver", value, _SOLVERS[c.solver]))
     if any(phase.control != "tracking" for phase in mission.phases):
         rate = f"{c.deformation_damping:g} /s"
         meaning = "motions that change no distance decay at this rate while no slots are tracked"
-        found.append(GainLine("deformation damping", rate, meaning))
-    return found
+        lines.append(GainLine("deformation damping", rate, meaning))
+    return lines
 
 
 def _damping(mission: Mission) -> str:
@@ -87,7 +87,7 @@ def _damping(mission: Mission) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def _tracking(mission: Mission) -> list[GainLine]:
+def _tracking_lines(mission: Mission) -> list[GainLine]:
     if not any(phase.control == "tracking" for phase in mission.phases):
         return []
     t = mission.tracking
@@ -96,14 +96,14 @@ def _tracking(mission: Mission) -> list[GainLine]:
     return [GainLine("tracking", f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s", meaning)]
 
 
-def _regulators(mission: Mission) -> list[GainLine]:
+def _regulator_lines(mission: Mission) -> list[GainLine]:
     if not any(phase.steering is not None for phase in mission.phases):
         return []
     pairs = (("centre of mass", mission.lqr), ("attitude", mission.lqr.attitude))
-    return [_regulator(name, regulator) for name, regulator in pairs]
+    return [_regulator_line(name, regulator) for name, regulator in pairs]
 
 
-def _regulator(name: str, regulator: Regulator) -> GainLine:
+def _regulator_line(name: str, regulator: Regulator) -> GainLine:
     if regulator.horizon == "infinite":
         k1, k2 = lqr.double_integrator_gains(regulator.Q, regulator.R)
         value = f"k₁ = {k1:.3g} /s², k₂ = {k2:.3g} /s"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, shown
+from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting import style as st
 from rigidfleet.reporting import gains
@@ -56,7 +56,9 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
                 for flight, look in zip(flights, _looks(flights), strict=True)
             ]
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
-            ax.set_title(f"{'least' if q.at_least else 'greatest'} {q.called} [{shown(q.unit)}]")
+            ax.set_title(
+                f"{'least' if q.at_least else 'greatest'} {q.name_in_words} [{display_unit(q.unit)}]"
+            )
             if not any(known):
                 st.write_note(ax, "nothing to show")
             elif logarithmic:
@@ -108,10 +110,8 @@ def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:
 
 
 def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
-    from matplotlib.lines import Line2D
-
     handles = [
-        Line2D([], [], label=st.clean_name(label), **look)
+        st.legend_entry(st.clean_name(label), **look)
         for label, look in zip(labels, _looks(flights), strict=True)
     ]
     fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))

@@ -152,7 +152,7 @@ def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
 
     data = _bytes(path)
     due = {name: reader.Array(v.dims, v.integers, v.optional) for name, v in variables.items()}
-    with reader.opened(data) as file:
+    with reader.open_hdf5(data) as file:
         if _MARK not in file.attrs:
             raise ResultError(
                 f"{path}: is a netCDF-4 or HDF5 file, but not a result of rigidfleet. "

@@ -31,7 +31,9 @@ class Samples:
     def __init__(self, q: Quantity, values: Floats, owner: Owner = lambda _k, i: (i, -1)) -> None:
         self.quantity, self.values, self.owner = q, values, owner
         rank = q.rank(values)
-        self.rank = np.where(np.isfinite(rank), rank, -np.inf).reshape(len(rank), -1)
+        if not np.isfinite(rank).all():
+            rank = np.where(np.isfinite(rank), rank, -np.inf)
+        self.rank = rank.reshape(len(rank), -1)
 
     @property
     def worst(self) -> Floats:
@@ -74,11 +76,11 @@ def closeness(result: Result) -> proximity.Closeness:
 def samples(result: Result, name: str, close: proximity.Closeness | None = None) -> Samples:
     """Values of a quantity at samples, from positions and forces; ``close`` is `closeness`, if it is known."""
     if name in ("separation", "clearance"):
-        close = closeness(result) if close is None else close
-        both = (close.separation, close.pair), (close.clearance, close.agent, close.obstacle)
-        values, *owners = both[name == "clearance"]
-        columns = np.column_stack(owners)
-        return Samples(QUANTITIES[name], values, lambda k: columns[k].tolist())
+        near = closeness(result) if close is None else close
+        if name == "separation":
+            return Samples(QUANTITIES[name], near.separation, lambda k: near.pair[k].tolist())
+        who, what = near.agent, near.obstacle
+        return Samples(QUANTITIES[name], near.clearance, lambda k: (who.item(k), what.item(k)))
     return Samples(QUANTITIES[name], *SAMPLED[name](result))
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.facts import Fact, Row, Sheet, Shown, Table, worst_values
+from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, worst_values
 from rigidfleet._common.files import write_file
 from rigidfleet._common.quantities import quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
@@ -28,10 +28,6 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
-
-
-def _v(dims: str, units: str, text: str) -> Variable:
-    return Variable(tuple(dims.split()), units, text)
 
 
 _LABELLED = {dim: len(names) for dim, names in LABELS.items()}
@@ -54,10 +50,6 @@ def _installed_versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return versions
-
-
-def _versions() -> dict[str, str]:
-    return dict(_installed_versions())
 
 
 def _timestamp() -> str:
@@ -92,171 +84,128 @@ class Result(Shown):
         An array has the wrong shape, an index is out of range, or time does not increase.
     """
 
-    time: Annotated[Floats, _v("time", "s", "mission time")]
-    phase: Annotated[Ints, _v("time", "1", "index of the phase flown, from 0")]
+    time: Annotated[Floats, "time | s | mission time"]
+    phase: Annotated[Ints, "time | 1 | index of the phase flown, from 0"]
 
-    position: Annotated[Floats, _v("time agent axis", "m", "position, world axes (ENU)")]
-    velocity: Annotated[Floats, _v("time agent axis", "m s-1", "velocity, world axes")]
-    acceleration: Annotated[Floats, _v("time agent axis", "m s-2", "acceleration, world axes")]
-    slot_position: Annotated[Floats, _v("time agent axis", "m", "desired position, world axes")]
+    position: Annotated[Floats, "time agent axis | m | position, world axes (ENU)"]
+    velocity: Annotated[Floats, "time agent axis | m s-1 | velocity, world axes"]
+    acceleration: Annotated[Floats, "time agent axis | m s-2 | acceleration, world axes"]
+    slot_position: Annotated[Floats, "time agent axis | m | desired position, world axes"]
 
-    input_force: Annotated[Floats, _v("time agent axis", "N", "input force f_u, world axes")]
-    constraint_force: Annotated[
-        Floats, _v("time agent axis", "N", "constraint force f_C, world axes")
-    ]
-    external_force: Annotated[
-        Floats, _v("time agent axis", "N", "gravity and disturbances, world axes")
-    ]
+    input_force: Annotated[Floats, "time agent axis | N | input force f_u, world axes"]
+    constraint_force: Annotated[Floats, "time agent axis | N | constraint force f_C, world axes"]
+    external_force: Annotated[Floats, "time agent axis | N | gravity and disturbances, world axes"]
     thrust: Annotated[
-        Floats,
-        _v("time agent", "N", "thrust |f_u + f_C|, clipped at the limit if thrust saturates"),
+        Floats, "time agent | N | thrust |f_u + f_C|, clipped at the limit if thrust saturates"
     ]
 
-    cm: Annotated[Floats, _v("time axis", "m", "centre of mass, world axes")]
-    cm_velocity: Annotated[Floats, _v("time axis", "m s-1", "velocity of the centre of mass")]
-    cm_reference: Annotated[Floats, _v("time axis", "m", "commanded centre of mass")]
+    cm: Annotated[Floats, "time axis | m | centre of mass, world axes"]
+    cm_velocity: Annotated[Floats, "time axis | m s-1 | velocity of the centre of mass"]
+    cm_reference: Annotated[Floats, "time axis | m | commanded centre of mass"]
     cm_velocity_reference: Annotated[
-        Floats, _v("time axis", "m s-1", "commanded velocity of the centre of mass")
+        Floats, "time axis | m s-1 | commanded velocity of the centre of mass"
     ]
 
     attitude: Annotated[
-        Floats, _v("time quaternion", "1", "attitude of the formation, world to body, scalar first")
+        Floats, "time quaternion | 1 | attitude of the formation, world to body, scalar first"
     ]
-    attitude_reference: Annotated[Floats, _v("time quaternion", "1", "commanded attitude")]
-    frame: Annotated[Floats, _v("time quaternion", "1", "integrated mean-axis frame")]
-    rates: Annotated[Floats, _v("time axis", "rad s-1", "angular velocity, body axes (p, q, r)")]
+    attitude_reference: Annotated[Floats, "time quaternion | 1 | commanded attitude"]
+    frame: Annotated[Floats, "time quaternion | 1 | integrated mean-axis frame"]
+    rates: Annotated[Floats, "time axis | rad s-1 | angular velocity, body axes (p, q, r)"]
     rates_reference: Annotated[
-        Floats, _v("time axis", "rad s-1", "commanded angular velocity, body axes")
+        Floats, "time axis | rad s-1 | commanded angular velocity, body axes"
     ]
 
     wrench_asked: Annotated[
-        Floats,
-        _v("time wrench", "N or N m", "commanded wrench: force, torque about the centre of mass"),
+        Floats, "time wrench | N or N m | commanded wrench: force, torque about the centre of mass"
     ]
     wrench_achieved: Annotated[
-        Floats,
-        _v("time wrench", "N or N m", "resulting wrench: force, torque about the centre of mass"),
+        Floats, "time wrench | N or N m | resulting wrench: force, torque about the centre of mass"
     ]
 
-    edges: Annotated[Ints, _v("edge end", "1", "the two agents of each edge, from 0")]
-    distance: Annotated[Floats, _v("time edge", "m", "edge length L")]
-    distance_reference: Annotated[Floats, _v("time edge", "m", "reference d of an edge's length")]
-    distance_rate_reference: Annotated[Floats, _v("time edge", "m s-1", "rate of the reference d")]
-    constraint: Annotated[Floats, _v("time edge", "m", "constraint error c = L - d")]
-    integral: Annotated[Floats, _v("time edge", "m s", "integral of the constraint error")]
-    multiplier: Annotated[Floats, _v("time edge", "N", "multiplier lambda; the tension is -lambda")]
+    edges: Annotated[Ints, "edge end | 1 | the two agents of each edge, from 0"]
+    distance: Annotated[Floats, "time edge | m | edge length L"]
+    distance_reference: Annotated[Floats, "time edge | m | reference d of an edge's length"]
+    distance_rate_reference: Annotated[Floats, "time edge | m s-1 | rate of the reference d"]
+    constraint: Annotated[Floats, "time edge | m | constraint error c = L - d"]
+    integral: Annotated[Floats, "time edge | m s | integral of the constraint error"]
+    multiplier: Annotated[Floats, "time edge | N | multiplier lambda; the tension is -lambda"]
     singular_value: Annotated[
         Floats,
-        _v(
-            "time",
-            "1",
-            "smallest non-zero singular value of the constraint Jacobian J; with many agents, at some samples only",
-        ),
+        "time | 1 | smallest non-zero singular value of the constraint Jacobian J; with many agents, at some "
+        "samples only",
     ]
 
     separation: Annotated[
         Floats,
-        _v(
-            "time",
-            "m",
-            "least separation between two agents: centre distance minus radii; the sample after the minimum of a phase "
-            "has that minimum",
-        ),
+        "time | m | least separation between two agents: centre distance minus radii; the sample after the "
+        "minimum of a phase has that minimum",
     ]
     separation_pair: Annotated[
-        Ints, _v("time end", "1", "the two agents with the least separation, from 0; -1 for none")
+        Ints, "time end | 1 | the two agents with the least separation, from 0; -1 for none"
     ]
     clearance: Annotated[
         Floats,
-        _v(
-            "time",
-            "m",
-            "clearance to the nearest obstacle: distance minus radius; the sample after the minimum of a phase has "
-            "that minimum",
-        ),
+        "time | m | clearance to the nearest obstacle: distance minus radius; the sample after the minimum of a "
+        "phase has that minimum",
     ]
     clearance_agent: Annotated[
-        Ints, _v("time", "1", "the agent with the least clearance, from 0; -1 for none")
+        Ints, "time | 1 | the agent with the least clearance, from 0; -1 for none"
     ]
     clearance_obstacle: Annotated[
-        Ints, _v("time", "1", "the obstacle nearest to an agent, from 0; -1 for none")
+        Ints, "time | 1 | the obstacle nearest to an agent, from 0; -1 for none"
     ]
 
     disturbance_force: Annotated[
         Floats | None,
-        _v(
-            "time agent axis", "N", "force of the air, part of external_force; missing in still air"
-        ),
+        "time agent axis | N | force of the air, part of external_force; missing in still air",
     ] = None
     measured_position: Annotated[
-        Floats | None, _v("time agent axis", "m", "measured position; missing without noise")
+        Floats | None, "time agent axis | m | measured position; missing without noise"
     ] = None
     measured_velocity: Annotated[
-        Floats | None, _v("time agent axis", "m s-1", "measured velocity; missing without noise")
+        Floats | None, "time agent axis | m s-1 | measured velocity; missing without noise"
     ] = None
 
     vehicle_attitude: Annotated[
         Floats | None,
-        _v(
-            "time agent quaternion",
-            "1",
-            "attitude of each vehicle, world to body, scalar first; missing without vehicles",
-        ),
+        "time agent quaternion | 1 | attitude of each vehicle, world to body, scalar first; missing without vehicles",
     ] = None
     vehicle_rates: Annotated[
         Floats | None,
-        _v(
-            "time agent axis",
-            "rad s-1",
-            "angular velocity of each vehicle, body axes; missing without vehicles",
-        ),
+        "time agent axis | rad s-1 | angular velocity of each vehicle, body axes; missing without vehicles",
     ] = None
     rotor_force: Annotated[
-        Floats | None,
-        _v("time agent rotor", "N", "thrust of each rotor; missing without vehicles"),
+        Floats | None, "time agent rotor | N | thrust of each rotor; missing without vehicles"
     ] = None
     saturated: Annotated[
         Ints | None,
-        _v(
-            "time agent",
-            "1",
-            "1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
-        ),
+        "time agent | 1 | 1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
     ] = None
     clock_rate: Annotated[
-        Floats | None,
-        _v("time", "1", "rate of the virtual clock; missing without [avoidance]"),
+        Floats | None, "time | 1 | rate of the virtual clock; missing without [avoidance]"
     ] = None
     body_displacement: Annotated[
         Floats | None,
-        _v(
-            "time axis",
-            "m",
-            "displacement of the reference from the planned path, by the body layer; missing without [avoidance]",
-        ),
+        "time axis | m | displacement of the reference from the planned path, by the body layer; missing without "
+        "[avoidance]",
     ] = None
     avoidance_layers: Annotated[
         Ints | None,
-        _v(
-            "time agent",
-            "1",
-            "sum of the layers that change what an agent is asked for: 1 barriers, 2 guard, 4 guard by braking; "
-            "missing without [avoidance]",
-        ),
+        "time agent | 1 | sum of the layers that change what an agent is asked for: 1 barriers, 2 guard, 4 guard "
+        "by braking; missing without [avoidance]",
     ] = None
     slot_velocity: Annotated[
-        Floats | None, _v("time agent axis", "m s-1", "desired velocity, world axes")
+        Floats | None, "time agent axis | m s-1 | desired velocity, world axes"
     ] = None
     slot_acceleration: Annotated[
-        Floats | None, _v("time agent axis", "m s-2", "desired acceleration, world axes")
+        Floats | None, "time agent axis | m s-2 | desired acceleration, world axes"
     ] = None
-    slot_jerk: Annotated[
-        Floats | None, _v("time agent axis", "m s-3", "desired jerk, world axes")
-    ] = None
+    slot_jerk: Annotated[Floats | None, "time agent axis | m s-3 | desired jerk, world axes"] = None
     yaw: Annotated[
-        Floats | None, _v("time agent", "rad", "desired yaw of each vehicle, from east to north")
+        Floats | None, "time agent | rad | desired yaw of each vehicle, from east to north"
     ] = None
-    yaw_rate: Annotated[Floats | None, _v("time agent", "rad s-1", "desired yaw rate")] = None
+    yaw_rate: Annotated[Floats | None, "time agent | rad s-1 | desired yaw rate"] = None
 
     phases: list[PhaseRecord]
     mission_text: str
@@ -264,7 +213,7 @@ class Result(Shown):
     complete: bool = True
     ending: str = ""
     statistics: dict[str, Any] = field(default_factory=dict)
-    versions: dict[str, str] = field(default_factory=_versions)
+    versions: dict[str, str] = field(default_factory=lambda: dict(_installed_versions()))
     platform: str = field(default_factory=platform.platform)
     created: str = field(default_factory=_timestamp)
 
@@ -329,14 +278,6 @@ class Result(Shown):
     def _set(self, name: str, array: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims, dtype = _CHECKED[name]
-        if (
-            type(array) is np.ndarray
-            and array.dtype is dtype
-            and array.shape == tuple([sizes.get(dim) for dim in dims])
-            and array.flags.c_contiguous
-        ):
-            self.__dict__[name] = array
-            return
         value = np.ascontiguousarray(array, dtype=dtype)
         expected = tuple(sizes.get(dim, "any") for dim in dims)
         if value.ndim != len(expected) or any(
@@ -403,11 +344,11 @@ class Result(Shown):
         }
         rows = [Row(item) for item in about.items() if item[1] is not None]
         worst = [
-            Fact(f"{q.sense} {q.called}", x.value, q.unit, when=x.time)
+            Fact(f"{q.sense} {q.name_in_words}", x.value, q.unit, when=x.time)
             for q in map(quantity, _WORST)
             if (x := self.extreme(q.name)) is not None and math.isfinite(x.value)
         ]
-        contents = Table(("about", "result"), rows, ("result",), bare=True)
+        contents = FactTable(("about", "result"), rows, ("result",), bare=True)
         return Sheet(name, title, [contents, worst_values("quantity", worst)])
 
     @property
@@ -631,11 +572,17 @@ vars(Result.__init__)["__signature__"] = Signature(_FIELDS)
 _HINTS = get_type_hints(Result, include_extras=True)
 
 
+def _variable(hint: Any, *, optional: bool) -> Variable:
+    """The declaration that stands beside the type of a field: dimensions | unit | meaning."""
+    dims, units, text = hint.__metadata__[0].split(" | ", 2)
+    return Variable(
+        tuple(dims.split()), units, text, hint.__origin__ in (Ints, Ints | None), optional
+    )
+
+
 #: Dimensions, unit and meaning of each array of a result.
 VARIABLES: dict[str, Variable] = {
-    f.name: _HINTS[f.name]
-    .__metadata__[0]
-    ._replace(integers=_HINTS[f.name].__origin__ in (Ints, Ints | None), optional=f.default is None)
+    f.name: _variable(_HINTS[f.name], optional=f.default is None)
     for f in fields(Result)
     if hasattr(_HINTS[f.name], "__metadata__")
 }

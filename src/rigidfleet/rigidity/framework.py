@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet.formation.distance_geometry import distances
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.math.rigid_body import rigid_motions
 from rigidfleet.typing import Floats, Ints
@@ -69,7 +70,7 @@ class Framework:
     @cached_property
     def lengths(self) -> Floats:
         """Lengths (m,) of the edges [m]."""
-        return np.linalg.norm(self.p[self.edges[:, 0]] - self.p[self.edges[:, 1]], axis=1)
+        return distances(self.p, self.edges)
 
     @cached_property
     def rigid(self) -> Floats:

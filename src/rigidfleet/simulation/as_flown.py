@@ -8,7 +8,7 @@ from typing import Any
 
 from rigidfleet.errors import Finding, MissionError, wrong_type
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.findings import near
+from rigidfleet.mission.findings import suggest
 from rigidfleet.mission.kinds import AnyPhase
 from rigidfleet.mission.losses import ON_LOSS
 from rigidfleet.planning.timing import timed_leg
@@ -108,7 +108,7 @@ def check_formation(mission: Mission, phase: Phase) -> None:
         return
     name, known = shaping.formation, mission.formations
     if name not in known:
-        remedy = near(name, known) or f"formations: {', '.join(known)}"
+        remedy = suggest(name, known) or f"formations: {', '.join(known)}"
         problem = "there is no such formation"
         raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
     if phase.control == "tracking" and mission.formation_slots(name) is None:

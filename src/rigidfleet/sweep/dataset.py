@@ -35,7 +35,7 @@ def load(folder: str | Path) -> xarray.Dataset:
     sweep = table.sweep
     variables: dict[str, Any] = {}
     for k, column in enumerate(sweep.columns):
-        unit, text = explained(sweep, column)
+        unit, text = unit_and_meaning(sweep, column)
         values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
         variables[column.name] = ("run", values, {"units": unit, "long_name": text})
     for name, values, text in (
@@ -63,7 +63,7 @@ def load(folder: str | Path) -> xarray.Dataset:
     )
 
 
-def explained(sweep: Sweep, column: SweepColumn) -> tuple[str, str]:
+def unit_and_meaning(sweep: Sweep, column: SweepColumn) -> tuple[str, str]:
     """Unit and meaning of the number that a column varies."""
     text = keypaths.description_of(sweep.mission, column.keys)
     units = _UNIT.findall(text)

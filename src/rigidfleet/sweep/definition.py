@@ -159,7 +159,7 @@ class Sweep:
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
         data = {"mission": mission.name, "vary": list(vary), **keys}
-        return cls(mission, *_checked(data, origin, mission), name or mission.name)
+        return cls(mission, *_check(data, origin, mission), name or mission.name)
 
     @classmethod
     def load(cls, path: str | Path, *, more: Iterable[str] = (), **keys: Any) -> Self:
@@ -186,10 +186,10 @@ class Sweep:
             shipped = named in mission_names()
             mission = load_mission(named if shipped else path.parent / named)
         data |= {key: value for key, value in keys.items() if value is not None}
-        if isinstance(given := data.get("vary", []), list):
-            data["vary"] = [*given, *more]
+        if isinstance(own := data.get("vary", []), list):
+            data["vary"] = [*own, *more]
         controllers.add_search_folder(path.parent)
-        variations, header = _checked(data, origin, mission)
+        variations, header = _check(data, origin, mission)
         assert mission is not None  # otherwise the check has raised
         return cls(mission, variations, header, path.stem)
 
@@ -271,15 +271,15 @@ class Sweep:
         stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
         drawn = sum(column.grid is None for column in self.columns)
         fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
-        point, places, found = run, {}, []
+        point, places, reversed_values = run, {}, []
         for axis, size in reversed(self.grid_sizes.items()):  # the last grid varies fastest
             point, places[axis] = divmod(point, size)
         for k, column in reversed([*enumerate(self.columns)]):
             if column.grid is None:
-                found.append(column.variation.quantile(fractions.pop()))
+                reversed_values.append(column.variation.quantile(fractions.pop()))
             else:
-                found.append(column.grid[places[_axis(column, k)]])
-        return found[::-1]
+                reversed_values.append(column.grid[places[_axis(column, k)]])
+        return reversed_values[::-1]
 
     def varied(self, run: int, values: Sequence[Any] | None = None) -> dict[str, Any]:
         """The mission of a run as plain data, not yet checked.
@@ -289,7 +289,7 @@ class Sweep:
         varied = {column.keys for column in self.columns}
         document = self.mission.to_dict()
         for column, value in zip(self.columns, values or self.values(run), strict=True):
-            apply(document, self.whole, column, value)
+            apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
             stream = np.random.SeedSequence(self.seed, spawn_key=(run, 1))
             seed = int(stream.generate_state(1)[0] >> 1)
@@ -326,7 +326,7 @@ def _axis(column: SweepColumn, k: int) -> str | int:
 
 
 @lru_cache(maxsize=4)
-def shared(text: str) -> Sweep:
+def sweep_of_json(text: str) -> Sweep:
     """Restore a sweep from its JSON; cached for the next chunks."""
     return Sweep.from_json(text)
 
@@ -339,36 +339,36 @@ def is_sweep_file(path: str | Path) -> bool:
         return False
 
 
-def apply(
+def apply_value(
     document: dict[str, Any], whole: Mapping[str, Any], column: SweepColumn, value: Any
 ) -> None:
     """Apply a value of a column to a document; all numbers at its place change alike."""
     there = keypaths.flatten(look_up(whole, column.keys))
     integral = all(isinstance(x, int) for x in there)
 
-    def changed(there: Any) -> Any:
+    def new_number(there: Any) -> Any:
         new = column.variation.apply(there, value)
         return round(new) if integral and math.isfinite(new) else new
 
-    def replaced(there: Any) -> Any:
-        return keypaths.map_nested(there, changed) if is_number(value) else value
+    def new_value(there: Any) -> Any:
+        return keypaths.map_nested(there, new_number) if is_number(value) else value
 
-    keypaths.replace_value(document, whole, column.keys, replaced)
+    keypaths.replace_value(document, whole, column.keys, new_value)
 
 
 # -- the check ---------------------------------------------------------------------------------------
 
 
-def _checked(
+def _check(
     data: dict[str, Any], origin: str, mission: Mission | None
 ) -> tuple[list[Variation], SweepHeader]:
     """Check a sweep and return its variations and header."""
     data = {key: value for key, value in data.items() if value is not None}
     wrong: dict[int, WrongLine] = {}
-    if isinstance(given := data.get("vary"), list):
-        parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in given]
+    if isinstance(entries := data.get("vary"), list):
+        parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in entries]
         wrong = {k: entry for k, entry in enumerate(parsed) if isinstance(entry, WrongLine)}
-        data["vary"] = [given[k] if k in wrong else entry for k, entry in enumerate(parsed)]
+        data["vary"] = [entries[k] if k in wrong else entry for k, entry in enumerate(parsed)]
     collector = FindingCollector(data, origin)
     known = [*SweepHeader.model_fields, "vary"]
     for key in data:
@@ -384,10 +384,10 @@ def _checked(
         if k in wrong:
             collector.add(("vary", k), wrong[k].problem, wrong[k].remedy)
             continue
-        found = _variation(collector, entry, k)
+        variation = _variation(collector, entry, k)
         if whole is not None and isinstance(entry, dict) and isinstance(entry.get("path"), str):
-            _fits(collector, k, entry["path"], found, whole, lacked, starts=by_final_states)
-        variations += [] if found is None else [found]
+            _fits(collector, k, entry["path"], variation, whole, lacked, starts=by_final_states)
+        variations += [] if variation is None else [variation]
     if by_final_states and mission is not None:
         from rigidfleet.simulation.ensemble import unfit
 
@@ -420,11 +420,15 @@ def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | N
     """Check a variation by itself; None if it has errors."""
     before = len(collector.findings)
     model = collector.kind(entry, ("vary", k), KINDS)
-    found = None if model is None else collector.validate(model, entry, ("vary", k))
-    if found is not None and len(collector.findings) == before and (problem := found.wrong()):
+    variation = None if model is None else collector.validate(model, entry, ("vary", k))
+    if (
+        variation is not None
+        and len(collector.findings) == before
+        and (problem := variation.wrong())
+    ):
         key, *words = problem
-        collector.add(("vary", k, key), *words, getattr(found, key))
-    return found if len(collector.findings) == before else None
+        collector.add(("vary", k, key), *words, getattr(variation, key))
+    return variation if len(collector.findings) == before else None
 
 
 def _fits(
@@ -502,7 +506,7 @@ def _taken(
     for _, column in lacked:
         v = column.variation
         value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
-        apply(document, whole, column, value)
+        apply_value(document, whole, column, value)
     try:
         Mission.from_plain(document, "<dict>")
     except MissionError as error:

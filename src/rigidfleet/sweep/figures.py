@@ -14,11 +14,11 @@ from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.plotting import encode_figure, write_files
 from rigidfleet.plotting import style as st
-from rigidfleet.sweep.dataset import explained
-from rigidfleet.sweep.metrics import METRICS, readable
-from rigidfleet.sweep.record import called
+from rigidfleet.sweep.dataset import unit_and_meaning
+from rigidfleet.sweep.metrics import METRICS, readable_unit
+from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.sweep.store import Table
-from rigidfleet.sweep.summary import drivers, failures, interval, outcomes, varied
+from rigidfleet.sweep.summary import drivers, failures, interval, outcomes, varied_numbers
 from rigidfleet.sweep.variation import Geomspace, LogUniform
 from rigidfleet.typing import Floats, Ints
 
@@ -111,7 +111,7 @@ def outcome(table: Table) -> Figure | None:
         right.grid(visible=False)
         right.tick_params(bottom=False, labelbottom=False)
         return fig
-    names = [called(reason) for reason in reasons]
+    names = [reason_in_words(reason) for reason in reasons]
     bars = right.barh(names, list(reasons.values()), color=FAILED, height=0.65)
     right.bar_label(bars, padding=3, fontsize=8)
     right.grid(visible=False, axis="y")
@@ -162,7 +162,7 @@ def envelopes(table: Table) -> Figure | None:
     if not strongest:
         return None
     fig, axes = _small_axes(table, "Metrics over what drives them most", list(strongest))
-    numbers = varied(table)
+    numbers = varied_numbers(table)
     for (name, over), ax in zip(strongest.items(), axes, strict=True):
         x, y = numbers[over], table.metrics[name]
         for passed, colour in ((True, PASSED), (False, FAILED)):
@@ -189,7 +189,7 @@ def correlations(table: Table) -> Figure | None:
     if not correlated:
         return None
     rows = list(dict.fromkeys(d.varied for d in correlated))[:_ROWS]
-    rows = [name for name in varied(table) if name in rows]
+    rows = [name for name in varied_numbers(table) if name in rows]
     columns = [name for name in outcomes(table) if any(d.outcome == name for d in correlated)]
     values = np.full((len(rows), len(columns)), np.nan)
     for d in correlated:
@@ -224,7 +224,7 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     RigidfleetError
         The sweep has no such path or metric.
     """
-    numbers, correlated = varied(table), drivers(table)
+    numbers, correlated = varied_numbers(table), drivers(table)
     if not metric:
         judged = outcomes(table)
         strongest = [d.outcome for d in correlated]
@@ -298,14 +298,13 @@ def _small_axes(table: Table, title: str, names: Sequence[str]) -> tuple[Figure,
 
 
 def _draw_key(fig: Figure, table: Table, *, limit: bool = False) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Any] = [Patch(color=PASSED, label=f"{int(table.passed.sum())} passed")]
     if not table.passed.all():
         handles.append(Patch(color=FAILED, label=f"{int((~table.passed).sum())} failed"))
     if limit:
-        handles.append(Line2D([], [], color=st.ALERT, linestyle=(0, (6, 2)), label="limit"))
+        handles.append(st.legend_entry("limit", color=st.ALERT, linestyle=(0, (6, 2))))
     fig.legend(handles=handles, loc="outside lower left", ncols=len(handles), fontsize=8)
 
 
@@ -314,14 +313,14 @@ def _metric_label(metric: str) -> str:
 
 
 def _unit(metric: str) -> str:
-    return readable(METRICS[metric].unit)
+    return readable_unit(METRICS[metric].unit)
 
 
 def _axis_label(table: Table, name: str) -> str:
     column = next(c for c in table.sweep.columns if c.name == name)
-    unit, _ = explained(table.sweep, column)
+    unit, _ = unit_and_meaning(table.sweep, column)
     how = {"set": "", "add": ", added", "scale": ", factor"}[column.variation.change]
-    return f"{name}{how} [{readable(unit)}]"
+    return f"{name}{how} [{readable_unit(unit)}]"
 
 
 def _metric_limits(table: Table) -> dict[str, float]:

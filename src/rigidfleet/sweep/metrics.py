@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, shown
+from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.math import proximity
 from rigidfleet.typing import Floats
 
@@ -69,10 +69,10 @@ METRICS: dict[str, Metric] = {
 }
 
 
-def readable(unit: str) -> str:
+def readable_unit(unit: str) -> str:
     """A unit for display: m/s² for m s-2."""
     words = {code: unit for unit, code in _NOTATION.items()} | {"1": "-"}
-    return shown(words.get(unit, unit))
+    return display_unit(words.get(unit, unit))
 
 
 def measure(result: Result, verdict: Verdict) -> dict[str, float]:
@@ -80,7 +80,7 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
     phases = verdict.phases
     shapes = [p.shape for p in phases if p.shape is not None]
     hands = [float(p.handedness) for p in phases if p.handedness is not None]
-    found = {
+    values = {
         "shape_end": shapes[-1] if shapes else math.nan,
         "shape": _greatest(shapes),
         "constraint_end": _greatest(p.constraint for p in phases[-1:]),
@@ -90,10 +90,10 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
         "steps": float(result.statistics["steps"]),
         "evaluations": float(result.statistics["evaluations"]),
     }
-    found |= _in_flight(result)
+    values |= _flight_errors(result)
     for name in ("position", "velocity", "attitude", "rates"):
         misses = (getattr(w, name) for p in phases for w in (p.waypoint, p.stay) if w)
-        found[f"waypoint_{name}"] = _greatest(misses)
+        values[f"waypoint_{name}"] = _greatest(misses)
     checks = verdict.by_name
     worst = {name: f.worst for name, f in checks.items() if f.worst is not None}
     if (rotor := checks.get("rotor_force")) is not None:
@@ -102,17 +102,17 @@ def measure(result: Result, verdict: Verdict) -> dict[str, float]:
         worst["saturation"] /= 100.0
     # Of clearances, those of vehicles that stand on an obstacle count, too.
     worst |= {name: e.value for name, e in verdict.worst.items() if name != "thrust"}
-    return {name: float((worst | found).get(name, math.nan)) for name in METRICS}
+    return {name: float((worst | values).get(name, math.nan)) for name in METRICS}
 
 
 def _greatest(values: Iterable[float | None]) -> float:
     return max((v for v in values if v is not None), default=math.nan)
 
 
-def _in_flight(result: Result) -> dict[str, float]:
+def _flight_errors(result: Result) -> dict[str, float]:
     """Errors of shape and of tracking at all samples, lost vehicles left out."""
-    off = np.ascontiguousarray((_left(result) - result.slot_position).T)
-    apart, shape = _most(proximity.root_of_squares(off)), shape_errors(result)
+    off = np.ascontiguousarray((_positions_left(result) - result.slot_position).T)
+    apart, shape = _greatest_of_columns(proximity.root_of_squares(off)), shape_errors(result)
     tracked = np.isfinite(apart)
     errors = {
         ("shape_flight", "shape_rms"): shape,
@@ -120,12 +120,12 @@ def _in_flight(result: Result) -> dict[str, float]:
         ("shape_forces", ""): shape[~tracked],
         ("tracking_error", "tracking_rms"): apart,
     }
-    found = {}
+    values = {}
     for (name, mean), error in errors.items():
         there = error[np.isfinite(error)]
-        found[name] = float(there.max()) if len(there) else math.nan
-        found[mean] = float(np.sqrt(np.mean(there**2))) if len(there) else math.nan
-    return found
+        values[name] = float(there.max()) if len(there) else math.nan
+        values[mean] = float(np.sqrt(np.mean(there**2))) if len(there) else math.nan
+    return values
 
 
 def shape_errors(result: Result) -> Floats:
@@ -133,22 +133,24 @@ def shape_errors(result: Result) -> Floats:
 
     Elsewhere, and with many agents, it is that of the edges against their references. NaN if there are none.
     """
-    error = _most(np.abs(np.ascontiguousarray(result.constraint.T)))
+    error = _greatest_of_columns(np.abs(np.ascontiguousarray(result.constraint.T)))
     n = result.position.shape[1]
     if n < 2 or n > _PAIRED:
         return error
     pairs = proximity.all_pairs(n).T
-    flown, asked = (proximity.lengths(x, pairs) for x in (_left(result), result.slot_position))
-    flown -= asked
-    return np.fmax(error, _most(np.abs(flown, out=flown)))
+    flown, due = (
+        proximity.lengths(x, pairs) for x in (_positions_left(result), result.slot_position)
+    )
+    flown -= due
+    return np.fmax(error, _greatest_of_columns(np.abs(flown, out=flown)))
 
 
-def _left(result: Result) -> Floats:
+def _positions_left(result: Result) -> Floats:
     """Positions (K, N, 3) [m]; NaN of agents that are lost."""
     left = result.left
     return result.position if left.all() else np.where(left[..., None], result.position, np.nan)
 
 
-def _most(values: Floats) -> Floats:
+def _greatest_of_columns(values: Floats) -> Floats:
     """Greatest finite value (K,) of each column of values (M, K); NaN if there is none."""
     return np.fmax.reduce(values, axis=0, initial=np.nan)

@@ -43,6 +43,6 @@ def refusal(error: MissionError) -> tuple[str, str]:
     return REFUSED, " ".join(words.split())
 
 
-def called(reason: str) -> str:
+def reason_in_words(reason: str) -> str:
     """Name of a reason in tables and figures."""
     return _CALLED.get(reason, reason.replace("_", " "))

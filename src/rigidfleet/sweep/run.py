@@ -45,23 +45,23 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     begun = perf_counter()
     values = {run: sweep.values(run) for run in runs}
     flown: dict[int, Any] = {
-        run: _tried(lambda run=run: sweep.mission_of(run, values[run])) for run in runs
+        run: _value_or_error(lambda run=run: sweep.mission_of(run, values[run])) for run in runs
     }
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
-    together = law or _tried(lambda: simulate_together([flown[run] for run in valid]))
+    together = law or _value_or_error(lambda: simulate_together([flown[run] for run in valid]))
     if law is not None or isinstance(together, Exception):
         together = [
-            _tried(lambda run=run: simulate(flown[run], controller=new(), rate=rate))
+            _value_or_error(lambda run=run: simulate(flown[run], controller=new(), rate=rate))
             for run in valid
         ]
     flown |= zip(valid, together, strict=True)
     del together
     shared = (perf_counter() - begun) / len(runs)
     # Each flight is let go of when it is judged: the next one's record takes its memory over.
-    return [_row(sweep, run, values[run], flown.pop(run), shared) for run in runs]
+    return [_record(sweep, run, values[run], flown.pop(run), shared) for run in runs]
 
 
-def _tried(job: Callable[[], Any]) -> Any:
+def _value_or_error(job: Callable[[], Any]) -> Any:
     """What a function returns, or its exception: one failed run must not end the sweep."""
     try:
         return job()
@@ -71,28 +71,28 @@ def _tried(job: Callable[[], Any]) -> Any:
         return error
 
 
-def _row(
+def _record(
     sweep: Sweep, run: int, values: Sequence[Any], flown: Result | Exception, shared: float
 ) -> RunRecord:
     """Judge a flight and measure it; ``shared`` is its share of the time that its group has taken so far [s]."""
     begun = perf_counter()
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
-    found = flown if isinstance(flown, Exception) else _tried(lambda: _judged(flown))
-    match found:
+    outcome = flown if isinstance(flown, Exception) else _value_or_error(lambda: _judge(flown))
+    match outcome:
         case MissionError():
-            reason, detail = refusal(found)
+            reason, detail = refusal(outcome)
         case FlightError() if sweep.header.controller:
-            reason, detail = RAISED, str(found)
+            reason, detail = RAISED, str(outcome)
         case Exception():
-            reason, detail = BROKEN, f"{type(found).__name__}: {found}"
+            reason, detail = BROKEN, f"{type(outcome).__name__}: {outcome}"
         case _:
-            metrics, reason, detail = found
+            metrics, reason, detail = outcome
     wall = shared + perf_counter() - begun
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
 
 
-def _judged(result: Result) -> tuple[dict[str, float], str, str]:
+def _judge(result: Result) -> tuple[dict[str, float], str, str]:
     """Metrics of a flight, and why it has failed."""
     from rigidfleet.assessment import assess
 

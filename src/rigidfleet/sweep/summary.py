@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import plain
 from rigidfleet.sweep import store
-from rigidfleet.sweep.metrics import METRICS, readable
-from rigidfleet.sweep.record import called
+from rigidfleet.sweep.metrics import METRICS, readable_unit
+from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.sweep.variation import is_number
 from rigidfleet.typing import Bools, Floats, Ints
 
@@ -105,14 +105,14 @@ class Summary(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The summary as plain data."""
-        found = asdict(self)
-        found["percentiles"] = {
+        data = asdict(self)
+        data["percentiles"] = {
             name: dict(zip(map(str, PERCENTILES), values, strict=True))
             for name, values in self.percentiles.items()
         }
         units = {name: METRICS[name].unit for name in self.percentiles}
         tested = {"pairs_tested": len(self.drivers), "false_discovery_rate": _CHANCE}
-        return plain(found | tested | {"units": units, "confidence": CONFIDENCE})
+        return plain(data | tested | {"units": units, "confidence": CONFIDENCE})
 
     def json(self) -> str:
         """The summary as JSON text."""
@@ -132,36 +132,43 @@ class Summary(Shown):
             parts.append(Line(f"Random numbers: {numbers}."))
         for name, rates in self.by_value.items():
             rows = [Row((word, f"{100 * r.rate:.3g} %", r.interval)) for word, r in rates.items()]
-            parts.append(Table((name, "passed", "95 % interval"), rows))
+            parts.append(FactTable((name, "passed", "95 % interval"), rows))
         if s.of:
             words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} % (95 % interval {s.interval})."
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
-    def _percentiles(self) -> Table:
+    def _percentiles(self) -> FactTable:
         rows = [
-            Row((name, readable(METRICS[name].unit), *values))
+            Row((name, readable_unit(METRICS[name].unit), *values))
             for name, values in self.percentiles.items()
         ]
-        return Table(
+        return FactTable(
             ("metric", "unit", "min", "5 %", "25 %", "median", "75 %", "95 %", "max"), rows
         )
 
-    def _reasons(self) -> Table:
+    def _reasons(self) -> FactTable:
         rows = []
         for reason, count in self.reasons.items():
             example = self.examples[reason]
             words = f"run {example.run}{': ' if example.detail else ''}{example.detail}"
             rows.append(
-                Row((called(reason), count, f"{100 * count / self.success.of:.3g} %", words))
+                Row(
+                    (
+                        reason_in_words(reason),
+                        count,
+                        f"{100 * count / self.success.of:.3g} %",
+                        words,
+                    )
+                )
             )
-        return Table(("failed check", "runs", "of all", "for example"), rows, ("for example",))
+        return FactTable(("failed check", "runs", "of all", "for example"), rows, ("for example",))
 
-    def _correlations(self, strong: Sequence[Driver]) -> Table:
+    def _correlations(self, strong: Sequence[Driver]) -> FactTable:
         """The strongest, those with success first."""
         first = sorted(strong, key=lambda d: d.outcome != "success")[:_SHOWN]
         rows = [Row((d.varied, d.outcome, f"{d.correlation:+.2f}")) for d in first]
-        return Table(("varied number", "outcome", "rank correlation"), rows, ("outcome",))
+        return FactTable(("varied number", "outcome", "rank correlation"), rows, ("outcome",))
 
 
 def summarise(table: store.Table) -> Summary:
@@ -170,7 +177,7 @@ def summarise(table: store.Table) -> Summary:
     for name, values in table.metrics.items():
         if len(finite := values[np.isfinite(values)]):
             percentiles[name] = np.percentile(finite, PERCENTILES).tolist()
-    by_value, worded = {}, _worded(table)
+    by_value, worded = {}, _columns_in_words(table)
     for k, column in enumerate(table.sweep.columns):
         if column.name in worded:
             words = np.array([str(column.variation.value(x)) for x in table.codes[:, k].tolist()])
@@ -203,15 +210,15 @@ def failures(table: store.Table) -> dict[str, int]:
 
 def _examples(table: store.Table) -> dict[str, Example]:
     """An example of each reason, preferably a run that fails it first: messages are about the first check."""
-    told: dict[str, Example] = {}
+    with_detail: dict[str, Example] = {}
     others: dict[str, Example] = {}
     for run, reasons, detail in zip(table.run.tolist(), table.reason, table.detail, strict=True):
         first, *rest = reasons.split(", ")
-        told.setdefault(first, Example(run, detail))
+        with_detail.setdefault(first, Example(run, detail))
         for reason in rest:
             others.setdefault(reason, Example(run, ""))
-    told.pop("", None)
-    return others | told
+    with_detail.pop("", None)
+    return others | with_detail
 
 
 def rate(passed: Bools) -> Rate:
@@ -233,17 +240,17 @@ def interval(k: Ints, n: Ints) -> tuple[Floats, Floats]:
 
 def outcomes(table: store.Table) -> dict[str, Floats]:
     """Outcomes of runs: success and every metric, if they differ between runs."""
-    found = {"success": table.passed.astype(float)} | table.metrics
+    all_outcomes = {"success": table.passed.astype(float)} | table.metrics
     return {
         name: values
-        for name, values in found.items()
+        for name, values in all_outcomes.items()
         if _differs(values, _SPREAD, _NOISE) and name not in ASIDE
     }
 
 
-def varied(table: store.Table) -> dict[str, Floats]:
+def varied_numbers(table: store.Table) -> dict[str, Floats]:
     """Varied numbers by path, without seeds, which have no order, and variations that are not numeric."""
-    worded = _worded(table)
+    worded = _columns_in_words(table)
     return {
         column.name: table.codes[:, k]
         for k, column in enumerate(table.sweep.columns)
@@ -253,8 +260,8 @@ def varied(table: store.Table) -> dict[str, Floats]:
 
 def drivers(table: store.Table) -> list[Driver]:
     """Rank correlation of every varied number with every outcome, strongest first."""
-    found: list[tuple[str, str, float, float]] = []
-    numbers = varied(table)
+    tested: list[tuple[str, str, float, float]] = []
+    numbers = varied_numbers(table)
     ranked = {name: _ranks(x) for name, x in numbers.items()}
     for outcome, y in outcomes(table).items():
         there = np.isfinite(y)
@@ -265,19 +272,19 @@ def drivers(table: store.Table) -> list[Driver]:
         for name, x in numbers.items():
             if every or _differs(x[there]):
                 x_ranked = ranked[name] if every else _ranks(x[there])
-                found.append((name, outcome, *_correlated(x_ranked, y_ranked)))
-    adjusted = _adjusted(np.array([chance for *_, chance in found]))
-    pairs = [Driver(*d, float(q)) for d, q in zip(found, adjusted, strict=True)]
+                tested.append((name, outcome, *_rank_correlation(x_ranked, y_ranked)))
+    adjusted = _adjusted_chances(np.array([chance for *_, chance in tested]))
+    pairs = [Driver(*d, float(q)) for d, q in zip(tested, adjusted, strict=True)]
     return sorted(pairs, key=lambda d: -abs(d.correlation))
 
 
-def _adjusted(chance: Floats) -> Floats:
+def _adjusted_chances(chance: Floats) -> Floats:
     """P-values (n,) corrected for their number, by Benjamini and Hochberg."""
     n = len(chance)
     order = np.argsort(-chance)
-    found = np.empty(n)
-    found[order] = np.minimum.accumulate(chance[order] * n / np.arange(n, 0, -1))
-    return found
+    adjusted = np.empty(n)
+    adjusted[order] = np.minimum.accumulate(chance[order] * n / np.arange(n, 0, -1))
+    return adjusted
 
 
 def _ranks(x: Floats) -> Floats:
@@ -286,7 +293,7 @@ def _ranks(x: Floats) -> Floats:
     return (np.cumsum(counts) - 0.5 * counts)[which] - 0.5 * len(x)
 
 
-def _correlated(x: Floats, y: Floats) -> tuple[float, float]:
+def _rank_correlation(x: Floats, y: Floats) -> tuple[float, float]:
     """Correlation of ranks, and the chance of a larger one: Student's t with n - 2 degrees of freedom.
 
     It is at least that of the strongest correlation, which two of all orders have: t is too sure of a few runs.
@@ -301,7 +308,7 @@ def _correlated(x: Floats, y: Floats) -> tuple[float, float]:
     return r, max(float(2.0 * stdtr(free, -t)), least)
 
 
-def _worded(table: store.Table) -> set[str]:
+def _columns_in_words(table: store.Table) -> set[str]:
     return {
         column.name
         for column in table.sweep.columns

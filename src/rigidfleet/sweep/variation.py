@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict
 
-from rigidfleet.mission.findings import near
+from rigidfleet.mission.findings import suggest
 from rigidfleet.mission.values import Number, Part, Positive
 
 #: Signs in a line, and the change that each stands for.
@@ -252,7 +252,7 @@ def from_line(line: str) -> dict[str, Any] | WrongLine:
     path, sign, kind, inside = match.groups()
     data = {"path": path, "change": SIGNS[sign], "kind": kind}
     if kind not in KINDS:
-        remedy = near(kind, KINDS) or f"use one of {', '.join(KINDS)}"
+        remedy = suggest(kind, KINDS) or f"use one of {', '.join(KINDS)}"
         return WrongLine(f"there is no distribution or grid '{kind}'", remedy)
     values = [_parse_word(word) for word in _split_words(inside)]
     if kind not in _KEYS:

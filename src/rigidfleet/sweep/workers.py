@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import multiprocessing
 import os
@@ -10,14 +9,14 @@ import signal
 import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.processes import safe_path
 from rigidfleet.errors import RigidfleetError
-from rigidfleet.sweep.definition import shared
+from rigidfleet.sweep.definition import sweep_of_json
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import fly_runs
 
@@ -26,9 +25,6 @@ if TYPE_CHECKING:
 
 #: An executor, and a function that returns how many chunks it can fly at the same time.
 Pool = tuple[Executor, Callable[[], int]]
-#: M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of malloc.h: free memory [bytes] that is given back, and blocks that are not
-#: kept.
-_KEPT = {-1: 256 << 20, -3: 32 << 20}
 #: Maximum time to wait for a scheduler [s].
 _CONNECT = 20.0
 
@@ -41,7 +37,7 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
     RigidfleetError
         The other process has another version of rigidfleet, or of the user's controller.
     """
-    flown = shared(sweep)
+    flown = sweep_of_json(sweep)
     if version != flown.version:
         raise RigidfleetError(
             f"a worker has {flown.version}, but the sweep was started by {version}. Install the same version on all"
@@ -130,19 +126,6 @@ def _begin_worker(inheritance: Inheritance | None) -> None:
         from rigidfleet.kernel.engine.native import inherit
 
         inherit(inheritance)
-    keep_memory()
-
-
-def keep_memory() -> None:
-    """Let the GNU C library keep what is freed, of blocks up to its limit: the next flight asks for as much again.
-
-    By its own thresholds, it gives the memory of each flight back to the system, and to get it again page by page takes
-    some per cent of a run. Other libraries are left as they are.
-    """
-    with suppress(AttributeError, OSError, TypeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        for parameter, size in _KEPT.items():
-            mallopt(parameter, size)
 
 
 def _end_with_parent() -> None:

@@ -16,12 +16,12 @@ from rigidfleet._common.toml import to_toml
 from rigidfleet.math import lqr, pid
 from rigidfleet.math.margins import Loop, LoopGains, Margins, margins
 from rigidfleet.mission import Mission
-from rigidfleet.mission.files import digests
+from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.schema import Tracking
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.vehicles import vehicle_lags
-from rigidfleet.preflight.margins import Looped, formation_laws, tracking_law
+from rigidfleet.preflight.margins import ClosedLoops, formation_laws, tracking_law
 from rigidfleet.typing import Floats
 
 #: A gain by its path in the mission, as in a variation.
@@ -110,7 +110,7 @@ class Screen:
         self.mission, self.share = mission, share
         self.gains = own_gains(mission)
         lags = vehicle_lags(mission)
-        laws: list[tuple[str, Looped]] = []
+        laws: list[tuple[str, ClosedLoops]] = []
         if lags:
             tracking = tracking_law(mission, lags)
             laws += [] if tracking is None else [(TRACKING, tracking)]
@@ -154,7 +154,7 @@ class Screen:
             yield part.name, margins([part.loop], replace(part.law, **new), part.growth)
 
 
-def _distinct_parts(laws: Sequence[tuple[str, Looped]]) -> list[_Part]:
+def _distinct_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
     """The distinct parts of all loops: most shapes have the same, and what decays on the longest way counts."""
     parts: dict[object, _Part] = {}
     for name, looped in laws:
@@ -219,7 +219,7 @@ def with_gains(text: str, gains: Gains) -> str:
         same = tomllib.loads(new) == wanted
     except tomllib.TOMLDecodeError:
         same = False
-    return new if same else digests(text) + to_toml(wanted)
+    return new if same else digest_lines(text) + to_toml(wanted)
 
 
 def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.facts import Line, Row, Sheet, Shown, Table
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import plain
 from rigidfleet.math.margins import Margins
-from rigidfleet.sweep.record import called
+from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.tuning.gains import Gains
 
 _WORDS = {
@@ -145,7 +145,7 @@ class Tuned(Shown):
 
     def facts(self) -> Sheet:
         """Gains, errors and margins on both sides, and the conclusion."""
-        table = Table(("", "before", "after", "change"), [*map(Row, self.rows())])
+        table = FactTable(("", "before", "after", "change"), [*map(Row, self.rows())])
         flights = f"{self.flights} flights of {self.candidates} choice{'s' * (self.candidates != 1)} of gains"
         title = f"{flights}; {self.refused} refused for their margins"
         return Sheet(self.mission, title, [table, Line(self.conclusion)])
@@ -179,7 +179,7 @@ class Tuned(Shown):
         rows.append((f"passed, {which} seeds", was, now, ""))
         for reason in {**before.reasons, **after.reasons}:
             was, now = (str(x.reasons.get(reason, 0)) for x in (before, after))
-            rows.append((f"failed '{called(reason)}', {which} seeds", was, now, ""))
+            rows.append((f"failed '{reason_in_words(reason)}', {which} seeds", was, now, ""))
         return rows
 
 

@@ -3,7 +3,7 @@
 from numba import types
 from numba.extending import intrinsic
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 
 #: Offsets in bytes of an array's data, number of dimensions, shape, type of numbers and flags: `PyArrayObject_fields`
 #: of NumPy's C interface, after the two words of every Python object. The second and the last have 32 bits.
@@ -34,7 +34,7 @@ def store(_context, address, word):
     return types.void(types.int64, types.int64), generate
 
 
-@compiled
+@jit
 def gather(objects, count, expected, words):
     """Write the data addresses and shapes of ``count`` arrays to ``words``; return how many are not as asked.
 

@@ -41,12 +41,12 @@ _OPTIMISES = numba.config.OPT > 0
 _CACHED = OPTIONS | {"no_cfunc_wrapper": True}
 
 
-def compiled(function: F) -> F:
+def jit(function: F) -> F:
     """Compile for the flight: cached on disk, without the GIL, without allocation."""
     return _with_cache(function, _CACHED)
 
 
-def inlined(function: F) -> F:
+def jit_inline(function: F) -> F:
     """Compile into each caller, for functions that every evaluation of a flight calls, and for those that sum.
 
     Where it is not inlined, the linker takes the copy that was loaded first, and copies sum in different orders.

@@ -267,7 +267,7 @@ _register((min,), 2, BUILD["min"])
 
 
 @intrinsic
-def filled(_context, x):
+def fill_lanes(_context, x):
     """Return lanes that all hold the number x."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.kept import same
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
 from rigidfleet.kernel.engine import lane_bounds, lane_steps, native
@@ -59,7 +59,7 @@ _FIRST_STEP, _FIRST_STEP_IN_VECTORS = 1e-3, 1e-2
 _MOST_EQUATIONS = 36
 
 
-@compiled
+@jit
 def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, max_steps, fresh):
     """Integrate vectors of eight flights from ``starts`` (G, n) at t0 to ``t_end`` [s], into ``ends``.
 
@@ -84,7 +84,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
             ends[g, q] = state.y[q]
 
 
-@compiled
+@jit
 def fly_on(p, state, t_end, fresh, times, unsampled, max_steps):
     """Integrate eight flights to ``t_end`` [s], see `dopri5.integrate`; p is an `UnrolledProblem`."""
     p, state = by_address(p), by_address(state)

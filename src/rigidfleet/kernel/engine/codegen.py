@@ -19,7 +19,7 @@ from numba.extending import intrinsic
 
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
-from rigidfleet.kernel.compiler.jit import compiled, compiled_copy, compiled_for_c, inlined
+from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, jit, jit_inline
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, gather, unpack
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_bounds, lane_steps
@@ -174,7 +174,7 @@ def _addresses(arrays: Sequence[Floats]) -> Ints:
     return np.array([x.ctypes.data for x in arrays])
 
 
-@compiled
+@jit
 def _interleave(addresses, first, made):
     for k in range(made.shape[0]):
         made[k] = gather(addresses, first + k)
@@ -232,7 +232,7 @@ def _call_code(
     return types.void(types.int64, types.int64, *arrays), generate
 
 
-@inlined
+@jit_inline
 def _closed_loop(t, y, dy, p, w):
     time, stage, wanted = p.time, p.stage[0], 0
     piece = gust = noise = 0

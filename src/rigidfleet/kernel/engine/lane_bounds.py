@@ -15,12 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.bernstein import CLOSE
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.compiler.simd import (
     WIDTH,
     LaneArray,
     empty,
-    filled,
+    fill_lanes,
     inverse_root_of,
     pack,
     put,
@@ -121,38 +121,38 @@ def begin(s: Search, monitors: Sequence[Monitor]) -> None:
     unpack(s.nearest)[:] = _FAR
 
 
-@inlined
+@jit_inline
 def _square(x, y, z):
     return x * x + y * y + z * z
 
 
-@inlined
+@jit_inline
 def _outside(below, above):
     """How far something is below or above an interval [m]."""
     outside = max(below, above)
     return max(outside, 0.0)
 
 
-@inlined
+@jit_inline
 def _keep(out, least, c, bound, end):
     """Write the bound of a distance over a step, ``end`` at its end; far, if an earlier step has come as near."""
     before = least[c]
-    out[c] = where_positive(bound - (before - _SAME), filled(_FAR), bound)
+    out[c] = where_positive(bound - (before - _SAME), fill_lanes(_FAR), bound)
     least[c] = min(before, end)
 
 
-@compiled
+@jit
 def bound_step(s, row):
     """Write the bounds of the step in row ``row`` of a `Search` s."""
     points, out, least, n = s.points[row], s.bounds[row], s.least, s.radius.shape[0]
-    near, at_end, beside = filled(_FAR), filled(_FAR), filled(_FAR)
+    near, at_end, beside = fill_lanes(_FAR), fill_lanes(_FAR), fill_lanes(_FAR)
     for pair in range(s.pairs.shape[0]):
         i, j = s.pairs[pair, 0], s.pairs[pair, 1]
         radii = s.radius[i] + s.radius[j]
         X = points[2, 3 * i] - points[2, 3 * j]
         Y = points[2, 3 * i + 1] - points[2, 3 * j + 1]
         Z = points[2, 3 * i + 2] - points[2, 3 * j + 2]
-        along, level = filled(_FAR), filled(_FAR)
+        along, level = fill_lanes(_FAR), fill_lanes(_FAR)
         x = y = z = X
         for k in range(5):
             x = points[k, 3 * i] - points[k, 3 * j]
@@ -167,8 +167,18 @@ def bound_step(s, row):
         at_end = min(at_end, end * inverse_root_of(end) - radii)
     _keep(out, least, SEPARATIONS, near, at_end)
     out[STACKS] = beside
-    low, low_end, clear, clear_end = filled(_FAR), filled(_FAR), filled(_FAR), filled(_FAR)
-    high, high_end, fast, fast_end = filled(-_FAR), filled(-_FAR), filled(0.0), filled(0.0)
+    low, low_end, clear, clear_end = (
+        fill_lanes(_FAR),
+        fill_lanes(_FAR),
+        fill_lanes(_FAR),
+        fill_lanes(_FAR),
+    )
+    high, high_end, fast, fast_end = (
+        fill_lanes(-_FAR),
+        fill_lanes(-_FAR),
+        fill_lanes(0.0),
+        fill_lanes(0.0),
+    )
     for i in range(n):
         q = 3 * i
         v = 3 * n + q
@@ -184,7 +194,7 @@ def bound_step(s, row):
             z0, z1 = min(z0, points[k, q + 2]), max(z1, points[k, q + 2])
         low, high = min(low, z0), max(high, z1)
         low_end, high_end = min(low_end, z), max(high_end, z)
-        far, far_end = filled(_FAR), filled(_FAR)  # squares
+        far, far_end = fill_lanes(_FAR), fill_lanes(_FAR)  # squares
         for b in range(s.boxes.shape[0]):
             x_low, y_low, z_low = s.boxes[b, 0], s.boxes[b, 1], s.boxes[b, 2]
             x_high, y_high, z_high = s.boxes[b, 3], s.boxes[b, 4], s.boxes[b, 5]
@@ -206,7 +216,7 @@ def bound_step(s, row):
     s.nearest[0] = min(s.nearest[0], clear)
 
 
-@compiled
+@jit
 def begin_forces(t, gauge, s):
     """Begin with the forces ``gauge`` (5N + 2m,) at a start or after a jump, at t [s]."""
     for c in range(s.forces.shape[1]):
@@ -214,7 +224,7 @@ def begin_forces(t, gauge, s):
     s.moments[0], s.moments[1] = -math.inf, t
 
 
-@compiled
+@jit
 def bound_forces(t, s, row, before):
     """Write the bounds of forces at the end t [s] of the step in row ``row``, and around that of the row ``before``.
 
@@ -226,7 +236,7 @@ def bound_forces(t, s, row, before):
     ends, peaks = s.bounds[row, FIRST_FORCE:], s.bounds[before, FIRST_FORCE:]
     ta, tb = s.moments[0], s.moments[1]
     for kind in range(FORCES):
-        ends[kind] = filled(-_FAR)
+        ends[kind] = fill_lanes(-_FAR)
     for c in range(gauge.shape[0]):
         kind = c // n if c < 3 * n else 3 + (c - 3 * n) // m
         a, b, v = forces[0, c], forces[1, c], abs(gauge[c])
@@ -289,7 +299,7 @@ def _landing(monitor: Monitor) -> bool:
     return low < math.inf or any(monitor.standing.tolist()) or fenced
 
 
-@compiled
+@jit
 def _hand_over(s, points, gauge, first, stop, listed, count):
     """Write into each flight's trail its listed steps, and what a search for forces asks of their neighbours."""
     rows, states, forces = s.bounds.shape[0], points.shape[2], gauge.shape[1]
@@ -311,7 +321,7 @@ def _hand_over(s, points, gauge, first, stop, listed, count):
                         put(gauge[row, g, lane], trail[1], forces * row + g)
 
 
-@compiled
+@jit
 def _list(s, first, start, stop, every, limits, margins, of_lanes, listed, count, points, gauge):
     """Write the steps to search, for distances and for forces, into ``listed`` (8, 2, S), their number into ``count``.
 
@@ -323,10 +333,10 @@ def _list(s, first, start, stop, every, limits, margins, of_lanes, listed, count
     for c in range(DISTANCES):
         limits[c] = s.least[c] + (_MARGIN + _SHARE * abs(s.least[c]))
         if c in (SEPARATIONS, CLEARANCES):  # a first contact counts, too
-            limits[c] = max(limits[c], filled(_MARGIN))
+            limits[c] = max(limits[c], fill_lanes(_MARGIN))
     for c in range(FORCES):  # thrust beyond a limit that is none is never greatest
         greatest = s.greatest[c]
-        limits[DISTANCES + c] = where_positive(-0.5 * _FAR - greatest, filled(0.0), greatest)
+        limits[DISTANCES + c] = where_positive(-0.5 * _FAR - greatest, fill_lanes(0.0), greatest)
     if start > 0:  # the step that has stayed
         for lane in range(listed.shape[0]):
             listed[lane, 1, 0], count[lane, 1] = 0, 1

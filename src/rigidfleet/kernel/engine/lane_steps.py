@@ -19,13 +19,13 @@ step, and forces are known at its middle, too. This takes one more evaluation.
 
 import numpy as np
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.compiler.simd import spread
 from rigidfleet.kernel.dopri5 import step_to_knot
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.engine.lane_bounds import begin_forces, bound_forces, bound_step
 from rigidfleet.kernel.records import EVALUATIONS, FIRST_ROW, SAMPLES, TIME, TRAILED
-from rigidfleet.kernel.vectors import filled, rough_inverse
+from rigidfleet.kernel.vectors import fill_lanes, rough_inverse
 
 #: Number of stages; rows of `IntegratorState.K` after them: the last ones are the state halfway, and its derivative.
 STAGES = 9
@@ -76,15 +76,15 @@ HALF = np.array(
 _AA, _EA, _HALF_A = A @ A, E @ A, HALF @ A
 
 
-@compiled
+@jit
 def forget_stages(k, first):
     """As `dopri5.forget_stages`."""
     for s in range(first, STAGES):
         for q in range(k.shape[1]):
-            k[s, q] = filled(0.0)
+            k[s, q] = fill_lanes(0.0)
 
 
-@inlined
+@jit_inline
 def _sum(k, q, w, first, end):
     """Sum of w_j k[j, q] over stage 0 and the stages from ``first`` (1, 2 or 3) to before ``end``, literals."""
     total = w[0] * k[0, q]
@@ -107,12 +107,12 @@ def _sum(k, q, w, first, end):
     return total
 
 
-@inlined
+@jit_inline
 def _weights(w, h):
     return h * w[0], h * w[1], h * w[2], h * w[3], h * w[4], h * w[5], h * w[6], h * w[7], h * w[8]
 
 
-@inlined
+@jit_inline
 def _to_state(k, row, coordinates, w, x, hc, s):
     """Write into a row the state that the first s stages, a literal, lead to, so that no term of weight zero is left.
 
@@ -133,19 +133,19 @@ def _to_state(k, row, coordinates, w, x, hc, s):
         k[row, q] = k[STATE, q] + _sum(k, q, w, of_rates, s)
 
 
-@inlined
+@jit_inline
 def _to_stage(k, coordinates, s, h):
     """Write the state of stage s, a literal."""
     _to_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
 
-@inlined
+@jit_inline
 def _coordinates(k, p):
     """Number of coordinates of all positions, for an `UnrolledProblem` p."""
     return (k.shape[1] - p.before.shape[0]) // 2
 
 
-@inlined
+@jit_inline
 def advance(k, stage, _a, h, p):
     """As `dopri5.advance`."""
     coordinates = _coordinates(k, p)
@@ -171,7 +171,7 @@ def advance(k, stage, _a, h, p):
         _to_stage(k, coordinates, 8, h)
 
 
-@inlined
+@jit_inline
 def _squared_error(k, q, e, rtol):
     """Square of an error over its tolerance."""
     size = max(abs(k[STATE, q]), abs(k[TRIAL, q]))
@@ -179,11 +179,11 @@ def _squared_error(k, q, e, rtol):
     return e * e
 
 
-@inlined
+@jit_inline
 def squared_errors(k, h, rtol, p):
     """As `dopri5.squared_errors`."""
     coordinates = _coordinates(k, p)
-    squares = filled(0.0)
+    squares = fill_lanes(0.0)
     v, r = _weights(E, h), _weights(_EA, h * h)
     for q in range(coordinates):
         i = coordinates + q
@@ -194,13 +194,13 @@ def squared_errors(k, h, rtol, p):
     return squares
 
 
-@inlined
+@jit_inline
 def step_size(t, h, t_end, p):
     """As `dopri5.step_size`; the tables of an `UnrolledProblem` are named as those of a `Disturbance`."""
     return step_to_knot(t, h, t_end, p)
 
 
-@inlined
+@jit_inline
 def _put_points(points, q, y, quarter, y_new, slope, slope_new):
     """Write Bernstein coefficients of a state q over half a step, from its value after a quarter of the step.
 
@@ -211,7 +211,7 @@ def _put_points(points, q, y, quarter, y_new, slope, slope_new):
     points[2, q] = (16.0 * quarter - (y + y_new) - 4.0 * (first + last)) * (1 / 6)
 
 
-@inlined
+@jit_inline
 def _put_halves(k, q, slopes, h, early, late):
     """Write the coefficients of a state over both halves of a step into ``early`` and ``late`` (5, n).
 
@@ -228,7 +228,7 @@ def _put_halves(k, q, slopes, h, early, late):
     _put_points(late, q, middle, last, y_new, s * d_middle, s * d_new)
 
 
-@compiled
+@jit
 def keep_step(t, h, p, w, state):
     """As `dopri5.keep_step`, for all flights; `lane_bounds.list_steps` hands them the steps to search.
 
@@ -264,7 +264,7 @@ def keep_step(t, h, p, w, state):
     state.count[TRAILED] += 2
 
 
-@compiled
+@jit
 def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
     for g in range(p.search.gauge.shape[1]):
@@ -272,7 +272,7 @@ def keep_start(p, w, state):
     begin_forces(state.clock[TIME], p.gauge, p.search)
 
 
-@compiled
+@jit
 def keep_samples(t, h, t_new, times, samples, p, state):
     """As `dopri5.keep_samples`, for each flight into its own samples, from the rows of a step that is kept."""
     search, count = p.search, state.count

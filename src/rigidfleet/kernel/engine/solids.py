@@ -2,7 +2,7 @@
 
 from numba import typeof
 
-from rigidfleet.kernel.compiler.jit import compiled
+from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.compiler.pointers import pointer
 from rigidfleet.kernel.engine.native import Watch
 from rigidfleet.kernel.engine.packing import examples, pack
@@ -15,7 +15,7 @@ from rigidfleet.solids.records import Solids
 _problem, _, _integrator, _, _, _monitor, *_ = (pointer(typeof(x)) for x in examples())
 
 
-@compiled
+@jit
 def _watch_steps(first, end, p, state, monitor, s):
     p, state, monitor = _problem(p), _integrator(state), _monitor(monitor)
     for step in range(first, end):

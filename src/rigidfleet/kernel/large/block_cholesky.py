@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.typing import Ints
 
 
@@ -63,7 +63,7 @@ def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pat
     return blocks_of
 
 
-@compiled
+@jit
 def elimination_tree(first, left, parent, ancestor):
     """Parent (N,) of each column: the first row below its diagonal in L; -1 at a root (Liu, 1986)."""
     for k in range(parent.shape[0]):
@@ -77,7 +77,7 @@ def elimination_tree(first, left, parent, ancestor):
                 j = above
 
 
-@compiled
+@jit
 def count_blocks(first, left, parent, mark, count, most):
     """Add the blocks below the diagonal to each column's count (N,); return False for more than ``most`` in all."""
     total = 0
@@ -95,7 +95,7 @@ def count_blocks(first, left, parent, mark, count, most):
     return True
 
 
-@compiled
+@jit
 def fill_blocks(first, left, parent, mark, free, out):
     """Write the rows and columns of the blocks counted by `count_blocks`."""
     at = 0
@@ -116,7 +116,7 @@ def fill_blocks(first, left, parent, mark, free, out):
     out.first[parent.shape[0]] = at
 
 
-@compiled
+@jit
 def assemble(u, edges, m, mbar, mu, place, column, of_edge, L):
     """K = mbar J^T J + mu M into the blocks L (B, 9)."""
     for q in range(L.shape[0]):
@@ -136,7 +136,7 @@ def assemble(u, edges, m, mbar, mu, place, column, of_edge, L):
                 L[o, 3 * s + t] -= x
 
 
-@compiled
+@jit
 def factor(column, row, first, left, block, L, at):
     """Factor by blocks in place, column by column; return False if the matrix is not positive definite.
 
@@ -193,7 +193,7 @@ def factor(column, row, first, left, block, L, at):
     return True
 
 
-@inlined
+@jit_inline
 def precondition(R, place, column, row, L, r, w, z):
     """z = R (L L^T)^-1 R^T r for (N, 3) arrays, where R (3, 3) is the rotation since the factor was made."""
     for i in range(r.shape[0]):
@@ -231,7 +231,7 @@ def precondition(R, place, column, row, L, r, w, z):
             z[i, s] = R[s, 0] * w[k, 0] + R[s, 1] * w[k, 1] + R[s, 2] * w[k, 2]
 
 
-@compiled
+@jit
 def apply_J(u, edges, a, scale, out):
     """out (m,) += scale J a, for a (N, 3)."""
     for k in range(edges.shape[0]):
@@ -243,7 +243,7 @@ def apply_J(u, edges, a, scale, out):
         )
 
 
-@compiled
+@jit
 def apply_Jt(u, edges, b, scale, out):
     """out (N, 3) += scale J^T b, for b (m,)."""
     for k in range(edges.shape[0]):
@@ -254,7 +254,7 @@ def apply_Jt(u, edges, b, scale, out):
             out[j, q] -= s * u[k, q]
 
 
-@inlined
+@jit_inline
 def apply(u, edges, m, mbar, mu, a, out):
     """out = K a for (N, 3) arrays."""
     for i in range(m.shape[0]):
@@ -268,7 +268,7 @@ def apply(u, edges, m, mbar, mu, a, out):
         out[j, 0], out[j, 1], out[j, 2] = out[j, 0] - s * x, out[j, 1] - s * y, out[j, 2] - s * z
 
 
-@inlined
+@jit_inline
 def inner(a, b):
     """Sum of a b over (N, 3) arrays."""
     s = 0.0
@@ -277,7 +277,7 @@ def inner(a, b):
     return s
 
 
-@compiled
+@jit
 def project(u, edges, m, mbar, mu, g, past, G, x):
     """x (N, 3) = the combination of past solutions (P, N, 3) that is nearest to the solution of K x = g.
 
@@ -330,7 +330,7 @@ def project(u, edges, m, mbar, mu, g, past, G, x):
                 x[i, s] += c[p] * past[p, i, s]
 
 
-@compiled
+@jit
 def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, within, most, work):
     """Solve K x = g, starting from x, until |g - K x| <= within, all (N, 3); return the number of iterations.
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet.kernel.compiler.jit import compiled, inlined
+from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.rigid_body import centre_of_mass, inertia, inertia_inverse
 from rigidfleet.typing import Edges, Ints
 
@@ -39,7 +39,7 @@ def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
     return Order(narrow(agent), narrow(edge), narrow(other), np.where(first, 1, -1).astype(np.int8))
 
 
-@compiled
+@jit
 def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
     """Compute f_C (N, 3) of the exact law for b (m,) and return the smallest pivot; if LOST, write nothing.
 
@@ -56,7 +56,7 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
     return pivot
 
 
-@inlined
+@jit_inline
 def particular(u, b, order, a):
     """Write into a (N, 3) a solution of J a = b, agent by agent; return the smallest pivot.
 
@@ -101,7 +101,7 @@ def particular(u, b, order, a):
     return smallest
 
 
-@inlined
+@jit_inline
 def balance(r, m, M, cm, I_inv, a, f):
     """Forces f = M a (N, 3) of accelerations a (N, 3), without the rigid motion that carries their momentum.
 
@@ -126,7 +126,7 @@ def balance(r, m, M, cm, I_inv, a, f):
         f[i, 2] = m[i] * (a[i, 2] - p2 - (w0 * y - w1 * x))
 
 
-@compiled
+@jit
 def pull_back(u, order, f, multiplier):
     """Multipliers (m,) with J^T lambda = f for balanced forces f (N, 3), last agent first; f is overwritten.
 

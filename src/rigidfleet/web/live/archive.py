@@ -131,21 +131,18 @@ def _join(pieces: list[Piece]) -> Piece:
 
 
 def _combine(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> Piece:
-    """A piece of which each ``array`` is made of those of pieces of one phase."""
+    """A piece of which each ``array`` is made of those of pieces of one phase, also in its named tuples."""
 
     def combine(each: Sequence[Any]) -> Any:
-        if each[0] is None:
-            return None
-        return type(each[0])(*map(array, zip(*each, strict=True)))
+        if isinstance(each[0], tuple):
+            return type(each[0])(*map(combine, zip(*each, strict=True)))
+        return None if each[0] is None else array(each)
 
-    first = pieces[0]
-    time, integral, frame = (
-        array([getattr(p, name) for p in pieces]) for name in ("time", "integral", "frame")
+    names = ("time", "record", "integral", "frame", "vehicles", "layers")
+    time, record, integral, frame, vehicles, layers = (
+        combine([getattr(p, name) for p in pieces]) for name in names
     )
-    record, vehicles, layers = (
-        combine([getattr(p, name) for p in pieces]) for name in ("record", "vehicles", "layers")
-    )
-    leading = tuple(leading for p in pieces for leading in p.followed)
+    first, leading = pieces[0], tuple(step for p in pieces for step in p.followed)
     return Piece(
         first.phase, time, record, integral, frame, first.edges, first.attached, leading, vehicles, layers
     )  # fmt: skip

@@ -124,7 +124,7 @@ class Pilot:
         self.pose = self._reference()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
         self.target = PilotTarget(
-            self._raised(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1]
+            self._turning_point(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1]
         )
         self.last: Result | None = None
 
@@ -151,9 +151,8 @@ class Pilot:
     @property
     def busy(self) -> bool:
         """Whether the formation is changing."""
-        phase, settle = self.commanded[-1], 0.0
-        if phase.control == "open":
-            settle = _STEADY
+        phase = self.commanded[-1]
+        settle = _STEADY if phase.control == "open" else 0.0
         blend = phase.shaping.least_time if phase.shaping is not None else 0.0
         return self.t < self.phases[-1].t_start + blend + settle - 1e-9
 
@@ -327,11 +326,11 @@ class Pilot:
     def _begin_formation(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
         common: dict[str, Any] = {"formation": formation, "blend": _BLEND, "duration": _ENDLESS}
+        law = "open" if establish else "body"
+        common["control"] = law if self.by_body else "tracking"
         if establish:
-            common["control"] = "open" if self.by_body else "tracking"
             self._begin_phase(Establish(kind="establish", name=f"establish {formation}", **common))
         else:
-            common["control"] = "body" if self.by_body else "tracking"
             self._begin_phase(Reshape(kind="reshape", name=f"change to {formation}", **common))
 
     def _begin_hold(self) -> None:
@@ -370,7 +369,7 @@ class Pilot:
         cm, v = self.masses @ seen.position / total, self.masses @ seen.velocity / total
         return Pose(cm, v, frame if frame is not None else np.eye(3), np.zeros(3))
 
-    def _raised(self, r: Floats) -> Floats:
+    def _turning_point(self, r: Floats) -> Floats:
         """A point (3,) [m] at or above ``r``, high enough for the first formation to rotate about it."""
         slots = self.flight.plan.slots
         assert slots is not None  # every formation flown has slots
@@ -387,15 +386,9 @@ class Pilot:
         r, v, a = _step_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _step_towards(away, pose.omega, self.alpha, h, _TURN)
         if self.commanded[-1].control != "open":
-            self.flight.steer(
-                h,
-                pose,
-                (r, v, a),
-                (phi, omega, alpha),
-                a=self.a,
-                alpha=self.alpha,
-                force=self._drop_passed_gusts(),
-            )
+            force = self._drop_passed_gusts()
+            ends = (r, v, a), (phi, omega, alpha)
+            self.flight.steer(h, pose, *ends, a=self.a, alpha=self.alpha, force=force)
             T = att.dcm_from_rotation_vector(phi) @ pose.T
             self.pose = Pose(pose.r + r, v, T, omega)
             self.a, self.alpha = a, alpha
