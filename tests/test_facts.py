@@ -78,7 +78,7 @@ def flights() -> list[rf.Result]:
 @pytest.fixture
 def quick(monkeypatch):
     """Figures of a page in no time."""
-    monkeypatch.setattr(plotting, "rendered", lambda *_: {"svg": b"<svg/>"})
+    monkeypatch.setattr(plotting, "render_figure", lambda *_: {"svg": b"<svg/>"})
 
 
 @cache

@@ -148,6 +148,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
     """Check each formation at the end of the phases that shape it, and at the end of the flight."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
+    limits: dict[str, float] = {}  # of errors of edges, by formation
     for i, p in enumerate(phases):
         shaping = KINDS[p.kind].shapes or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:
@@ -156,8 +157,11 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         edges, _ = measured.edges(p.formation, last)
         held = False
         if p.distances is not None:
-            shortest = float(measured.formation(p.formation)[2].min())
-            limit = measured.mission.formations[p.formation].greatest_error(shortest)
+            if p.formation not in limits:
+                shortest = float(measured.formation(p.formation)[2].min())
+                form = measured.mission.formations[p.formation]
+                limits[p.formation] = form.greatest_error(shortest)
+            limit = limits[p.formation]
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
@@ -173,8 +177,8 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         )
         if held and not passed:
             left = measured.left[last]
-            form = measured.mission.formations[p.formation].shape
-            wanted = f"no {form}" if form else f"not the shape of '{p.formation}'"
+            shape = measured.mission.formations[p.formation].shape
+            wanted = f"no {shape}" if shape else f"not the shape of '{p.formation}'"
             place = np.cumsum(left) - 1  # of each agent among those left
             rigid = is_rigid(measured.result.position[last][left], place[edges])
             state = "rigid, but" if rigid else "held by its edges, but"

@@ -14,6 +14,7 @@ These are names of `rigidfleet.kernel.compiler.simd`. Functions around them woul
 """
 
 from rigidfleet.kernel.compiler.simd import (
+    fill_lanes,
     in_vectors,
     inverse_root_of,
     rough_inverse,

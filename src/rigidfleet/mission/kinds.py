@@ -1,6 +1,7 @@
 """The kinds of phases: their keys with unit and meaning, and the properties by which other modules tell them apart."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, get_args
@@ -61,8 +62,8 @@ class AnyPhase(Part):
     lands: ClassVar[bool] = False
     #: Whether other phases take its place before the flight, so that it cannot begin in flight.
     replaced: ClassVar[bool] = False
-    #: Whether the phase follows ways that are given, whose start has to be where the vehicles are.
-    led: ClassVar[bool] = False
+    #: Whether the phase follows curves of its own keys, whose start has to be where the vehicles are.
+    follows_curves: ClassVar[bool] = False
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
@@ -83,6 +84,12 @@ class AnyPhase(Part):
         (0.0, 0.0, 0.0),
         description="force on each agent in addition to weight compensation [N]; only with control 'open'",
     )
+
+    @property
+    def led(self) -> bool:
+        """The earlier name of `follows_curves`."""
+        warnings.warn("led is now follows_curves", DeprecationWarning, stacklevel=2)
+        return self.follows_curves
 
     @property
     def shaping(self) -> "Shaping | None":
@@ -522,7 +529,7 @@ class Cruising(AnyPhase):
 class Follow(Cruising):
     """Follow trajectories that another program made: the virtual body, or each vehicle its own."""
 
-    led: ClassVar[bool] = True
+    follows_curves: ClassVar[bool] = True
 
     kind: Literal["follow"] = Field(description="follow trajectories of a file")
     file: str | None = Field(

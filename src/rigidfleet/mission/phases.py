@@ -171,7 +171,7 @@ def _motion(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
         if "blend" in p.model_fields_set:
             remedy = "remove it, or use reference = 'shape' or 'distances'"
             yield Breach("blend", "has no effect with reference 'step'", remedy)
-    elif longest is None or p.led or not lasts > longest * (1 + 1e-9):
+    elif longest is None or p.follows_curves or not lasts > longest * (1 + 1e-9):
         return
     elif hasattr(p, "blend"):
         problem = f"is longer than the phase, which lasts {longest:g} s"
@@ -523,7 +523,7 @@ def _automatic(m: Draft, p: Phase, k: int) -> Breaches:
     if p.control != "tracking":
         problem = f"needs tracked slots to have a least time, not control '{p.control}'"
         yield Breach(keys[0], problem, "use control = 'tracking', or give a time")
-    timed = p.steering or p.shaping or p.vertical or p.led or p.replaced
+    timed = p.steering or p.shaping or p.vertical or p.follows_curves or p.replaced
     if p.duration == AUTO and not timed:
         problem = f"a phase of kind '{p.kind}' has no least duration"
         yield Breach("duration", problem, "give a duration")

@@ -65,7 +65,8 @@ def complete_times(mission: Mission) -> Mission:
     """
     mission = spelled_out(mission)
     last = max(
-        (k for k, phase in enumerate(mission.phases) if phase.automatic or phase.led), default=None
+        (k for k, phase in enumerate(mission.phases) if phase.automatic or phase.follows_curves),
+        default=None,
     )
     if last is None:
         return mission
@@ -93,7 +94,7 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
     """
     departure = depart(mission, phase, now)
     if problem := obstacle_to_course(phase, departure.now):
-        key = "file" if phase.led else "formation"
+        key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
         path = f"phases[{number + 1}].{key}"
         raise MissionError([Finding(mission.origin, path, None, problem, remedy)])

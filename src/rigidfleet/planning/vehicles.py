@@ -258,9 +258,8 @@ class TickTables:
                 dropped = _random_rows(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
         if self.links is not None and self.links.dropped:
             rows = _rows(first, last, sensing.link_every)
-            unheard = (
-                _random_rows(_UNHEARD, self.links.seed, rows, (self.n, self.n)) < self.links.dropped
-            )
+            share = _random_rows(_UNHEARD, self.links.seed, rows, (self.n, self.n))
+            unheard = share < self.links.dropped
         return fleet.TickInputs(
             first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard
         )

@@ -322,7 +322,7 @@ def limit_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     hopeless: set[str] = set()  # limits that no time keeps; each is told once
     for planned in preflight.planned_phases:
         phase = planned.leg.phase
-        if (mission.smooth or phase.led) and phase.control == "tracking":
+        if (mission.smooth or phase.follows_curves) and phase.control == "tracking":
             yield from _limits_of_reference(mission, planned, hopeless)
         else:
             yield from _limits_at_samples(mission, planned)

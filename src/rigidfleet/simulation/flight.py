@@ -351,7 +351,7 @@ class Flight:
             )  # fmt: skip
         except MissionError as error:
             # Only where a flight leaves it open can a phase of the mission be impossible: the rest are errors.
-            if by_hand or not (phase.automatic or phase.led):
+            if by_hand or not (phase.automatic or phase.follows_curves):
                 raise
             self.ending = "; ".join(f"phase '{phase.name}' {f.problem}" for f in error.findings)
             return False
