@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.kept import kept
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
@@ -327,6 +328,8 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         )
 
 
+# With `_agree` and `reference._leads`, saves a twentieth of a short flight, such as narrow-passage.
+@kept
 def _vehicles(masses: Floats, limit: Floats, saturate: bool, gravity: float) -> Vehicles:
     return Vehicles(
         masses.copy(), 1.0 / masses, float(masses.sum()), float(masses.mean()), limit.copy(), saturate, gravity
@@ -355,6 +358,7 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     return name if (off <= _NEAR * wanted.min()).all() else None
 
 
+@kept
 def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
     own = distance_geometry.distances(slots, edges)

@@ -160,6 +160,7 @@ def reference_kind(
     return _leads(before, target, edges, lengths)
 
 
+@kept
 def _leads(
     before: Floats, target: Floats, edges: Ints, lengths: Floats
 ) -> Literal["shape", "squares"]:
