@@ -382,7 +382,7 @@ def test_a_group_is_never_split():
     from rigidfleet.sweep.runner import _Sweeping
 
     class Gaps:
-        def there(self):
+        def finished_runs(self):
             there = np.ones(100, dtype=bool)
             there[[3, 4, 40, 97]] = False
             return there

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -215,6 +217,13 @@ def align_comments(text: str) -> str:
     """Align the comments beside keys in one column."""
     beside = re.compile(r"^([^#\n]*[^#\s]) +# ?(.*)$", re.MULTILINE)
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "aligned":
+        warnings.warn("aligned is now align_comments", DeprecationWarning, stacklevel=2)
+        return align_comments
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def _row(values: Sequence[float] | Floats) -> str:
