@@ -328,7 +328,7 @@ def _check_size(mission: Mission, phase: Phase) -> None:
         )
 
 
-# With `_agree` and `reference._leads`, saves a twentieth of a short flight, such as narrow-passage.
+# With `_agree`, `_pair_lengths` and `reference._leads`, saves a twentieth of a short flight, such as narrow-passage.
 @kept
 def _vehicles(masses: Floats, limit: Floats, saturate: bool, gravity: float) -> Vehicles:
     return Vehicles(
@@ -352,10 +352,17 @@ def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
+    pairs, wanted, most = _pair_lengths(slots)
+    off = np.abs(distance_geometry.distances(r, pairs) - wanted)
+    return name if (off <= most).all() else None
+
+
+@kept
+def _pair_lengths(slots: Floats) -> tuple[Ints, Floats, float]:
+    """All pairs of slots, their distances [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
     wanted = distance_geometry.distances(slots, pairs)
-    off = np.abs(distance_geometry.distances(r, pairs) - wanted)
-    return name if (off <= _NEAR * wanted.min()).all() else None
+    return pairs, wanted, _NEAR * float(wanted.min())
 
 
 @kept
