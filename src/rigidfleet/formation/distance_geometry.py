@@ -21,8 +21,8 @@ def distances(points: ArrayLike, edges: ArrayLike) -> Floats:
     """Lengths (m,) [m] of edges (m, 2) between points (N, 3)."""
     p = np.asarray(points, dtype=np.float64)
     e = np.asarray(edges, dtype=np.int64).reshape(-1, 2)
-    x, y, z = (p[e[:, 0]] - p[e[:, 1]]).T  # half the time of a norm, and the same bits
-    return np.sqrt(x * x + y * y + z * z)
+    ways = p[e[:, 0]] - p[e[:, 1]]
+    return np.sqrt(np.add.reduce(ways * ways, axis=1))  # half the time of a norm, and the same bits
 
 
 def dimension(points: ArrayLike, tol: float = 1e-6) -> int:

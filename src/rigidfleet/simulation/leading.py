@@ -96,7 +96,7 @@ class Leader:
     deviation: Detour = field(default_factory=Detour)
     clock: VirtualClock = field(default_factory=VirtualClock)
     waited: float | None = None
-    nearest_accelerations: float | None = None
+    steered: float | None = None
     steering: float = 0.0
     who: int = 0
 
