@@ -443,7 +443,7 @@ def test_assess_writes_what_a_flight_has(tmp_path, capsys):
     (read,) = json.loads((out / "verdict.json").read_text())["read"]
     assert (read["files"], read["vehicles"]) == (7, 7)
     assert rf.Result.load(out / "sequence_trajectories.nc").statistics["read"] == [read]
-    drawn = {"clearance.png", "cm.png", "trajectory.png"}
+    drawn = {"clearance.png", "cm.png", "motion.png", "trajectory.png"}
     assert {path.name for path in (out / "figures").iterdir()} == drawn
     page = (out / "report.html").read_text()
     assert "the polynomials of the file" in page
