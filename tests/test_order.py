@@ -13,7 +13,7 @@ import rigidfleet as rf
 from rigidfleet.planning.body_layer import Detour, least_distance, nearest_accelerations, rigid_rows
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock
-from rigidfleet.simulation.leading import Leader, Led
+from rigidfleet.simulation.leading import Leader, LeaderState
 from rigidfleet.web.replay.scene import observe
 
 #: A ball that crosses the path of the formation just ahead of it, from the side, and one that never comes near.
@@ -110,7 +110,7 @@ def led(phase, deviation, clock):
     assert given is not None
     leader = Leader(given, active.plan, 0.02)
     leader.clock, leader.deviation = clock, deviation
-    leader.now = Led(5.0, clock, deviation)
+    leader.now = LeaderState(5.0, clock, deviation)
     return leader
 
 

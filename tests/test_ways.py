@@ -15,7 +15,7 @@ from rigidfleet.planning.clearance import closest, greatest_speeds, pace
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.lattice import FreeSpace, keeps_room
 from rigidfleet.planning.preview import preview
-from rigidfleet.planning.timing import complete_times, spelled_out
+from rigidfleet.planning.timing import complete_times, expand_mission
 from rigidfleet.simulation.flight import Flight
 
 FORMS = {
@@ -166,7 +166,7 @@ def test_no_way_says_what_stands_in_it(keys, needs):
 def test_what_is_written_flies_the_same_bits(tmp_path):
     """The phases that are found, written and read again, fly exactly as the mission that asks for them."""
     mission = going(*wall(2.0, 3.0))
-    written = Mission.from_toml(spelled_out(mission).text)
+    written = Mission.from_toml(expand_mission(mission).text)
     assert not any(p.kind == "go" for p in written.phases)
     one, two = simulate(mission), simulate(written)
     assert np.array_equal(one.position, two.position)

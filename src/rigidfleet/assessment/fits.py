@@ -155,7 +155,7 @@ _shape_of_many = lru_cache(1)(_shape.__wrapped__)
 
 
 def _worst_pairs_of_few(p: Floats, slots: Floats) -> Floats:
-    """Worst error of a distance of few agents (G, N, 3), see `Laid.worst`; of equal errors the first pair's."""
+    """Worst error of a distance of few agents (G, N, 3), see `Alignments.worst`; of equal errors the first pair's."""
     i, j = proximity.all_pairs(p.shape[1])
     flown, intended = (length(x.take(i, axis=1) - x.take(j, axis=1)) for x in (p, slots))
     error = np.abs(flown - intended)

@@ -9,7 +9,7 @@ import numpy as np
 from rigidfleet._common.facts import Fact
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.assessment.measure import Measurements
-from rigidfleet.assessment.outcome import Extreme
+from rigidfleet.assessment.outcome import Extreme, keeps_limit
 from rigidfleet.assessment.verdict import Verdict
 from rigidfleet.result import Result
 
@@ -80,6 +80,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             row = Safety(
                 q.name_in_words, q.text, display_unit(q.unit), q.at_least, limit, worst, passed
             )
-            beyond = check is None and row.margin is not None and row.margin < -1e-9
+            beyond = check is None and worst is not None and limit is not None
+            beyond = beyond and not keeps_limit(q, worst.value, limit)
             rows.append(replace(row, passed=passed and not beyond))
     return rows

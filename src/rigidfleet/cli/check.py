@@ -52,7 +52,7 @@ def check(
     from rigidfleet._common.progress import watched_by
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import load_mission
-    from rigidfleet.planning.timing import complete_times, spelled_out
+    from rigidfleet.planning.timing import complete_times, expand_mission
 
     keep_existing(expand, force=force, other="give another path")
     watch = console.CheckWatch(mission)
@@ -60,7 +60,7 @@ def check(
         with watch, watched_by(watch.update):
             loaded = load_mission(mission)
             if expand is not None:
-                loaded = spelled_out(loaded)
+                loaded = expand_mission(loaded)
                 write_file(expand, (loaded.about + to_toml(loaded.to_dict())).encode())
             loaded = complete_times(loaded)
     except MissionError as error:

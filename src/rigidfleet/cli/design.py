@@ -86,7 +86,9 @@ def design(
         name, (slots, colours, notes) = points_of(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
         if edges is not None:
-            _reject(edges, reach, searched=extra != "0" or sensing_range is not None)
+            _refuse_options_that_clash(
+                edges, reach, searched=extra != "0" or sensing_range is not None
+            )
             if edges != "none":
                 kinds[edges] = designs.GRAPHS[edges](slots, REACH if reach is None else reach)
         else:
@@ -135,7 +137,7 @@ def design(
     return PASSED
 
 
-def _reject(edges: str, reach: float | None, *, searched: bool) -> None:
+def _refuse_options_that_clash(edges: str, reach: float | None, *, searched: bool) -> None:
     """Reject an unknown graph, and options that have no effect on it.
 
     Raises

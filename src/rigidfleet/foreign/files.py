@@ -272,7 +272,9 @@ def _read_file(path: Path, interpolation: Interpolation, units: Units) -> Trajec
     except OSError as error:
         raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
     if data.startswith(_HDF):
-        raise TrajectoryError(f"{path}: is a result of `rigidfleet run`. Use `rigidfleet report`.")
+        raise TrajectoryError(
+            f"{path}: is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`."
+        )
     suffix = path.suffix.lower()
     try:
         if data.startswith(_ZIP) or suffix == ".skyc":

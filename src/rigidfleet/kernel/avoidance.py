@@ -14,13 +14,13 @@ from numpy.typing import ArrayLike
 from rigidfleet.solids.records import CYLINDER, HEIGHTS, Solids, join
 from rigidfleet.typing import Floats, Ints
 
-#: Columns of `Avoidance.count`: ticks, entries of the list of neighbours, whether the list is too short.
+#: Columns of `AvoidanceArrays.count`: ticks, entries of the list of neighbours, whether the list is too short.
 TICKS, LISTED, FULL = range(3)
-#: Columns of `Avoidance.acted` and `Avoidance.first`: the barrier, the guard, the guard by braking.
+#: Columns of `AvoidanceArrays.acted` and `AvoidanceArrays.first`: the barrier, the guard, the guard by braking.
 BARRIER, GUARD, BRAKE = range(3)
 #: Bits of `SampledState.layers`, of the same three.
 ACTS = (1, 2, 4)
-#: Rows of `Avoidance.margin`: between two vehicles, between a vehicle and an obstacle.
+#: Rows of `AvoidanceArrays.margin`: between two vehicles, between a vehicle and an obstacle.
 PAIR, OBSTACLE = range(2)
 #: What is known of an obstacle that moves: nothing, its place, or its velocity, too; see `Sight.known`.
 UNKNOWN, FOLLOWED, KNOWN = range(3)
@@ -37,7 +37,7 @@ EXACT = 64
 
 
 class Sight(NamedTuple):
-    """What is known of B obstacles, as displacements from where they stand in `Avoidance.solids`."""
+    """What is known of B obstacles, as displacements from where they stand in `AvoidanceArrays.solids`."""
 
     moves: Ints  # (B,) 1 if it moves
     reach: float  # distance from a vehicle within which an obstacle is seen [m]; infinity: known in advance
@@ -283,7 +283,7 @@ def _each(x: ArrayLike, n: int) -> Floats:
 
 
 def _coast(k: Floats, T: float) -> Floats:
-    """Coefficients (N, 3) of a motion under a held acceleration and linear drag; see `Avoidance.coast`."""
+    """Coefficients (N, 3) of a motion under a held acceleration and linear drag; see `AvoidanceArrays.coast`."""
     x = k * T
     E = np.exp(-x)
     small = x < 0.05

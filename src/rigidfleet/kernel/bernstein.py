@@ -196,7 +196,7 @@ def shortest(curve, floor, work, pieces):
 
 
 @jit
-def beyond_plane(piece, distance, x, y, z):
+def distance_beyond_plane(piece, distance, x, y, z):
     """Lower bound of the distance between a curve with control points (15,) and something convex.
 
     The tangent plane at the nearest point to any point bounds it; the middle control point is near the curve. The plane
@@ -256,7 +256,7 @@ def nearest_box(curve, b, part, floor, pieces, boxes):
     while top >= 0:
         piece, count = pieces[top], count + 1
         distance, x, y, z = touch_box(piece[6], piece[7], piece[8], b, part, boxes)
-        bound = beyond_plane(piece, distance, x, y, z)
+        bound = distance_beyond_plane(piece, distance, x, y, z)
         if bound < best - close:
             for k in (0, 12):
                 distance, _, _, _ = touch_box(piece[k], piece[k + 1], piece[k + 2], b, part, boxes)

@@ -29,7 +29,7 @@ STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
 #: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
 UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
-#: A tick that no flight reaches (`Tables.last`).
+#: A tick that no flight reaches (`TickInputs.last`).
 ENDLESS = 1 << 62
 
 

@@ -36,11 +36,11 @@ from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.moving import (
     brake_beside,
     braking_beside,
+    clearance_beside_moving,
     follow_flow,
     is_known,
     look,
     miss,
-    need_beside,
     room_beside,
     stop_beside,
     way_to_rest,
@@ -75,7 +75,7 @@ def stop_distance(u, i, a):
 
 @jit
 def predict(i, r, v, c, a, out):
-    """Motion of vehicle i from r, v (3,) under an acceleration c (3,) held for a tick; see `Avoidance.trial`.
+    """Motion of vehicle i from r, v (3,) under an acceleration c (3,) held for a tick; see `AvoidanceArrays.trial`.
 
     Returns the distance from r that it cannot leave in the tick, and by braking after it.
     """
@@ -333,7 +333,7 @@ def set_floor_beside(t, i, o, r, v, closest, a):
     if not is_known(o, a):
         return closest
     stop, speed = stop_beside(i, o, r, v, a)
-    need, way = need_beside(i, o, speed, braking_beside(i, o, a), a), a.shifted
+    need, way = clearance_beside_moving(i, o, speed, braking_beside(i, o, a), a), a.shifted
     apart = from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
     a.walls[i, o] = need
     if a.threat[i] < 0:  # also one that is still far: a single tick may bring it near

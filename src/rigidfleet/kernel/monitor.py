@@ -633,7 +633,7 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
         at[k], rank[k] = ta if k == 0 else tb if k == 1 else tc, k
     # Entries peak at different times: the most promising one is looked at first, and all are judged there.
     for count in range(3, at.shape[0]):
-        in_step = step if top <= end_of(step, state) else step + 1
+        in_step = step if top <= end_time(step, state) else step + 1
         evaluate(top, in_step, p, w, state, monitor, values[count])
         # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
@@ -663,7 +663,7 @@ def row_of(step, state):
 
 
 @jit
-def end_of(step, state):
+def end_time(step, state):
     """Time [s] at which a step of the trail ends."""
     row = row_of(step, state)
     return state.trail.clock[row, 0] + state.trail.clock[row, 1]
@@ -672,7 +672,7 @@ def end_of(step, state):
 @jit
 def watch_middle(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
-    start, end = state.trail.clock[row_of(step, state), 0], end_of(step, state)
+    start, end = state.trail.clock[row_of(step, state), 0], end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
     evaluate(middle, step, p, w, state, monitor, values)
     look_between(before, values, after, step, start, middle, end, p, w, state, monitor)
@@ -690,7 +690,7 @@ def watch_forces(last, p, w, state, monitor):
         step = k if listed == ANY_STEP else monitor.listed[1, k]
         new = step > 0 or not stayed
         row = row_of(step, state)
-        start, end = trail.clock[row, 0], end_of(step, state)
+        start, end = trail.clock[row, 0], end_time(step, state)
         after = trail.gauge[row]
         earlier = trail.gauge[row_of(step - 1, state)] if step > 0 else before
         if step == 0 and new:
@@ -702,7 +702,7 @@ def watch_forces(last, p, w, state, monitor):
         if step == 0 and new:
             watch_middle(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
-            then, until = trail.gauge[row_of(step + 1, state)], end_of(step + 1, state)
+            then, until = trail.gauge[row_of(step + 1, state)], end_time(step + 1, state)
             look_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
             watch_middle(step, earlier, after, p, w, state, monitor)

@@ -181,7 +181,7 @@ def way_to_rest(u, b, lag, T):
 
 
 @jit
-def need_beside(i, o, speed, b, a):
+def clearance_beside_moving(i, o, speed, b, a):
     """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
     bound = a.sight.bound[o]
     return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / b

@@ -115,8 +115,8 @@ def _closest_of_many(r: Floats, radius: Floats) -> tuple[Floats, Ints]:
     """`separation` of many agents r (K, N, 3), all finite, in O(N) or O(N log N) per sample.
 
     A tree finds the near pairs at one sample. They are used for later samples as long as no other pair can have come
-    as near: apart from rigid motion of the whole, agents that have moved by at most ``moved`` have changed no distance
-    by more than twice that.
+    as near: apart from rigid motion of the whole, agents that have moved by at most some way (`_greatest_move`) have
+    changed no distance by more than twice that.
     """
     least, pair = np.empty(len(r)), np.empty((len(r), 2), dtype=np.int64)
     near, rest = None, np.zeros((3, 0))

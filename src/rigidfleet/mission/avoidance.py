@@ -78,7 +78,7 @@ def reaction_times(models: Sequence[VehicleModel], disturbances: Disturbances | 
 def reaction_lags(
     models: Sequence[VehicleModel], disturbances: Disturbances | None, gravity: float
 ) -> Floats:
-    """Lags (N, 3, 3) of `Avoidance.ahead`; 0 of points.
+    """Lags (N, 3, 3) of `AvoidanceArrays.ahead`; 0 of points.
 
     Commands take the time in which the torques of hovering rotors turn the tilt from one limit to the other, so that
     attitude follows them linearly, and no thrust is lost to torques.

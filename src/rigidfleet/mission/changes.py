@@ -68,10 +68,10 @@ def with_scales(
                     "slots": tuple(map(tuple, (scale * slots).tolist())),
                     "distances": smaller,
                 }
-                known[scaled_name(name, scale)] = form.model_copy(update=shrunk)
+                known[scaled_formation_name(name, scale)] = form.model_copy(update=shrunk)
     return known
 
 
-def scaled_name(name: str, scale: float) -> str:
+def scaled_formation_name(name: str, scale: float) -> str:
     """Name of a formation that is shrunk by a factor."""
     return f"{name} x {scale:g}"

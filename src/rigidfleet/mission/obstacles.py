@@ -145,7 +145,7 @@ class Box(Moving):
 
     @property
     def form(self) -> Form:
-        """The box; turned by ``turn`` from world axes to its own."""
+        """The box, turned by its angles if it `is_turned`."""
         angles = np.deg2rad([self.roll_deg, self.pitch_deg, self.yaw_deg])
         return records.box(self.min, self.max, dcm_from_euler(angles) if self.is_turned else None)
 

@@ -46,7 +46,7 @@ _REST_WITHIN = 10.0
 #: the speed downwards there [m/s]. Both are well within what the verdict takes as standing on the ground.
 ABOVE, TOUCH_DOWN = 0.05, 0.2
 #: How far the first point of given ways may be off [m, m/s, rad], and the time in which the difference fades [s].
-_LED, _FADED = (0.1, 0.1, math.radians(5.0)), 1.0
+_START_TOLERANCES, _FADED = (0.1, 0.1, math.radians(5.0)), 1.0
 #: Ways of vehicles straight up or down that differ by less count as one [m].
 _LEVEL = 1e-9
 
@@ -216,21 +216,25 @@ def _whole_turns(yaw: float, near: float) -> float:
     return 2.0 * math.pi * round((near - yaw) / (2.0 * math.pi))
 
 
-def obstacle_to_course(phase: Phase, now: PhaseState) -> str:
+def course_conflict(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    return _MISLED.get(phase.kind, lambda *_: "")(phase, now)
+    return _MISMATCHES.get(phase.kind, lambda *_: "")(phase, now)
 
 
-def _misled_slots(phase: Reshape, now: PhaseState) -> str:
+def _slot_mismatch(phase: Reshape, now: PhaseState) -> str:
     """What keeps a change of shape from following its bent ways, if it has any."""
     if not phase.bent:
         return ""
     first = np.array(phase.control_points)[0]
     far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
-    return "" if far < _LED[0] else "begins in other slots than the phase before has led to"
+    return (
+        ""
+        if far < _START_TOLERANCES[0]
+        else "begins in other slots than the phase before has led to"
+    )
 
 
-def _misled_vehicles(phase: Follow, now: PhaseState) -> str:
+def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     """What keeps the virtual body, or each vehicle, from following its trajectory."""
     if now.pose is None or now.slots is None:
         return ""
@@ -245,7 +249,7 @@ def _misled_vehicles(phase: Follow, now: PhaseState) -> str:
         np.linalg.norm(first[..., 0] - place, axis=1),
         np.linalg.norm(first[..., 1] * (knots[-1] / length) - speed, axis=1),
     )
-    for far, most, unit in zip(off, _LED, ("m", "m/s"), strict=False):
+    for far, most, unit in zip(off, _START_TOLERANCES, ("m", "m/s"), strict=False):
         i = int(far.argmax())
         if far[i] > most:
             who = "the virtual body" if alone else f"agent {i + 1}"
@@ -258,7 +262,7 @@ def _misled_vehicles(phase: Follow, now: PhaseState) -> str:
     if phase.turns_away:
         T1 = att.dcm_from_euler(np.array([0.0, 0.0, pieces[0, 0, 3, 0]]))
         angle = float(np.linalg.norm(att.rotation_vector_from_dcm(pose.T @ T1.T)))
-        if angle > _LED[2]:
+        if angle > _START_TOLERANCES[2]:
             return f"its first attitude, yaw {math.degrees(pieces[0, 0, 3, 0]):.1f}°, is {math.degrees(angle):.1f}° off"
     return ""
 
@@ -347,7 +351,7 @@ _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "turn": _turn,
 }
 #: Function of each kind of phase that may follow given ways, which says what keeps it from that.
-_MISLED: dict[str, Callable[[Any, PhaseState], str]] = {
-    "follow": _misled_vehicles,
-    "reshape": _misled_slots,
+_MISMATCHES: dict[str, Callable[[Any, PhaseState], str]] = {
+    "follow": _vehicle_mismatch,
+    "reshape": _slot_mismatch,
 }

@@ -12,7 +12,7 @@ from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, Obstacle
-from rigidfleet.mission.changes import scaled_name
+from rigidfleet.mission.changes import scaled_formation_name
 from rigidfleet.mission.kinds import Go
 from rigidfleet.planning.lattice import Change, Path
 from rigidfleet.planning.reference import align_slots
@@ -43,11 +43,11 @@ def candidate_shapes(mission: Mission, phase: Go, own: str) -> Iterator[Candidat
     """The formation as it is, others, and smaller ones; others only if their agents keep the limits of separation."""
     limits, radius = mission.limits, mission.fleet.radius
     names = tuple(mission.formations) if phase.formations is None else phase.formations
-    shrunk = {scaled_name(n, x) for n in mission.formations for x in phase.scales}
+    shrunk = {scaled_formation_name(n, x) for n in mission.formations for x in phase.scales}
     others = [n for n in names if n != own and n not in shrunk]
     stages = [(own, 0), *((n, 1) for n in others)]
     for scale in sorted(phase.scales, reverse=True):
-        stages += [(scaled_name(n, scale), 2) for n in (own, *others)]
+        stages += [(scaled_formation_name(n, scale), 2) for n in (own, *others)]
     for name, stage in stages:
         slots = mission.slots_about_cm(name) if name in mission.formations else None
         if slots is None:

@@ -245,7 +245,7 @@ def plan_phase(
         assert leg.goal is not None
         feedback = _feedback(mission, phase, leg.goal, leg.start, leg.arrival)
     method = solvers.choose(len(masses), edges, mission.constraint.solver)
-    held = _held(mission, name, now) if method == "dense" else None
+    held = _formation_in_shape(mission, name, now) if method == "dense" else None
     problem = Problem(
         body_formulation=mission.formulation == "body",
         has_frame=leg.frame is not None,
@@ -343,7 +343,7 @@ def _graph(edges: bytes, masses: bytes, *, large: bool) -> Graph:
     return graph(pairs, np.frombuffer(masses), large=large)
 
 
-def _held(mission: Mission, name: str | None, now: PhaseState) -> str | None:
+def _formation_in_shape(mission: Mission, name: str | None, now: PhaseState) -> str | None:
     """The formation, if the remaining agents are in it: all pairs within a tenth of the shortest distance."""
     slots = mission.formation_slots(name) if name else None
     if slots is None:

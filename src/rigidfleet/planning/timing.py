@@ -16,7 +16,7 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import points_passed
-from rigidfleet.planning.courses import obstacle_to_course
+from rigidfleet.planning.courses import course_conflict
 from rigidfleet.planning.legs import Departure, Leg, at_start, depart, leg_from
 from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
@@ -36,7 +36,7 @@ _MARGIN, _UNIT = 1.005, 1e-3
 SLACK = 1e-3
 
 
-def spelled_out(mission: Mission) -> Mission:
+def expand_mission(mission: Mission) -> Mission:
     """The mission with phases for its transitions (`transitions.expand_phases`) and ways (`ways.find_ways`).
 
     A mission with neither is returned as it is. The result's text is that of these phases; automatic times stay so.
@@ -50,12 +50,12 @@ def spelled_out(mission: Mission) -> Mission:
 
 
 def complete_times(mission: Mission) -> Mission:
-    """Return a mission whose transitions and ways are phases of their own (`spelled_out`), with its times known.
+    """Return a mission whose transitions and ways are phases of their own (`expand_mission`), with its times known.
 
     Automatic times are replaced by the least ones. A mission with neither is returned as it is.
 
     Times follow from the planned state at the start of each phase; a phase before that ends by settling is assumed to
-    have arrived. The text is that of `spelled_out`, so that a result repeats from it.
+    have arrived. The text is that of `expand_mission`, so that a result repeats from it.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def complete_times(mission: Mission) -> Mission:
         No transition keeps the separation, no time of a phase keeps the limits, its start is not known before the
         flight, or a phase ends too early for the times before it.
     """
-    mission = spelled_out(mission)
+    mission = expand_mission(mission)
     last = max(
         (k for k, phase in enumerate(mission.phases) if phase.automatic or phase.follows_curves),
         default=None,
@@ -93,7 +93,7 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
         No time keeps the limits, or the phase follows given ways that begin elsewhere.
     """
     departure = depart(mission, phase, now)
-    if problem := obstacle_to_course(phase, departure.now):
+    if problem := course_conflict(phase, departure.now):
         key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
         path = f"phases[{number + 1}].{key}"

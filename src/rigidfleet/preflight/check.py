@@ -48,8 +48,8 @@ def check(
     Parameters
     ----------
     mission : a shipped name, a path or a `Mission`
-    search : whether to search for other shapes with the same distances, from `STARTS` random starts per formation;
-        default: for up to `SEARCHED` agents
+    search : whether to search for other shapes with the same distances, from `formations.STARTS` random starts per
+        formation; default: for up to `SEARCHED` agents
     progress : called with a description of the next step
 
     Raises

@@ -236,7 +236,7 @@ class ActivePhase:
             quiet = self.t >= least and self._error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
-    def lead(self, problem: Problem) -> None:
+    def steer(self, problem: Problem) -> None:
         """Continue with another problem of the same size, such as one with a different reference, by hand."""
         self.stepper.steer(problem)
         self.renew(problem)

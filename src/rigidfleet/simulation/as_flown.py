@@ -26,7 +26,7 @@ def as_flown(
 
     Parameters
     ----------
-    asked : each phase as it was begun
+    begun : each phase as it was begun
     step : between samples [s]
     """
     records = _with_unique_names(flown)
@@ -143,7 +143,7 @@ def _data_as_flown(
     records: Sequence[PhaseRecord],
     step: float,
 ) -> dict[str, Any]:
-    """What differs from the data ``given`` for a mission, with these phases in place of its own."""
+    """What differs from the data of a mission, ``own``, with these phases in place of its own."""
     data: dict[str, Any] = {}
     end = records[-1].t_end
     data["output_step"] = min(step, end)

@@ -219,7 +219,7 @@ def _places(finished: Bools) -> Ints:
 
 
 def max_edge_error(r: Floats, edges: NDArray[np.integer], distances: Floats) -> Floats:
-    """Greatest error (B,) [m] of edges (m, 2) against the lengths ``asked`` (m,) [m], at positions (B, N, 3)."""
+    """Greatest error (B,) [m] of edges (m, 2) against the lengths ``distances`` (m,) [m], at positions (B, N, 3)."""
     return np.abs(_lengths(r, edges) - distances).max(axis=1, initial=0.0)
 
 

@@ -454,7 +454,7 @@ class Flight:
             feedback = problem.feedback._replace(
                 arrival=t, r=start.r, v=start.v, T1=np.ascontiguousarray(start.T), omega=start.omega
             )
-            active.lead(problem._replace(feedback=feedback, external=external))
+            active.steer(problem._replace(feedback=feedback, external=external))
             return
         (r, v, a_end), (phi, omega, alpha_end) = end, turn
         zero = np.zeros(3)
@@ -465,7 +465,7 @@ class Flight:
         times = np.array([t, t + h])
         pieces = np.ascontiguousarray(lqr.quintic_pieces(times, x, x_dot, x_ddot))
         motion = Motion(times, pieces, np.ascontiguousarray(start.T))
-        active.lead(problem._replace(motion=motion, external=external))
+        active.steer(problem._replace(motion=motion, external=external))
 
     def finish(self, ending: str = "") -> Result:
         """End the flight; return its record.

@@ -63,7 +63,7 @@ def layers(mission: Mission) -> Settings | None:
     return None if lost or not any(o.solid.moves for o in mission.obstacles) else settings
 
 
-class Led(NamedTuple):
+class LeaderState(NamedTuple):
     """A period that is led: when it begins [s], and clock and deviation there."""
 
     begun: float
@@ -102,7 +102,7 @@ class Leader:
 
     def __post_init__(self) -> None:
         self.problem = self.plan.problem
-        self.now: Led | None = None
+        self.now: LeaderState | None = None
         self.leads = False  # whether the reference flown is another than the plan's
         self.calm = True  # whether no barrier asks for more than the deviation's own decay
         self._unscalable: bool | None = None
@@ -128,7 +128,7 @@ class Leader:
             self.leads = False
             return self._late(self.problem)
         self.leads = True
-        self.now = Led(t, copy.copy(self.clock), self.deviation)
+        self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
         problem = self._piece(t, h, accelerations)
         lost = self.clock.advance(h)
         if lost > 0.0:

@@ -32,7 +32,7 @@ from rigidfleet.math.piecewise import (
     piece_at,
     refine,
 )
-from rigidfleet.mission import Mission, load_mission
+from rigidfleet.mission import Mission, as_mission
 from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
@@ -211,7 +211,7 @@ def judged_as(
     phase = {"kind": "hold", "name": PHASE, "control": "open", "duration": lasting}
     agents: dict[str, Any] = {"position": start.tolist()}
     if mission is not None:
-        own = mission if isinstance(mission, Mission) else load_mission(mission)
+        own = as_mission(mission)
         if own.n_agents != len(start):
             raise ResultError(
                 f"the mission {own.name!r} has {own.n_agents} agents, and there are {len(start)} trajectories."

@@ -2,7 +2,7 @@
 
 Every function takes coordinates x, y, z that are numbers, or arrays of one shape. NumPy runs it on arrays. The kernel
 compiles the same source for numbers (`rigidfleet.kernel.compiler.elementwise`), so there is one distance in plan,
-flight and verdict. What differs between numbers and arrays is in `choose`, `some`, `whole` and `zero`.
+flight and verdict. What differs between numbers and arrays is in `choose`, `some`, `floor` and `zero`.
 
 Points are in the solid's own axes, unless a docstring says otherwise.
 """
@@ -33,7 +33,7 @@ def some(test: Numbers) -> Any:
     return np.any(test)
 
 
-def whole(x: Numbers) -> Any:
+def floor(x: Numbers) -> Any:
     """The greatest integer below."""
     return np.floor(x).astype(np.int64)
 
@@ -204,7 +204,7 @@ def below(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
     u = np.minimum(np.maximum(x, 0.0), size[3])
     v = np.minimum(np.maximum(y, 0.0), size[4])
     p, q = u / size[3] * (n - 1), v / size[4] * (m - 1)
-    i, j = whole(np.minimum(p, n - 1.5)), whole(np.minimum(q, m - 1.5))
+    i, j = floor(np.minimum(p, n - 1.5)), floor(np.minimum(q, m - 1.5))
     p, q, at = p - i, q - j, first + i * m + j
     low, high = s.heights[at], s.heights[at + m + 1]
     lower = low + p * (s.heights[at + m] - low) + q * (high - s.heights[at + m])

@@ -26,7 +26,7 @@ overload(distance.choose, jit_options=OPTIONS)(
     lambda test, this, other: lambda test, this, other: this if test else other
 )
 overload(distance.some, jit_options=OPTIONS)(lambda test: lambda test: test)
-overload(distance.whole, jit_options=OPTIONS)(lambda x: _floor)
+overload(distance.floor, jit_options=OPTIONS)(lambda x: _floor)
 overload(distance.zero, jit_options=OPTIONS)(lambda x: lambda x: 0.0)
 
 for _function in distance.ELEMENTWISE:

@@ -172,7 +172,7 @@ class Vector:
 
     Parameters
     ----------
-    given : disturbances of the flights
+    disturbances : of the flights
     """
 
     def __init__(self, disturbances: Sequence[Disturbance]) -> None:

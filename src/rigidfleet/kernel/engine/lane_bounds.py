@@ -280,7 +280,7 @@ def list_steps(s: Search, first: int, steps: range, monitors: Sequence[Monitor])
     pairs = zip(nearest, monitors, strict=True)
     landed = [near <= x.pad + _MARGIN or _landing(x) for near, x in pairs]
     every = np.array([np.logical_or(landed, directed), directed]).T
-    _list(
+    _list_steps(
         s, first, steps.start, steps.stop, every, limits, margins, unpack(margins), listed, count,
         unpack(s.points), unpack(s.gauge),
     )  # fmt: skip
@@ -322,7 +322,9 @@ def _hand_over(s, points, gauge, first, stop, listed, count):
 
 
 @jit
-def _list(s, first, start, stop, every, limits, margins, of_lanes, listed, count, points, gauge):
+def _list_steps(
+    s, first, start, stop, every, limits, margins, of_lanes, listed, count, points, gauge
+):
     """Write the steps to search, for distances and for forces, into ``listed`` (8, 2, S), their number into ``count``.
 
     Of flights with ``every`` (8, 2), all steps, for distances and for forces. ``limits`` (11,) and ``margins`` (2,) are

@@ -44,7 +44,7 @@ class Archive:
         self.size = 0.0
 
     def add(self, pieces: Sequence[Piece], record: Result) -> None:
-        """Store the samples of a tick; ``told`` is the record of its end."""
+        """Store the samples of a tick; ``record`` is that of its end."""
         for piece in pieces:
             key = (piece.phase, len(piece.edges))
             fresh, archived = key not in self.phases, self.phases.setdefault(key, ArchivedPhase())
