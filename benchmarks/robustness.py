@@ -171,7 +171,7 @@ def shipped(seed: int) -> list[Case]:
     """The formations of up to 20 agents of missions that show formations, each once, from random starts."""
     found: dict[bytes, Case] = {}
     groups = (GROUPS[group] for group in ("The paper", "Shapes and rigidity", "Vehicles"))
-    for mission in map(load_mission, chain(*groups)):
+    for mission in map(load_mission, sorted(chain(*groups))):
         for name in mission.formations:
             slots = mission.formation_slots(name)
             if slots is None or len(slots) > LARGEST:
