@@ -208,8 +208,8 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        preparation = preparation_of(as_mission(mission))
-        self.mission = mission = preparation.mission
+        self._preparation = preparation_of(as_mission(mission))
+        self.mission = mission = self._preparation.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (("controller", controller), ("progress", progress)):
@@ -229,12 +229,12 @@ class Flight:
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
         r, v = mission.fleet.position.copy(), mission.fleet.velocity.copy()
-        self._reached = copy_with(at_start(mission), r=r, v=v)
+        self._begins = self._reached = copy_with(at_start(mission), r=r, v=v)
         self._vehicles = (
             FleetState(mission, self._push.max_step) if mission.vehicle_models else None
         )
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = preparation.disturbance if self._vehicles is None else None
+        self._disturbance = self._preparation.disturbance if self._vehicles is None else None
         self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
@@ -338,8 +338,7 @@ class Flight:
         if self._asked:
             self._report(phase, planning=True)
         try:
-            leg = timed_leg(self.mission, phase, self._now, len(self._asked))
-            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
+            plan = self._plan_from_now(phase)
             phase = plan.phase
             self._check_frame(plan)
             stepper = PointPhase
@@ -552,6 +551,14 @@ class Flight:
         return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
+
+    def _plan_from_now(self, phase: Phase) -> PhasePlan:
+        """The plan of a phase from the state now, with its times known."""
+        now, air, push = self._now, self._disturbance, self._push
+        if now is self._begins and now.lost is None:
+            return self._preparation.first_plan(phase, now, air, push)
+        leg = timed_leg(self.mission, phase, now, len(self._asked))
+        return plan_phase(self.mission, leg, disturbance=air, external=push)
 
     @property
     def _now(self) -> PhaseState:

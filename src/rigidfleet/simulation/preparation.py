@@ -1,14 +1,16 @@
-"""What all flights of a mission have in common, prepared once: times and disturbances."""
+"""What all flights of a mission have in common, prepared once: times, disturbances, the first plan."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from functools import cached_property
 
-from rigidfleet.kernel.problem import Disturbance
-from rigidfleet.mission import Mission
+from rigidfleet.kernel.problem import Disturbance, External
+from rigidfleet.mission import Mission, Phase
 from rigidfleet.planning.disturbances import disturbance
-from rigidfleet.planning.timing import complete_times
+from rigidfleet.planning.plan import PhasePlan, plan_phase
+from rigidfleet.planning.reference import PhaseState, copy_with
+from rigidfleet.planning.timing import complete_times, timed_leg
 
 #: Number of missions whose preparation is kept, and their greatest number of agents.
 _KEPT, _SMALL = 8, 200
@@ -19,6 +21,7 @@ class Preparation:
 
     def __init__(self, mission: Mission) -> None:
         self._mission = mission
+        self._plan: tuple[Phase, External, PhasePlan] | None = None
 
     @cached_property
     def mission(self) -> Mission:
@@ -29,6 +32,21 @@ class Preparation:
     def disturbance(self) -> Disturbance:
         """Disturbances of the flight of points."""
         return disturbance(self.mission)
+
+    def first_plan(
+        self, phase: Phase, now: PhaseState, disturbance: Disturbance | None, external: External
+    ) -> PhasePlan:
+        """The plan of a flight's first phase, from the mission's start; saves a third of the shortest flights.
+
+        A flight may change its plan, and the state before it, but none of their arrays.
+        """
+        last = self._plan
+        if last is None or last[0] is not phase or last[1] != external:
+            leg = timed_leg(self.mission, phase, now, 0)
+            plan = plan_phase(self.mission, leg, disturbance=disturbance, external=external)
+            _ = plan.certificate, plan.tolerances  # once for all flights
+            self._plan = last = phase, external, plan
+        return copy_with(last[2], before=copy_with(last[2].before))
 
 
 _preparations: OrderedDict[int, tuple[Mission, Preparation]] = OrderedDict()
