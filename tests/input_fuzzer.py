@@ -31,7 +31,7 @@ import numpy as np
 
 KINDS = ("check", "run", "result")
 #: Time of a case [s] and memory of all [bytes]; the kernel's own code and its libraries take half a GB of it.
-SECONDS, MEMORY = {"check": 240, "run": 60, "result": 60}, 3 << 30
+SECONDS, MEMORY = {"check": 60, "run": 60, "result": 60}, 3 << 30
 #: By the clock so many times that.
 _WAIT = 10
 #: Longer flights are not flown: they end, but not soon.

@@ -48,13 +48,18 @@ class FreeSpace(NamedTuple):
     obstacles: Sequence[Obstacle]
     fence: Floats
 
+    @property
+    def fenced(self) -> bool:
+        """Whether there is a geofence."""
+        return bool(np.isfinite(self.fence).any())
+
     def room(self, r: Floats, radius: Floats, most: Floats | float = np.inf) -> Floats:
         """Least distance (..., M) [m] of balls at r (..., M, 3) to an obstacle, or of their centres to the fence.
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
         least = self.apart(r, radius, most)
-        if np.isfinite(self.fence).any():
+        if self.fenced:
             least = np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
         return least
 
@@ -68,6 +73,8 @@ class FreeSpace(NamedTuple):
         Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
         spot is the same wherever it is: it is looked at once, as finely as halvings would.
         """
+        if not self.fenced:  # nothing is looked at: that took half of a search
+            return np.ones(len(a), dtype=np.bool_)
         parts = 2**_HALVINGS
         offsets, off = path((np.arange(parts) + 0.5) / parts), ways[:, None] / (2.0 * parts)
         low, high = (offsets.min(axis=0) - off).min(axis=0), (offsets.max(axis=0) + off).max(axis=0)
