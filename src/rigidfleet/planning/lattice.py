@@ -49,7 +49,7 @@ class FreeSpace(NamedTuple):
     fence: Floats
 
     @property
-    def fenced(self) -> bool:
+    def has_fence(self) -> bool:
         """Whether there is a geofence."""
         return bool(np.isfinite(self.fence).any())
 
@@ -59,7 +59,7 @@ class FreeSpace(NamedTuple):
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
         least = self.apart(r, radius, most)
-        if self.fenced:
+        if self.has_fence:
             least = np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
         return least
 
@@ -73,7 +73,7 @@ class FreeSpace(NamedTuple):
         Coordinates along a straight way are between those of its ends, however near the fence it runs. A path on the
         spot is the same wherever it is: it is looked at once, as finely as halvings would.
         """
-        if not self.fenced:  # nothing is looked at: that took half of a search
+        if not self.has_fence:  # nothing is looked at: that took half of a search
             return np.ones(len(a), dtype=np.bool_)
         parts = 2**_HALVINGS
         offsets, off = path((np.arange(parts) + 0.5) / parts), ways[:, None] / (2.0 * parts)
