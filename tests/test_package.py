@@ -23,7 +23,7 @@ def test_import_is_light():
 def test_unknown_name():
     """A name that the package does not have is an AttributeError that gives the name."""
     with pytest.raises(AttributeError, match="no attribute 'fly_me'"):
-        rigidfleet.fly_me  # noqa: B018
+        rigidfleet.fly_me  # noqa: B018  # ty: ignore[missing-attribute]
 
 
 @pytest.mark.parametrize("name", sorted(set(rigidfleet.__all__) - {"__version__"}))
