@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from rigidfleet._common.facts import Sheet
+    from rigidfleet.assessment import Verdict
     from rigidfleet.simulation.flight import Progress as FlightProgress
     from rigidfleet.sweep import SweepProgress
 
@@ -95,6 +96,14 @@ def print_json(data: object) -> None:
     import json
 
     print_exactly(json.dumps(data, ensure_ascii=False, indent=2, default=str) + "\n")
+
+
+def show_verdict(verdict: Verdict, *, json: bool = False, quiet: bool = False) -> None:
+    """Print a verdict, as JSON or in words."""
+    if json:
+        print_json(verdict.to_dict())
+    elif not quiet:
+        out().print(verdict)
 
 
 def complain(error: object) -> None:
