@@ -275,9 +275,9 @@ class Agents(Part):
             return data
         n = len(data["position"])
         full = {"velocity": [(0.0, 0.0, 0.0)] * n, "radius": 0.25, "thrust_limit": math.inf} | data
-        for key in full.keys() & {"mass", "radius", "thrust_limit"}:
-            if not isinstance(full[key], list | tuple):
-                full[key] = [full[key]] * n
+        for name in full.keys() & {"mass", "radius", "thrust_limit"}:
+            if not isinstance(full[name], list | tuple):
+                full[name] = [full[name]] * n
         return full
 
 
