@@ -198,9 +198,8 @@ def time_figure(
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
     shares = [1.0] * rows if shares is None else shares
-    stacked = (
-        (columns, rows) if is_narrow() else None
-    )  # the second column then stands below the first
+    # The second column then stands below the first.
+    stacked = (columns, rows) if is_narrow() else None
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)

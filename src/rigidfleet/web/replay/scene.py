@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from rigidfleet.result import Result
 
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
-_BOXES = (
-    200  # greatest number of obstacles that an overview fits one by one; more are fitted together
-)
+#: Greatest number of obstacles that an overview fits one by one; more are fitted together.
+_BOXES = 200
 #: Distance from the flight up to which obstacles that move are in sight, as a share of its length; places looked at.
 _BESIDE, _PLACES = 0.15, 100
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
