@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.text import Annotation, Text
     from matplotlib.transforms import Bbox
 
-Draw = Callable[[Result], "Figure"]
+Draw = Callable[..., "Figure"]
 
 #: Colours of the first twelve agents: those of Okabe and Ito's set that stand out on white, then colours as
 #: distinct from these as possible, to normal and to colour-blind vision.
@@ -130,9 +130,9 @@ def in_style(draw: Draw) -> Draw:
     """Draw a figure in our style."""
 
     @wraps(draw)
-    def draw_in_style(result: Result) -> Figure:
+    def draw_in_style(*what: Any, **more: Any) -> Figure:
         with settings():
-            figure = draw(result)
+            figure = draw(*what, **more)
             place_words(figure)
             return figure
 
