@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from rigidfleet.cli import outputs
+from rigidfleet.errors import ResultError
+
 #: Run by every Python as it starts. What Windows does not have is gone, and modes are those that it reports. A file
 #: that is open is neither replaced nor removed, text is not UTF-8 unless one says so, and nothing is below /proc.
 ELSEWHERE = """
@@ -62,7 +65,7 @@ for name in "pthread_sigmask SIGKILL SIGHUP SIGALRM SIGUSR1 alarm setitimer".spl
     delattr(signal, name)
 warnings.filterwarnings("error", category=EncodingWarning, module="rigidfleet")
 """
-#: A sweep by two processes, a result that replaces the one it was read from, a live flight that takes off and ends.
+#: A sweep by two processes, a store that is begun again, and files that replace those they were read from.
 SCRIPT = """
 import multiprocessing
 import rigidfleet as rf
@@ -81,8 +84,8 @@ if __name__ == "__main__":
     fly(sweep, "two", workers=1, replace=True)
     result = rf.Result.load("out/two-agents.nc")
     result.save("out/two-agents.nc")
-    rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial")
-    rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial", force=True)
+    rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial", flown=True)
+    rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial", flown=True, force=True)
 """
 
 
@@ -145,3 +148,27 @@ with open("held", "wb"), open("new", "wb") as new:
         print("kept")
 """
     assert run(elsewhere, "-c", code) == "kept\n"
+
+
+def test_a_stream_that_is_closed_takes_every_letter(elsewhere):
+    """A program without standard output, as behind a window, may print any letter, whatever the platform's code."""
+    code = """
+import sys
+from rigidfleet.cli import console
+sys.stdout = None
+console.prepare_streams()
+print("\u03c9")
+"""
+    assert run(elsewhere, "-c", code) == ""
+
+
+def test_a_drive_that_is_not_there(monkeypatch):
+    """Where no folder above a path exists, as on a missing drive, there is one clear error, and no endless search."""
+
+    def refuse(**_: object) -> None:
+        raise FileNotFoundError(2, "The system cannot find the path specified")
+
+    monkeypatch.setattr(os.path, "lexists", lambda _: False)
+    monkeypatch.setattr(outputs, "TemporaryFile", refuse)
+    with pytest.raises(ResultError, match="the system cannot find the path"):
+        outputs.Files(Path("Z:/flights/a"), "a").try_out()
