@@ -85,7 +85,7 @@ if __name__ == "__main__":
     result = rf.Result.load("out/two-agents.nc")
     result.save("out/two-agents.nc")
     rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial", flown=True)
-    rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial", flown=True, force=True)
+    rf.export(rf.Result.load("out/two-agents.nc"), "ways", format="polynomial", flown=True)
 """
 
 

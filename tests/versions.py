@@ -6,6 +6,8 @@
 - with the pinned ones (`constraints.txt`), on each other Python of `PYTHONS` that is on this machine;
 - with the newest that can be had, on the newest of these.
 
+Words choose among them: `python tests/versions.py newest`, or `pinned 3.12`.
+
 The first two must fly. What fails with the newest alone is reported, and ends nothing: it was released after the
 change that is being tested. A Python that is not here is named, and nothing is claimed of it.
 """
@@ -125,6 +127,7 @@ def main() -> int:
     if PYTHONS[0] in here:
         plan.insert(0, ("lowest", PYTHONS[0], "constraints-lowest.txt"))
     plan.append(("newest", [*here][-1], os.devnull))
+    plan = [entry for entry in plan if {*sys.argv[1:]} <= {*entry}]
     failures = 0
     with tempfile.TemporaryDirectory() as place:
         pins = ("--build-constraints", "constraints.txt")
