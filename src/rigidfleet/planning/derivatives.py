@@ -62,7 +62,7 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
         return series.product(way_series(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
     s = blend_series(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
-        turned = np.moveaxis(series.rotation(s[..., None] * reference.turn), 1, -1)
+        turned = series.rotation(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
         axes = series.product(axes, turned, _matrix_product)
     slots = reference.p0 @ axes
     if reference.dp.any():
@@ -74,7 +74,7 @@ def way_series(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
     ways = Piecewise(reference.knots, reference.ways)
     inside = np.clip(time, ways.time[0], ways.time[-1])
-    values = np.moveaxis(ways.series(inside, ORDERS), 1, -1)
+    values = ways.series(inside, ORDERS).transpose(0, 2, 3, 1)
     values[1:, ..., inside != time] = 0.0
     return values
 
@@ -100,7 +100,7 @@ def body_series(
     """
     way = Piecewise(motion.knots, motion.coefficients)
     inside = np.minimum(time, way.time[-1])
-    x = np.ascontiguousarray(np.moveaxis(way.series(inside, ORDERS), 1, -1))
+    x = np.ascontiguousarray(way.series(inside, ORDERS).swapaxes(1, 2))
     beyond = time > inside
     x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
     x[2:, :, beyond] = 0.0
@@ -109,7 +109,7 @@ def body_series(
         axes = np.zeros((orders, 3, 3, 1))
         axes[0] = motion.T1.T[..., None]
         return cm, axes
-    turned = np.moveaxis(series.rotation(phi.swapaxes(1, 2), orders), 1, -1)
+    turned = series.rotation(phi.swapaxes(1, 2), orders).transpose(0, 2, 3, 1)
     return cm, (motion.T1.T @ turned.reshape(orders, 3, -1)).reshape(turned.shape)
 
 

@@ -212,7 +212,7 @@ class Leader:
         for o in seen:
             x, bound = a.sight.track[o], a.sight.bound[o]
             away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
-            room = signed_distance(*own_axes(*np.moveaxis(away, -1, 0), o, a.solids), o, a.solids)
+            room = signed_distance(*own_axes(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
             room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
             if (worst := float(room.min())) < least:
                 least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
