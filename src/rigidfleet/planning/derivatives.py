@@ -59,7 +59,9 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     """Taylor series (5, 3, N, K) of each slot, from the `body_series` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body
     if len(reference.knots):
-        return series.product(way_series(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
+        return (
+            series.product(way_series(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
+        )
     s = blend_series(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
         turned = series.rotation(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
@@ -89,9 +91,7 @@ def _matrix_product(a: Floats, b: Floats) -> Floats:
     return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 
-def body_series(
-    motion: Motion, time: Floats, orders: int = ORDERS
-) -> tuple[Floats, Floats]:
+def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Floats, Floats]:
     """Taylor series (5, 3, K) [m] of the CM and (5, 3, 3, K) of the attitude, body to world, at times (K,) [s].
 
     Of a body that does not turn, the attitude has one time instead of K, and so nothing is multiplied K times. Fewer
