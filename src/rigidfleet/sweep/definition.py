@@ -287,9 +287,9 @@ class Sweep:
 
         ``values`` are those of the run, if they are known.
         """
-        return self._varied(self.mission, run, values)
+        return self._document_of(self.mission, run, values)
 
-    def _varied(
+    def _document_of(
         self, mission: Mission, run: int, values: Sequence[Any] | None = None
     ) -> dict[str, Any]:
         varied = {column.keys for column in self.columns}
@@ -313,13 +313,15 @@ class Sweep:
         MissionError
             It has errors.
         """
-        if self._expanded is not self.mission:
+        if self._mission_with_ways is not self.mission:
             with suppress(MissionError):  # errors are told of the mission as written
-                return Mission.from_plain(self._varied(self._expanded, run, values), f"run {run}")
+                return Mission.from_plain(
+                    self._document_of(self._mission_with_ways, run, values), f"run {run}"
+                )
         return Mission.from_plain(self.varied(run, values), f"run {run}")
 
     @cached_property
-    def _expanded(self) -> Mission:
+    def _mission_with_ways(self) -> Mission:
         """The mission with phases for its transitions and ways if nothing that varies matters to them, else as written.
 
         Then they are searched once for all runs. Every run has the same start, which varies by no key either.
