@@ -678,6 +678,8 @@ def test_any_executor_flies_a_sweep(tmp_path):
     finally:
         sys.setswitchinterval(before)
     assert table.passed.all()
+    with pytest.raises(TypeError, match="an Executor of concurrent"):
+        fly(asked, tmp_path, pool=lambda: ThreadPoolExecutor(1))  # ty: ignore[invalid-argument-type]
     assert numbers(table) == numbers(fly(asked, tmp_path / "alone", workers=1))
 
 

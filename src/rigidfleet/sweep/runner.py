@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.processes import cores
-from rigidfleet.errors import RigidfleetError
+from rigidfleet.errors import RigidfleetError, wrong_type
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.record import RunRecord
@@ -101,6 +101,8 @@ def fly(
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
+    if not isinstance(pool, Executor | None):
+        raise wrong_type("an Executor of concurrent.futures as pool", pool)
     own, folder = own_runs(shard, sweep.runs), shard_folder(Path(folder), shard)
     count = cores() if workers is None else workers
     with Store(folder, sweep, shard, replace) as store:
