@@ -31,7 +31,8 @@ from rigidfleet.assessment import assess
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import MissionError, ResultError, RigidfleetError, SweepError
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.timing import complete_times, expand_mission, matters_to_plan
 from rigidfleet.result import Extremum
 from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, merge, read
 from rigidfleet.sweep.figures import map_over_two, plot
@@ -298,6 +299,82 @@ def test_metrics_are_those_of_the_verdict(tmp_path):
     assert row.metrics["shape_end"] == verdict.phases[-1].shape
     assert row.metrics["steps"] == result.statistics["steps"]
     assert math.isnan(row.metrics["clearance"])
+
+
+FOUND = "narrow-passage-found"  # searches its way through a gap
+
+
+@pytest.mark.parametrize(
+    ("line", "searches"),
+    [("constraint.alpha = grid(0.4, 0.6)", 1), ("obstacles.3.min.1 += grid(0, 0.4)", 2)],
+)
+def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
+    monkeypatch, line, searches
+):
+    """A gain leaves the way, a wall may move it: rows are those of missions that search for themselves, to the bit."""
+    from rigidfleet.planning import ways
+    from rigidfleet.simulation.together import simulate_together
+
+    count, search = [0], ways._Search.mission_with_way
+
+    def counted(self: Any) -> Mission:
+        count[0] += 1
+        return search(self)
+
+    monkeypatch.setattr(ways._Search, "mission_with_way", counted)
+    varied = Sweep.of(FOUND, [line])
+    rows = fly_runs(varied, range(2))
+    assert count[0] == searches
+    alone = simulate_together([Mission.from_dict(varied.varied(k)) for k in range(2)])
+    assert count[0] == searches + 2
+    for row, result in zip(rows, alone, strict=True):
+        own = measure(result, assess(result))
+        assert row.passed
+        assert np.array_equal([*row.metrics.values()], [*own.values()], equal_nan=True)
+
+
+def test_what_matters_in_flight_alone_changes_no_way():
+    """Phases that are found are the same for other tolerances, air, noise and gains; all else counts as a change."""
+    written = load_mission(FOUND)
+    noise = {"position": 0.02, "velocity": 0.05, "rate": 20.0, "seed": 3}
+    gusts = {"model": "dryden", "altitude": 20.0, "correlation_length": 20.0, "seed": 1}
+    air = {"wind": [3.0, 1.0, 0.0], "drag": 0.4, "mass_error": 0.1, "gusts": gusts, "noise": noise}
+    other = {"integrator": {"rtol": 1e-5}, "constraint": {"alpha": 0.6}, "disturbances": air}
+    for keys in [
+        ("integrator", "rtol"),
+        ("constraint", "alpha"),
+        *(("disturbances", k) for k in air),
+    ]:
+        assert not matters_to_plan(written, keys)
+    assert written.to_dict().keys().isdisjoint(other)
+    changed = Mission.from_dict(written.to_dict() | other)
+    phases = [expand_mission(mission).to_dict()["phases"] for mission in (written, changed)]
+    assert phases[0] == phases[1]
+    assert len(phases[0]) > len(written.phases)
+    for path in (
+        "agents.position.1",
+        "agents.mass",
+        "obstacles.2",
+        "tracking.Q",
+        "disturbances.lost",
+    ):
+        assert matters_to_plan(written, tuple(path.split(".")))
+    settling = [{**PAIR["phases"][0], "settle": {}}]
+    del settling[0]["until"]
+    assert matters_to_plan(Mission.from_dict(PAIR | {"phases": settling}), ("constraint", "alpha"))
+    assert matters_to_plan(load_mission("passage-quadrotors"), ("constraint", "alpha"))
+
+
+def test_a_sweep_without_a_way_says_so_in_each_row():
+    """Where no way is found, each run is refused, with the reason that its mission alone has."""
+    tables = load_mission(FOUND).to_dict()
+    tables["phases"][-2]["position"] = [38.0, 70.0, 10.0]  # inside a wall
+    blocked = Sweep.of(Mission.from_dict(tables), ["constraint.alpha = grid(0.4, 0.6)"])
+    rows = fly_runs(blocked, range(2))
+    with pytest.raises(MissionError, match="its goal leaves agent") as caught:
+        complete_times(blocked.mission)
+    assert [row.reason for row in rows] == ["mission"] * 2
+    assert all(caught.value.findings[0].problem in row.detail for row in rows)
 
 
 def test_a_failed_run_is_a_row_with_its_reason(tmp_path):
