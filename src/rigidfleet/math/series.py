@@ -43,10 +43,13 @@ def rate(x: Floats) -> Floats:
 
 
 def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
-    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,)."""
+    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,).
+
+    In memory, x is the last axis: arithmetic on long rows is fast.
+    """
     coefficients = np.asarray(coefficients, dtype=float)
-    c = [coefficients[..., k] for k in range(coefficients.shape[-1])]
-    x = x.reshape(-1, *(1,) * (c[0].ndim - 1))
+    inner = range(1, coefficients.ndim - 1)
+    c = list(np.ascontiguousarray(coefficients.transpose(-1, *inner, 0)))
     powers = len(c)
     for order in range(min(orders, powers)):  # repeated synthetic division by (t - x)
         for k in range(powers - 2, order - 1, -1):
@@ -54,7 +57,7 @@ def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
     full = np.zeros((orders, *np.broadcast_shapes(x.shape, c[0].shape)))
     for order, values in enumerate(c[:orders]):
         full[order] = values
-    return full
+    return full.transpose(0, -1, *inner)
 
 
 def product(
