@@ -67,7 +67,9 @@ class Files:
             The folder cannot be written.
         """
         folder = self.folder.absolute()
-        while not os.path.lexists(folder):
+        while (
+            not os.path.lexists(folder) and folder != folder.parent
+        ):  # as on a drive that is not there
             folder = folder.parent
         try:
             TemporaryFile(dir=folder).close()

@@ -78,7 +78,7 @@ class Detour:
         def derivatives_at(x: Floats, end: Floats) -> Floats:
             value, rate, second = x
             bend = (end - second) * share
-            return np.stack(
+            return np.array(
                 [
                     value + dt * (rate + dt * (second / 2 + bend / 6)),
                     rate + dt * (second + bend / 2),
@@ -87,7 +87,7 @@ class Detour:
             )
 
         # The rotation vector from Q, whose rates are those of the body as long as it is small
-        spin = derivatives_at(np.stack([np.zeros(3), *self.omega]), accelerations[3:6])
+        spin = derivatives_at(np.array([np.zeros(3), *self.omega]), accelerations[3:6])
         Q = att.dcm_from_rotation_vector(spin[0]).T @ self.Q
         return Detour(
             derivatives_at(self.x, accelerations[:3]),
