@@ -2,9 +2,9 @@
 
 `python tests/mutants.py --into FILE` draws 100 mutants by a seed, over guard, barriers, monitor and checks in
 proportion to their lines of code, and tests each. It writes a line of JSON for each into the file, goes on there if it
-was stopped, tests survivors again, and lists those that are left. Each calls for a test, or for an entry in `mutants.toml` with the proof that
-nothing changes. `--count`, `--seed` and `--jobs` are as they say, `--only 3 7` takes some of those drawn, `--list` runs
-none, and `--as-is` tells which tests pass without a fault, and how long they take.
+was stopped, tests survivors again, and lists those that are left. Each calls for a test, or for an entry in
+`mutants.toml` with the proof that nothing changes. `--count`, `--seed` and `--jobs` are as they say, `--only 3 7` takes
+some of those drawn, `--list` runs none, and `--as-is` tells which tests pass without a fault, and how long they take.
 
 The operators:
 
