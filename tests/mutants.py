@@ -46,6 +46,7 @@ import time
 import tomllib
 import types
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -80,7 +81,13 @@ TARGETS = (
     Target("kernel/monitor.py", _MONITOR, "monitor"),
     Target(
         "assessment/checks.py",
-        ("test_assess.py", "test_losses.py", "test_quantities.py", *_MONITOR[1:]),
+        (
+            "test_assess.py",
+            "test_assess_files.py",
+            "test_losses.py",
+            "test_quantities.py",
+            *_MONITOR[1:],
+        ),
         "",
     ),
 )
@@ -242,6 +249,7 @@ def code_lines(tree: ast.Module) -> int:
     return len({site.line for site in sites_of(tree)})
 
 
+@cache
 def draw(count: int, seed: int) -> list[Mutant]:
     """Mutants drawn by a seed, in proportion to the lines of code of each file; no place and operator twice."""
     rng = np.random.default_rng(seed)

@@ -246,6 +246,32 @@ def test_margins_are_the_least_so_far_and_the_first_that_is_lost():
     assert [*a.between[OBSTACLE], *a.loser[OBSTACLE]] == [0, 0, 0, 0]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_who_is_nearer_to_an_obstacle_than_it_should_be_comes_no_nearer(seed):
+    """Past a ball, with less room than should be kept, and asked to fly into it: the stop segment keeps what it has."""
+    rng = np.random.default_rng(seed)
+    crowd = Crowd(1, solids=single(ball(np.zeros(3), 0.7)), clearance=0.3, filtered=False)
+    n = rng.normal(size=3)
+    n /= np.linalg.norm(n)
+    t = np.cross(n, rng.normal(size=3))
+    t /= np.linalg.norm(t)
+    r, v = (
+        n * (1.0 + rng.uniform(0.05, 0.29)) - t * rng.uniform(0.2, 1.2),
+        t * rng.uniform(1.0, 4.0),
+    )
+    kept = []
+    for k in range(20):
+        first, last = stop(r, v)
+        way = last - first
+        share = np.clip(-(first @ way) / (way @ way), 0.0, 1.0)
+        kept.append(float(np.linalg.norm(first + share * way)) - 1.0)
+        (c,) = crowd([r], [v], [-8.0 * r / np.linalg.norm(r)], t=k * T)
+        (r,), (v,) = course(r, v, c, 0.0, [T])
+    assert kept[0] < 0.3
+    assert min(kept) >= kept[0] - 1e-6
+    assert crowd.a.margin[OBSTACLE, 0] == pytest.approx(min(kept) - 0.3, abs=1e-6)
+
+
 class Beside:
     """One vehicle beside a ball at the origin, of a constant velocity w, in the frame of the ball."""
 
