@@ -86,6 +86,7 @@ TARGETS = (
             "test_assess_files.py",
             "test_losses.py",
             "test_quantities.py",
+            "test_spans.py",
             *_MONITOR[1:],
         ),
         "",

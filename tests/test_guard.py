@@ -543,9 +543,12 @@ def test_rigid_edges_pass_a_push_on_to_all(seed):
     J = J.reshape(len(edges) + 1, -1)
     inverse = np.repeat(1.0 / mass, 3)
     right = np.r_[np.zeros(len(edges)), needed(gap, -u, 0.9 * B, rate)]
-    expected = inverse * (J.T @ np.linalg.solve(J @ (inverse[:, None] * J.T), right))
+    forces = np.linalg.solve(J @ (inverse[:, None] * J.T), right)
+    expected = inverse * (J.T @ forces)
     assert right[-1] > 0.0
     assert took == pytest.approx(expected.reshape(n, 3), abs=1e-5)
+    assert crowd.a.known[2, 0] == pytest.approx(forces[-1] * m, rel=1e-4)  # by which edges let go
+    assert not crowd.a.known[2, 1:].any()
 
 
 def test_edges_let_go_as_they_are_pushed_and_take_hold_again():
