@@ -207,7 +207,7 @@ def turning(rng: np.random.Generator, steps: int, rate: float) -> tuple[np.ndarr
     )
     q *= np.sign(q @ q[0])[:, None]
     points = FROM_KNOTS @ q.reshape(steps, 5, 4)
-    matrices = Rotation.from_quat((BASIS @ points).reshape(-1, 4), scalar_first=True).as_matrix()
+    matrices = Rotation.from_quat((BASIS @ points).reshape(-1, 4)[:, [1, 2, 3, 0]]).as_matrix()
     return points, matrices.reshape(steps, len(FINE), 3, 3)
 
 
