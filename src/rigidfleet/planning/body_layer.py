@@ -37,9 +37,8 @@ _THIN = 1e-9
 class Detour:
     """What the reference of a body deviates from the planned one by, in world axes."""
 
-    x: Floats = field(
-        default_factory=lambda: np.zeros((3, 3))
-    )  # displacement, two derivatives [m, s]
+    # Displacement, two derivatives [m, s].
+    x: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     Q: Floats = field(default_factory=lambda: np.eye(3))  # rotation
     omega: Floats = field(default_factory=lambda: np.zeros((2, 3)))  # rates [rad/s], derivative
     scale: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))  # and two derivatives
@@ -99,9 +98,8 @@ class Detour:
 
     def series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
-        own = (
-            self.omega @ self.Q
-        )  # in the axes of Q, in which the derivative of the rates is the same
+        # In the axes of Q, in which the derivative of the rates is the same.
+        own = self.omega @ self.Q
         Q = series.from_rates(self.Q, own)
         return series.from_derivatives(self.x), Q, series.from_derivatives(self.scale)
 
@@ -115,9 +113,8 @@ def least_distance(G: Floats, h: Floats) -> Floats | None:
     f[-1] = 1.0
     u, _ = nnls(E, f)
     r = E @ u - f
-    if (
-        -r[-1] <= 1e-12
-    ):  # the residual of a consistent problem is not zero, and its last entry is its square
+    # The residual of a consistent problem is not zero, and its last entry is its square.
+    if -r[-1] <= 1e-12:
         return None
     return -r[:-1] / r[-1]
 
