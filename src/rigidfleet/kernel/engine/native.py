@@ -225,7 +225,7 @@ def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> 
 
 def call_large(name: str, *arguments: Any) -> float:
     """Call a function of `rigidfleet.kernel.elimination` or `rigidfleet.kernel.block_cholesky` with its arguments."""
-    return getattr(_library("large"), name)(pack_anew(OF_LARGE[name]._make(arguments)).address)
+    return _call(getattr(_library("large"), name), pack_anew(OF_LARGE[name]._make(arguments)))
 
 
 class Library(SimpleNamespace):
