@@ -38,7 +38,7 @@ class MachineCode(BuildHookInterface):
     def dependencies(self) -> list[str]:
         """What compiling needs, in the versions that the project needs."""
         needed = self.metadata.core.dependencies
-        return [x for x in needed if HERE and re.match("(numba|numpy)[^a-z]", x)]
+        return [x for x in needed if HERE and re.match("(llvmlite|numba|numpy)[^a-z]", x)]
 
     def initialize(self, version: str, build_data: dict) -> None:
         """Make the shared objects, unless the package is only linked to its sources."""

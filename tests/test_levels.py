@@ -29,9 +29,9 @@ linux = pytest.mark.skipif(
 @pytest.mark.skipif(not LOADER.exists(), reason="asks glibc's loader")
 def test_levels_are_those_of_the_loader():
     """The levels that this machine runs are those for which the system's own loader would search its libraries."""
-    told = subprocess.run([LOADER, "--help"], capture_output=True, text=True, check=False).stdout
-    runs = set(re.findall(r"(x86-64-v\d) \(supported", told))
-    if "x86-64-v" not in told:
+    listed = subprocess.run([LOADER, "--help"], capture_output=True, text=True, check=False).stdout
+    runs = set(re.findall(r"(x86-64-v\d) \(supported", listed))
+    if "x86-64-v" not in listed:
         pytest.skip("a loader that does not tell")
     assert set(levels.of_machine()) == runs & set(levels.LEVELS)
 

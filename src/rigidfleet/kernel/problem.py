@@ -104,9 +104,8 @@ class Reference(NamedTuple):
     dp: Places  # what the blend adds to them [m]
     turn: Vector  # rotation vector by which the slots turn during the blend [rad]; zero with ``knots``
     knots: Floats = NO_KNOTS  # (K + 1,) [s], or empty
-    ways: Floats = (
-        NO_WAYS  # (K, N, 3, P): piece, slot in body axes [m], power of (t - knots[piece])
-    )
+    # (K, N, 3, P): piece, slot in body axes [m], power of (t - knots[piece])
+    ways: Floats = NO_WAYS
 
 
 class Motion(NamedTuple):

@@ -43,7 +43,8 @@ def rate(x: Floats) -> Floats:
 
 def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
     """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,)."""
-    c = list(np.moveaxis(np.asarray(coefficients, dtype=float), -1, 0))
+    coefficients = np.asarray(coefficients, dtype=float)
+    c = [coefficients[..., k] for k in range(coefficients.shape[-1])]
     x = x.reshape(-1, *(1,) * (c[0].ndim - 1))
     powers = len(c)
     for order in range(min(orders, powers)):  # repeated synthetic division by (t - x)
@@ -66,14 +67,17 @@ def product(
     return total
 
 
-def rotation(phi: Floats) -> Floats:
+def rotation(phi: Floats, orders: int | None = None) -> Floats:
     """Series (n, ..., 3, 3) of R = Exp(phi), body to world, of rotation vectors phi (n, ..., 3) [rad].
+
+    With fewer ``orders``, the others are left out, and the numbers are the same.
 
     R = c_0(u) + c_1(u) [phi x] + c_2(u) phi phi^T with u = |phi|^2 and the Stumpff functions c_k, which are analytic in
     u, so that no angle is special. Times are the last axis in memory: arithmetic on long rows is fast.
     """
-    x = np.ascontiguousarray(np.moveaxis(phi, -1, 1))
-    c0, c1, c2 = _stumpff_series(product(x, x).sum(axis=1))
+    count = 2 * len(phi) + 1  # of functions; two fewer with each order
+    x = np.ascontiguousarray(phi[:orders].transpose(0, -1, *range(1, phi.ndim - 1)))
+    c0, c1, c2 = _stumpff_series(product(x, x).sum(axis=1), count)
     S = product(c1[:, None], x)
     P = product(product(c2[:, None], x)[:, [0, 1, 2, 0, 0, 1]], x[:, [0, 1, 2, 1, 2, 2]])
     P[:, :3] += c0[:, None]
@@ -83,7 +87,7 @@ def rotation(phi: Floats) -> Floats:
     for k, (i, j, sign) in enumerate(((0, 1, -1.0), (0, 2, 1.0), (1, 2, -1.0))):
         R[:, i, j] = P[:, 3 + k] + sign * S[:, 2 - k]
         R[:, j, i] = P[:, 3 + k] - sign * S[:, 2 - k]
-    return np.moveaxis(R, (1, 2), (-2, -1))
+    return R.transpose(0, *range(3, R.ndim), 1, 2)
 
 
 def rotation_vector(R: Floats) -> Floats:
@@ -167,13 +171,12 @@ def _stumpff(u: Floats, count: int) -> Floats:
     return np.where(near, values, np.stack(closed))
 
 
-def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
-    """Series (n, ...) of c_0(u), c_1(u) and c_2(u) of a series u (n, ...).
+def _stumpff_series(u: Floats, count: int) -> tuple[Floats, Floats, Floats]:
+    """Series (n, ...) of c_0(u), c_1(u) and c_2(u) of a series u (n, ...), by so many Stumpff functions.
 
     c_k' = (k c_(k+2) - c_(k+1)) / 2 gives each order from the order before of the following functions.
     """
     n, slope = len(u), rate(u)
-    count = 2 * n + 1  # of the functions; two fewer with each order
     orders = [_stumpff(u[0], count)]
     chain: list[Floats] = []  # derivatives by u
     for order in range(1, n):
@@ -184,5 +187,5 @@ def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
         for i in range(1, order):
             total += slope[i] * chain[order - 1 - i][: len(total)]
         orders.append(total / order)
-    c0, c1, c2 = (np.stack([c[k] for c in orders]) for k in range(3))
+    c0, c1, c2 = (np.array([c[k] for c in orders]) for k in range(3))
     return c0, c1, c2

@@ -32,7 +32,10 @@ def of_machine() -> tuple[str, ...]:
     """The levels that this machine runs, the lowest first; none where there are no levels."""
     if sys.platform != "linux" or platform.machine() != "x86_64":
         return ()
-    lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+    except OSError:  # a container without /proc
+        return ()
     has = next((set(line.split()) for line in lines if line.startswith("flags")), set[str]())
     return tuple(takewhile(lambda name: _NEEDS[name] <= has, _NEEDS))
 

@@ -23,7 +23,6 @@ from rigidfleet.kernel import (
     fleet,
     measurement,
     monitor,
-    nearest,
     recorder,
     recursion,
 )
@@ -32,7 +31,7 @@ from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
 from rigidfleet.kernel.engine import objects, packing
-from rigidfleet.kernel.measured import Measured, Nearest, SingularValues
+from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.kernel.records import IntegratorState, Monitor, Record, Recursion, Segment
 from rigidfleet.solids.records import Solids
@@ -127,14 +126,12 @@ def apart() -> list[bytes]:
         watch_distances,
         watch_forces,
         caller(measurement.measure, _at(Measured)),
-        caller(measurement.spectrum, _at(SingularValues)),
-        caller(nearest.nearest_boxes, _at(Nearest)),
         caller(recursion.follow, _at(Recursion)),
         gather,
     )
     entries = list(objects.ENTRIES["flight"].items())[2:-1]
     return [
-        _object(*_module(function, name, words), loops=name == "nearest")
+        _object(*_module(function, name, words))
         for function, (name, words) in zip(functions, entries, strict=True)
     ]
 
@@ -205,7 +202,7 @@ def large_code() -> list[bytes]:
         call = f"return 0.0 + f({fields})" if source in _RETURNING else f"f({fields}); return 0.0"
         scope = {"at": _at(kind), "f": function}
         exec(f"def entry(address):\n    x = at(address)\n    {call}", scope)
-        codes.append(_object(*_module(scope["entry"], name, 1, types.float64), hot=(), loops=True))
+        codes.append(_object(*_module(scope["entry"], name, 1, types.float64), hot=()))
     return codes
 
 
@@ -238,15 +235,10 @@ def _object(
     name: str,
     hot: tuple[str, ...] = _HOT,
     sizes: Mapping[str, int] = ANY,
-    *,
-    loops: bool = False,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`.
-
-    ``loops``: make vectors of its loops.
-    """
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`."""
     module = _simplify(with_sizes(text, sizes), symbol, name, hot)
-    builder = _passes(3, loops=loops)
+    builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
@@ -276,10 +268,10 @@ def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) ->
     return module
 
 
-def _passes(level: int, *, loops: bool = False) -> Any:
+def _passes(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
     # Most loops are short, and the integrator's sums use vectors already
-    options.loop_vectorization = loops
+    options.loop_vectorization = False
     return llvm.create_pass_builder(objects.target_machine(), options)
 
 

@@ -46,7 +46,7 @@ from rigidfleet.kernel.engine.packing import (
     pack_anew,
     use,
 )
-from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
+from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import (
     Problem,
     Workspace,
@@ -59,9 +59,8 @@ from rigidfleet.kernel.records import (
     Segment,
     recorder,
 )
-from rigidfleet.solids import distance
 from rigidfleet.solids.records import Solids
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Floats
 
 
 def integrate(
@@ -199,20 +198,6 @@ def measure(measured: Measured) -> None:
     _call(_code().measure, pack_anew(measured))
 
 
-def least_singular_values(r: Floats, edges: Ints) -> Floats:
-    """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
-    spectrum = spectrum_of(r, edges)
-    _call(_code().spectrum, pack_anew(spectrum))
-    return spectrum.values
-
-
-def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
-    """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
-    nearest = nearest_of(r, radius, boxes)
-    _call(_code().nearest, pack_anew(nearest))
-    return nearest.least, nearest.nearest
-
-
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
     _call(_code().follow, pack_anew(Recursion(x, a, backward)))
@@ -296,7 +281,6 @@ def _link(
     }
     if part == "flight":
         use(calls["gather"], engine)
-        distance.use(nearest_boxes)
     return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 
