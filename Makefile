@@ -8,7 +8,7 @@ BIN := .venv/bin
 export UV_PYTHON_DOWNLOADS := never
 INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 	--constraints constraints.txt --build-constraints constraints.txt --editable .
-# The wheel is built from the sdist, which so proves to be whole.
+# The wheel is built from the sdist, which so proves to be whole. Its machine code takes some minutes.
 BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints constraints.txt
 
 .DEFAULT_GOAL := help
@@ -36,6 +36,7 @@ bench: .venv/.vehicles  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
 	@$(BIN)/python benchmarks/vehicles.py
+	@$(BIN)/python benchmarks/wheel.py
 
 peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH)
 	@$(BIN)/python benchmarks/compare.py

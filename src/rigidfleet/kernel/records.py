@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, padded, zeros
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
 #: Boxes by their least and greatest corners, and pairs of agents.
@@ -43,6 +43,8 @@ QUANTITIES = VERTICAL_ACCELERATION + 1
 #: steps listed in `Monitor.listed` that alone can hold worse distances, and worse forces, or `ANY_STEP`.
 STAYED, LISTED_DISTANCES, LISTED_FORCES = range(3)
 ANY_STEP = -1
+#: Triple product of three unit vectors below which a pivot counts as lost.
+LOST_PIVOT = 1e-6
 #: Approximate size of a trail in bytes; the integrator pauses when it is full. With more, flights wait for memory.
 _TRAIL = 1 << 17
 #: Greatest number of points in a search for a greatest force.
@@ -262,3 +264,24 @@ class Recursion(NamedTuple):
     y: Floats = NO_ROWS
     first: int = 0
     b: Floats = NO_FACTORS
+
+
+class Order(NamedTuple):
+    """The order of elimination: agents, each with its edges to three before it; missing entries are 0."""
+
+    agent: Edges  # (N,)
+    edge: Edges  # (N, 3): none, one, two, then three each
+    other: Edges  # (N, 3) the agents at their other ends
+    sign: NDArray[np.int8]  # (N, 3) 1 where u of the edge points towards the agent, else -1
+
+
+class Pattern(NamedTuple):
+    """Positions of the blocks of L: by columns, the diagonal first, and by rows."""
+
+    place: Ints  # (N,) column of each agent
+    column: Ints  # (N + 1,) first block of each column
+    row: Ints  # (B,) row of each block
+    first: Ints  # (N + 1,) of each row, the blocks left of the diagonal:
+    left: Ints  # (B - N,) their columns
+    block: Ints  # (B - N,) and which blocks they are
+    of_edge: Ints  # (m,) block of each edge

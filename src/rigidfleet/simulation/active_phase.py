@@ -39,7 +39,7 @@ from rigidfleet.simulation.solver_setup import equip
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.large.solver import Counts  # imports the compiler
+    from rigidfleet.kernel.large.solver import Counts
 
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1

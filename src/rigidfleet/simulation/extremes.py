@@ -206,9 +206,7 @@ class CurveWatch:
     ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is not None:
-            from rigidfleet.kernel.engine.solids import watch_solids  # loads the compiler
-
-            watch_solids(self.monitor, problem, state, first, end, self.solids)
+            self.monitor.clearances(problem, state, first, end, self.solids)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""

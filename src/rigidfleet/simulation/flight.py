@@ -45,7 +45,7 @@ from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.large.solver import Counts  # imports the compiler
+    from rigidfleet.kernel.large.solver import Counts
 
 __all__ = [
     "AttitudeCommand", "Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "RotorCommand",

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import platform
 from dataclasses import dataclass, field
 
 from rigidfleet.errors import MissionError
+from rigidfleet.kernel.compiler import levels
 
 #: Reasons other than failed checks, of runs without a verdict: the varied mission has errors; the program failed; the
 #: user's controller failed.
@@ -36,7 +36,7 @@ class RunRecord:
     codes: tuple[float, ...]
     metrics: dict[str, float]
     wall: float
-    level: str = field(default_factory=platform.machine)
+    level: str = field(default_factory=levels.level)
 
 
 def refusal(error: MissionError) -> tuple[str, str]:
