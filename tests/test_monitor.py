@@ -46,7 +46,13 @@ class Watched:
         self.state = state._replace(trail=trail, count=np.zeros_like(state.count))
         pairs = np.array(list(combinations(range(self.n), 2)), dtype=np.int64).reshape(-1, 2)
         none = np.zeros((0, 6))
-        every = {"pairs": pairs, "columns": pairs} | changes
+        every: dict[str, Any] = {
+            "worst": np.full(records.QUANTITIES, np.inf), "when": np.zeros(records.QUANTITIES),
+            "who": np.full((records.QUANTITIES, 2), -1), "sign": np.zeros(1), "left": np.ones(self.n, dtype=np.bool_),
+            "standing": np.zeros(self.n, dtype=np.int64), "low": np.full((self.n, 3), np.inf), "pad": 0.0,
+            "altitude": math.inf, "pairs": pairs, "columns": pairs, "struck": np.zeros((0, 2), dtype=np.int64),
+            "listed": np.zeros((2, 0), dtype=np.int64),
+        } | changes  # fmt: skip
         self.watch = native.Watch(
             records.monitor(
                 self.radius, none if boxes is None else boxes, none if fence is None else fence, points.shape[2], 0,
