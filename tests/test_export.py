@@ -13,6 +13,7 @@ import struct
 import zipfile
 from dataclasses import replace
 from importlib.metadata import packages_distributions
+from itertools import islice
 from pathlib import Path
 from typing import get_args
 
@@ -707,9 +708,8 @@ def test_all_files_or_none(flight, tmp_path, monkeypatch):
     assert set(before) == {f"agent-{i}.csv" for i in (1, 2, 3, 4)}
 
     def broken(motion, tolerance):
-        if motion.first == 2:
-            raise OSError(28, "No space left on device")
-        return FORMATS["polynomial"].write(motion, tolerance)
+        yield from islice(FORMATS["polynomial"].write(motion, tolerance), 2)
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setitem(FORMATS, "poly4d", FORMATS["polynomial"]._replace(write=broken))
     with pytest.raises(rf.ResultError, match="cannot be written: No space left on device"):

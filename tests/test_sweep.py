@@ -40,7 +40,7 @@ from rigidfleet.sweep.final_states import start_states
 from rigidfleet.sweep.metrics import measure
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.runner import SweepProgress
-from rigidfleet.sweep.shards import Shard
+from rigidfleet.sweep.shards import own_runs
 from rigidfleet.sweep.summary import Example, drivers, rate, summarise
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
@@ -471,7 +471,7 @@ def test_a_group_is_never_split():
             there[[3, 4, 40, 97]] = False
             return there
 
-    under_way = _Sweeping(sweep(runs=100), Gaps(), None, Shard(1, 1))  # ty: ignore[invalid-argument-type]
+    under_way = _Sweeping(sweep(runs=100), Gaps(), None, np.ones(100, bool))  # ty: ignore[invalid-argument-type]
     under_way.pace = 1e-6
     taken = [under_way.take(1) for _ in range(2)]
     assert taken == [[*range(8), *range(40, 48)], [96, 97, 98, 99]]
@@ -642,7 +642,7 @@ def test_shards_are_merged_to_the_rows_of_one_run(flown, tmp_path, count):
 def test_shards_share_all_runs():
     """Each run is in one shard, with the others of its group of eight, however many shards there are."""
     for count in (1, 3, 40):
-        masks = np.array([Shard(k, count).runs(1003) for k in range(1, count + 1)])
+        masks = np.array([own_runs(f"{k}/{count}", 1003) for k in range(1, count + 1)])
         assert (masks.sum(axis=0) == 1).all()
         assert all(len({*np.flatnonzero(x[:1000]) // 8}) * 8 == x[:1000].sum() for x in masks)
         assert np.ptp(masks.sum(axis=1)) <= 8
@@ -658,7 +658,7 @@ def test_a_shard_that_is_missing_or_partly_flown_is_named(tmp_path):
         if progress.flown:
             raise KeyboardInterrupt
 
-    with pytest.raises(ResultError, match="contains no shards"):
+    with pytest.raises(ResultError, match="shards: contains no sweep"):
         merge(tmp_path)
     asked = sweep(runs=60)
     with pytest.raises(KeyboardInterrupt):
@@ -701,7 +701,7 @@ def test_shards_that_do_not_fit_are_refused(tmp_path, monkeypatch):
                 other.setattr("rigidfleet.sweep.definition.__version__", "0.0.0")
             parts(here, shard, asked=asked)
         with pytest.raises(
-            ResultError, match=rf"does not fit .*1-of-2; it differs in: {words}\. Fly"
+            ResultError, match=rf"does not fit .*1-of-2; it differs in: {words}\. Move"
         ):
             merge(here)
 
@@ -755,6 +755,8 @@ def test_any_executor_flies_a_sweep(tmp_path):
     finally:
         sys.setswitchinterval(before)
     assert table.passed.all()
+    with pytest.raises(TypeError, match="an Executor of concurrent"):
+        fly(asked, tmp_path, pool=lambda: ThreadPoolExecutor(1))  # ty: ignore[invalid-argument-type]
     assert numbers(table) == numbers(fly(asked, tmp_path / "alone", workers=1))
 
 
@@ -766,7 +768,7 @@ def test_an_executor_that_dies_is_a_sentence(flown, tmp_path, monkeypatch, capsy
         fly(asked, tmp_path, pool=pool, workers=1)
     done = len(read(tmp_path).run)
     assert str(caught.value) == (
-        "a worker died, and the executor with it. If memory is short, use fewer workers."
+        "workers died in the middle of runs. If memory is short, use fewer of them."
         f" {tmp_path}: {done} of 20 runs are saved; the same command goes on."
     )
     warned = [r.message for r in caplog.records if r.levelno == logging.WARNING]
@@ -820,7 +822,7 @@ def test_loky_flies_a_sweep(flown, tmp_path):
     with loky.ProcessPoolExecutor(2) as pool:
         assert numbers(fly(sweep(), tmp_path / "whole", pool=pool, workers=2)) == numbers(flown)
         pids = {pool.submit(os.getpid).result() for _ in range(20)}
-        with pytest.raises(RigidfleetError, match=r"executor with it.* of 4000 runs are saved"):
+        with pytest.raises(RigidfleetError, match=r"workers died.* of 4000 runs are saved"):
             fly(sweep(runs=4000), tmp_path / "killed", pool=pool, workers=2, progress=kill)
 
 
@@ -1026,7 +1028,7 @@ def test_a_chunk_that_kills_its_workers(deadly, dask, tmp_path):
     """More deaths than Dask allows are one sentence."""
     address, _ = dask
     asked = Sweep.of(MISSION, SCATTER, runs=8, controller="deadly:law")
-    with pytest.raises(RigidfleetError, match=r"several workers died .* 0 of 8 runs are saved"):
+    with pytest.raises(RigidfleetError, match=r"workers died .* 0 of 8 runs are saved"):
         fly(asked, tmp_path / "cluster", cluster=address)
 
 
@@ -1034,10 +1036,8 @@ def test_a_chunk_that_kills_its_workers(deadly, dask, tmp_path):
 @pytest.mark.parametrize("dask", [[]], indirect=True)
 def test_a_cluster_without_workers(dask, tmp_path, monkeypatch):
     """A scheduler that no worker joins in time is one sentence."""
-    monkeypatch.setattr("rigidfleet.sweep.workers._ALONE", 2.0)
-    with pytest.raises(
-        RigidfleetError, match=r"no worker has come for 2 s.* 0 of 20 runs are saved"
-    ):
+    monkeypatch.setattr("rigidfleet.sweep.runner._ALONE", 2.0)
+    with pytest.raises(RigidfleetError, match=r"no worker came for 2 s.* 0 of 20 runs are saved"):
         fly(sweep(), tmp_path / "cluster", cluster=dask[0])
 
 
@@ -1324,8 +1324,7 @@ def test_the_command_flies_shards(folder, capsys):
     assert not Path("sweeps/pair/shards/2-of-2/figures").exists()
     wrong = {
         "--shard 0/2": ["sweep", "sweeps/pair", "--shard", "0/2"],
-        "with K from 1 to N, as 3/40": ["sweep", "sweeps/pair", "--shard", "2"],
-        "contains shards. Merge them": ["sweep", "sweeps/pair"],
+        "with K from 1 to N, such as 3/40": ["sweep", "sweeps/pair", "--shard", "2"],
         "partly flown: 1. Fly each": ["sweep", "sweeps/pair", "--merge"],
         "exclude each other": ["sweep", "sweeps/pair", "--merge", "--shard", "1/2"],
         "Go on by `rigidfleet sweep sweeps/pair --shard 2/2`": [

@@ -1,10 +1,12 @@
 """Fly with other versions, of Python and of packages, in environments of their own.
 
-`python tests/versions.py` (`make versions`) builds the wheel and flies it, with all extras,
+`python tests/versions.py` (`make versions`) flies, with all extras,
 
 - with exactly the lowest versions that `pyproject.toml` declares (`constraints-lowest.txt`), on the oldest Python;
 - with the pinned ones (`constraints.txt`), on each other Python of `PYTHONS` that is on this machine;
 - with the newest that can be had, on the newest of these.
+
+The pinned ones fly the wheel, which has been built once. The others compile: theirs is another compiler.
 
 Words choose among them: `python tests/versions.py newest`, or `pinned 3.12`.
 
@@ -15,17 +17,21 @@ change that is being tested. A Python that is not here is named, and nothing is 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).parents[1]
 #: Versions of Python that are looked for, the oldest first.
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")
+EXTRAS = "[analysis,cluster,show,mcap,rerun]"
+PINS = ("--build-constraints", "constraints.txt")
 #: What is flown, by the command: all of its libraries of machine code, and each package that it or an extra needs.
 COMMANDS = (
     "run narrow-passage --figures all --format png --replay --out flown",
@@ -99,6 +105,13 @@ def environment(python: str, folder: Path) -> Path:
     return home / ("Scripts" if os.name == "nt" else "bin") / "python"
 
 
+@cache
+def wheel(place: Path) -> Path:
+    """The wheel, built into a folder."""
+    uv("build", "--quiet", "--wheel", *PINS, "--out-dir", place, ".")
+    return next(place.glob("*.whl"))
+
+
 def fly(python: Path, folder: Path) -> None:
     """Fly in an environment, with nothing compiled before."""
     (folder / "drawing.svg").write_text(DRAWING, encoding="utf-8")
@@ -119,43 +132,40 @@ def newer(python: Path) -> str:
 
 def main() -> int:
     """Fly in each environment, say how it went, and return 1 if one failed that must fly."""
-    here = interpreters()
-    own = (
-        f"{sys.version_info.major}.{sys.version_info.minor}"  # on which all tests run with the pins
-    )
+    here, own = interpreters(), ".".join(platform.python_version_tuple()[:2])
+    # On this Python all tests run with the pins.
     plan = [("pinned", version, "constraints.txt") for version in here if version != own]
     if PYTHONS[0] in here:
         plan.insert(0, ("lowest", PYTHONS[0], "constraints-lowest.txt"))
     plan.append(("newest", [*here][-1], os.devnull))
     plan = [entry for entry in plan if {*sys.argv[1:]} <= {*entry}]
-    failures = 0
     with tempfile.TemporaryDirectory() as place:
-        pins = ("--build-constraints", "constraints.txt")
-        uv("build", "--quiet", "--wheel", *pins, "--out-dir", place, ".")
-        (wheel,) = Path(place).glob("*.whl")
-        for what, version, constraints in plan:
-            begun, folder = time.perf_counter(), Path(place, f"{what}-{version}")
-            words = f"{what} versions, Python {version}"
-            try:
-                python = environment(here[version], folder)
-                install = ("pip", "install", "--quiet", "--python", python)
-                uv(
-                    *install,
-                    "--constraints",
-                    constraints,
-                    f"{wheel}[analysis,cluster,show,mcap,rerun]",
-                )
-                words += f" (not pinned: {newer(python)})" if what == "newest" else ""
-                fly(python, folder)
-            except CommandError as error:
-                failures += what != "newest"
-                print(f"{'WARNING' if what == 'newest' else 'ERROR'}: {words}: {error}", flush=True)
-            else:
-                print(f"{words}: flies ({time.perf_counter() - begun:.0f} s)", flush=True)
-            shutil.rmtree(folder, ignore_errors=True)
+        failed = [fly_or_tell(*entry, here[entry[1]], Path(place)) for entry in plan]
     if missing := [version for version in PYTHONS if version not in here]:
         print(f"Python {', '.join(missing)}: not on this machine, not flown")
-    return min(failures, 1)
+    return int(any(failed))
+
+
+def fly_or_tell(what: str, version: str, constraints: str, python: str, place: Path) -> bool:
+    """Fly with these versions, say how it went, and return whether this fails what is tested."""
+    begun, folder = time.perf_counter(), place / f"{what}-{version}"
+    words = f"{what} versions, Python {version}"
+    try:
+        there = environment(python, folder)
+        package = str(wheel(place)) if what == "pinned" else "."
+        uv(
+            "pip", "install", "--quiet", "--python", there, "--constraints", constraints, *PINS,
+            *(("--editable",) if what != "pinned" else ()), f"{package}{EXTRAS}",
+        )  # fmt: skip
+        words += f" (not pinned: {newer(there)})" if what == "newest" else ""
+        fly(there, folder)
+    except CommandError as error:
+        print(f"{'WARNING' if what == 'newest' else 'ERROR'}: {words}: {error}", flush=True)
+        return what != "newest"
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    print(f"{words}: flies ({time.perf_counter() - begun:.0f} s)", flush=True)
+    return False
 
 
 if __name__ == "__main__":

@@ -100,43 +100,28 @@ def sweep(
         Print only errors, and JSON with --json.
     """
     check_workers(workers)
-    if (merge and shard) or (summary and (merge or shard)):
+    if merge + summary + bool(shard) > 1:
         raise RigidfleetError("--shard, --merge and --summary exclude each other: use one of them.")
     from rigidfleet._common.files import write_file
     from rigidfleet.sweep import figures, fly, shards, store
     from rigidfleet.sweep.record import UNJUDGED, reason_in_words
     from rigidfleet.sweep.summary import summarise
 
-    if summary:
-        folder = Path(mission)
-        table = store.read(folder)
-    elif merge:
-        folder = Path(mission)
-        table = shards.merge(folder, replace=force)
+    folder = Path(mission)
+    if summary or merge:
+        table = store.read(folder) if summary else shards.merge(folder, replace=force)
     else:
         keys = {
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
             "controller": controller, "rate": rate,
         }  # fmt: skip
-        part = shards.Shard.of(shard) if shard else None
-        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, keys)
-        folder = whole if part is None else part.folder(whole)
-        if part is None and not store.is_store(whole) and shards.shard_folders(whole):
-            raise RigidfleetError(
-                f"{whole}: contains shards. Merge them by --merge, fly one by --shard K/N, or choose another folder by"
-                " --out."
-            )
+        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys)
+        folder = shards.shard_folder(whole, shard)
         try:
             with watching(None if quiet else console.SweepWatch()) as progress:
                 table = fly(
-                    definition,
-                    whole,
-                    workers=workers,
-                    cluster=cluster,
-                    shard=shard,
-                    replace=force,
-                    progress=progress,
-                )
+                    definition, whole, workers=workers, cluster=cluster, shard=shard, replace=force, progress=progress,
+                )  # fmt: skip
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
             words = f"Interrupted: {done} of {definition.runs} runs are saved in {folder}"
@@ -170,7 +155,7 @@ def sweep(
 
 
 def _sweep_and_folder(
-    what: str, vary: list[str], runs: int | None, out: Path | None, keys: dict[str, Any]
+    what: str, vary: list[str], runs: int | None, out: Path | None, shard: str, keys: dict[str, Any]
 ) -> tuple[Sweep, Path]:
     """Sweep of the command line, and its folder."""
     from rigidfleet.mission import mission_names
@@ -178,7 +163,7 @@ def _sweep_and_folder(
     from rigidfleet.sweep.definition import is_sweep_file
 
     here = Path(what)
-    if stored := [here] * store.is_store(here) or shards.shard_folders(here):
+    if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):
         if vary or out is not None or any(value is not None for value in keys.values()):
             raise RigidfleetError(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"

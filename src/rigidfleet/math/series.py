@@ -18,7 +18,9 @@ from rigidfleet.typing import Floats
 #: Up to this squared angle, Stumpff functions are summed as series, with this number of terms: exact to rounding.
 _SERIES, _TERMS = 16.0, 16
 #: 1/k!
-_RECIPROCALS = [1.0 / math.factorial(k) for k in range(64)]
+_RECIPROCALS = np.array([1.0 / math.factorial(k) for k in range(64)])
+#: k!
+_FACTORIALS = np.array([float(math.factorial(k)) for k in range(64)])
 
 
 def derivatives(x: Floats) -> Floats:
@@ -32,8 +34,7 @@ def from_derivatives(x: Floats) -> Floats:
 
 
 def _factorials(x: Floats) -> Floats:
-    factorials = [float(math.factorial(k)) for k in range(len(x))]
-    return np.array(factorials).reshape(-1, *(1,) * (x.ndim - 1))
+    return _FACTORIALS[: len(x)].reshape(-1, *(1,) * (x.ndim - 1))
 
 
 def rate(x: Floats) -> Floats:
@@ -42,10 +43,13 @@ def rate(x: Floats) -> Floats:
 
 
 def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
-    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,)."""
+    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,).
+
+    In memory, x is the last axis: arithmetic on long rows is fast.
+    """
     coefficients = np.asarray(coefficients, dtype=float)
-    c = [coefficients[..., k] for k in range(coefficients.shape[-1])]
-    x = x.reshape(-1, *(1,) * (c[0].ndim - 1))
+    inner = range(1, coefficients.ndim - 1)
+    c = list(np.ascontiguousarray(coefficients.transpose(-1, *inner, 0)))
     powers = len(c)
     for order in range(min(orders, powers)):  # repeated synthetic division by (t - x)
         for k in range(powers - 2, order - 1, -1):
@@ -53,7 +57,7 @@ def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
     full = np.zeros((orders, *np.broadcast_shapes(x.shape, c[0].shape)))
     for order, values in enumerate(c[:orders]):
         full[order] = values
-    return full
+    return full.transpose(0, -1, *inner)
 
 
 def product(
@@ -99,7 +103,7 @@ def rotation_vector(R: Floats) -> Floats:
     phi = np.zeros(R.shape[:-1])
     phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))
     for k in range(1, len(R)):
-        lacking = R[k] - rotation(phi[: k + 1])[k]
+        lacking = R[k] - rotation(phi[: k + 1])[k] if k > 1 else R[k]  # nothing moves yet
         phi[k] = att.rotation_vector_rate(phi[0], _axial(np.swapaxes(R[0], -1, -2) @ lacking))
     return phi
 
@@ -154,11 +158,11 @@ def _stumpff(u: Floats, count: int) -> Floats:
     values = np.zeros((count, *u.shape))
     near = u < _SERIES
     small = np.where(near, u, 0.0)
-    for k in (count - 1, count - 2):
-        total = values[k, ...]  # a view, of single numbers as well
-        for i in range(_TERMS, -1, -1):  # Horner
-            np.multiply(total, small, out=total)
-            np.subtract(_RECIPROCALS[2 * i + k], total, out=total)
+    total, column = values[count - 2 :], (2, *(1,) * u.ndim)
+    for i in range(_TERMS, -1, -1):  # Horner, of both
+        np.multiply(total, small, out=total)
+        first = 2 * i + count - 2
+        np.subtract(_RECIPROCALS[first : first + 2].reshape(column), total, out=total)
     for k in range(count - 3, -1, -1):  # c_k = 1/k! - u c_(k + 2), downwards for small u
         values[k] = _RECIPROCALS[k] - small * values[k + 2]
     if near.all():

@@ -225,8 +225,10 @@ class SampledPhase(Stepper):
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
-            within = (abs(phase.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
-            phase.state.count[records.TRAILED] = rows if within.all() else int(within.argmin())
+            points = phase.state.trail.points[:rows]
+            if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
+                rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
+            phase.state.count[records.TRAILED] = rows
             phase.extremes.take_path(self.flown, phase.workspace, phase.state)
             self.sampled.count[fleet.TRAILED] = phase.state.count[records.TRAILED] = 0
             self.unjudged = True

@@ -324,7 +324,7 @@ class Sweep:
     def _mission_with_ways(self) -> Mission:
         """The mission with phases for its transitions and ways if nothing that varies matters to them, else as written.
 
-        Then they are searched once for all runs. Every run has the same start, which varies by no key either.
+        Then they are searched once for all runs. The start is such a key, too.
         """
         from rigidfleet.planning.timing import expand_mission, matters_to_plan
 

@@ -10,18 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from rigidfleet._common.processes import cores
-from rigidfleet.errors import RigidfleetError
+from rigidfleet.errors import RigidfleetError, wrong_type
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import GROUP, fly_runs
-from rigidfleet.sweep.shards import Shard
+from rigidfleet.sweep.shards import own_runs, shard_folder
 from rigidfleet.sweep.store import Store, Table, read
+from rigidfleet.typing import Bools
 
 #: Approximate duration of a chunk [s]: the work that kill -9 loses per worker, and the interval of progress.
 _CHUNK = 1.0
@@ -33,8 +34,8 @@ _AHEAD = 2
 _LOOK = 1.0
 #: Number of deaths of workers, without a finished chunk in between, after which the sweep stops.
 _DEATHS = 3
-
-T = TypeVar("T")
+#: Maximum time without any worker of a cluster [s]: they may wait in a queue for their machines.
+_ALONE = 300.0
 
 #: Says what progress says, and warns of what was lost; silent unless the program that uses the library listens.
 _log = logging.getLogger("rigidfleet.sweep")
@@ -63,6 +64,9 @@ class SweepProgress:
     workers: int
 
 
+_Listener = Callable[[SweepProgress], None] | None
+
+
 def fly(
     sweep: Sweep,
     folder: str | Path,
@@ -71,7 +75,7 @@ def fly(
     cluster: str | None = None,
     shard: str = "",
     replace: bool = False,
-    progress: Callable[[SweepProgress], None] | None = None,
+    progress: _Listener = None,
     pool: Executor | None = None,
 ) -> Table:
     """Fly the runs of a sweep that are missing in a folder, and return all of its rows.
@@ -97,11 +101,12 @@ def fly(
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
-    part = Shard.of(shard) if shard else Shard(1, 1)
-    folder = part.folder(Path(folder)) if shard else Path(folder)
+    if not isinstance(pool, Executor | None):
+        raise wrong_type("an Executor of concurrent.futures as pool", pool)
+    own, folder = own_runs(shard, sweep.runs), shard_folder(Path(folder), shard)
     count = cores() if workers is None else workers
-    with Store(folder, sweep, shard=shard, replace=replace) as store:
-        flight = _Sweeping(sweep, store, progress, part)
+    with Store(folder, sweep, shard, replace) as store:
+        flight = _Sweeping(sweep, store, progress, own)
         if cluster is not None:
             with pools.cluster(cluster) as (executor, capacity):
                 flight.hand_out(executor, capacity)
@@ -132,21 +137,14 @@ def fly(
 class _Sweeping:
     """State of a sweep that is running."""
 
-    def __init__(
-        self,
-        sweep: Sweep,
-        store: Store,
-        progress: Callable[[SweepProgress], None] | None,
-        shard: Shard,
-    ) -> None:
+    def __init__(self, sweep: Sweep, store: Store, progress: _Listener, own: Bools) -> None:
         self.sweep, self.store, self.progress = sweep, store, progress
         self.finished_runs = store.finished_runs()
-        own = shard.runs(sweep.runs)
         self.runs = int(own.sum())
         # A group is flown as a whole, so that its records do not depend on when the sweep was stopped.
         self.missing = deque(np.unique(np.flatnonzero(own & ~self.finished_runs) // GROUP).tolist())
         self.flown, self.failed, self.workers = 0, 0, 1
-        self.begun = perf_counter()
+        self.begun = self.changed = perf_counter()
         self.pace = 0.0  # [s] a run
         _log.info(f"{self.words()}; begun")
         self.report(1)
@@ -168,15 +166,13 @@ class _Sweeping:
             The executor failed, by the error that is the cause.
         """
 
-        def outcome(call: Callable[..., T], *arguments: Any) -> T:
+        def outcome(call: Callable[..., Any], *arguments: Any) -> Any:
             try:
                 return call(*arguments)
             except RigidfleetError:
                 raise
             except Exception as error:
-                raise RigidfleetError(
-                    f"{pools.why_failed(error)} {self.words()} are saved; the same command goes on."
-                ) from error
+                raise self.failure(pools.why_failed(error)) from error
 
         flying: dict[Future[list[RunRecord]], list[int]] = {}
         taken: list[int] = []
@@ -216,6 +212,10 @@ class _Sweeping:
         self.pace = max(median(row.wall for row in rows), 1e-9)
         _log.info(f"{self.words()}, {self.failed} of {self.flown} flown failed")
 
+    def failure(self, why: str) -> RigidfleetError:
+        """An error by which the sweep ends before all runs are flown."""
+        return RigidfleetError(f"{why} {self.words()} are saved; the same command goes on.")
+
     def words(self) -> str:
         """Runs that are saved, and where."""
         return f"{self.store.path.parent}: {self.finished_runs.sum()} of {self.runs} runs"
@@ -225,7 +225,9 @@ class _Sweeping:
         if workers != self.workers:
             level = logging.WARNING if workers < self.workers else logging.INFO
             _log.log(level, f"{self.words()}; workers: {workers}, before {self.workers}")
-            self.workers = workers
+            self.workers, self.changed = workers, perf_counter()
+        if not workers and perf_counter() - self.changed > _ALONE:
+            raise self.failure(f"no worker came for {_ALONE:g} s. Start some by `dask worker`.")
         if self.progress is not None:
             done, wall = int(self.finished_runs.sum()), perf_counter() - self.begun
             now = SweepProgress(done, self.runs, self.flown, self.failed, wall, workers)

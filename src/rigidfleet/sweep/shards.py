@@ -3,54 +3,38 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.run import GROUP
 from rigidfleet.sweep.store import FILE, Store, Table, contents, differences, outcome_of, read
-from rigidfleet.typing import Bools
+from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
 _SHARDS = "shards"
+_MOVE = "Move the wrong one out of the folder."
 
 
-@dataclass(frozen=True)
-class Shard:
-    """Part ``number``, from 1, of ``count``: every ``count``-th group of runs, so that parts grow with their sweep."""
+def own_runs(shard: str, runs: int) -> Bools:
+    """Mask (runs,) of the runs of a shard, "3/40": every 40th group, so that shards grow with their sweep; "": all.
 
-    number: int
-    count: int
+    Raises
+    ------
+    RigidfleetError
+        There is no such shard.
+    """
+    match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", shard or "1/1")
+    if match is None or int(match[1]) > int(match[2]):
+        raise RigidfleetError(f"--shard {shard}: write K/N with K from 1 to N, such as 3/40.")
+    return _shard_of_runs(runs, int(match[2])) == int(match[1])
 
-    @classmethod
-    def of(cls, text: str) -> Self:
-        """Read a shard as it is written, such as 3/40.
 
-        Raises
-        ------
-        RigidfleetError
-            It is written otherwise, or there is no such part.
-        """
-        match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", text)
-        if match is None or int(match[1]) > int(match[2]):
-            raise RigidfleetError(
-                f"--shard {text}: is no part of a sweep. Write K/N with K from 1 to N, as 3/40 for the third of 40."
-            )
-        return cls(int(match[1]), int(match[2]))
-
-    def __str__(self) -> str:
-        return f"{self.number}/{self.count}"
-
-    def runs(self, count: int) -> Bools:
-        """Mask (count,) of its runs among all of a sweep."""
-        return np.arange(count) // GROUP % self.count == self.number - 1
-
-    def folder(self, sweep: Path) -> Path:
-        """Its folder in that of its sweep."""
-        return sweep / _SHARDS / f"{self.number}-of-{self.count}"
+def shard_folder(folder: Path, shard: str) -> Path:
+    """Folder of a shard in that of its sweep; the latter, if the shard is ""."""
+    return folder / _SHARDS / shard.replace("/", "-of-") if shard else folder
 
 
 def shard_folders(folder: Path) -> list[Path]:
@@ -73,40 +57,33 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
         contains another sweep or cannot be written. Nothing is written then.
     """
     folder = Path(folder)
-    paths = shard_folders(folder)
-    if not paths:
-        raise ResultError(
-            f"{folder}: contains no shards. `rigidfleet sweep ... --shard K/N` flies one."
-        )
+    paths = shard_folders(folder) or [folder / _SHARDS]
     sweep, common, _ = contents(paths[0])
-    rows: dict[int, tuple[Any, ...]] = {}
-    owner: dict[int, Path] = {}
+    rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
     for path in paths:
         _, own, part = contents(path)
         if own != common:
-            raise ResultError(
-                f"{path}: does not fit {paths[0]}; it differs in: {differences(common, own)}. Fly it again, or move it"
-                " out of the folder."
-            )
-        for run, *row in part:
-            if run in rows and outcome_of((run, *row)) != outcome_of(rows[run]):
-                raise ResultError(
-                    f"{path}: run {run} is not as in {owner[run]}. Keep the right one, and move the other out of the"
-                    " folder."
-                )
-            rows[run], owner[run] = (run, *row), path
-    there = np.zeros(sweep.runs, dtype=bool)
-    there[[*rows]] = True
-    count, lacking = common["shards"], []
-    for k in np.unique(np.flatnonzero(~there) // GROUP % count).tolist():
-        own = Shard(k + 1, count).runs(sweep.runs)
-        flown = f" (has {(own & there).sum()} of {own.sum()} runs)" if (own & there).any() else ""
-        lacking.append(f"{k + 1}{flown}")
-    if lacking:
+            other = differences(common, own)
+            raise ResultError(f"{path}: does not fit {paths[0]}; it differs in: {other}. {_MOVE}")
+        for row in part:
+            where, same = rows.setdefault(row[0], (path, row))
+            if outcome_of(row) != outcome_of(same):
+                raise ResultError(f"{path}: run {row[0]} is not as in {where}. {_MOVE}")
+    shards = _shard_of_runs(sweep.runs, count := common["number of shards"])
+    total, flown = (np.bincount(x, minlength=count + 1) for x in (shards, shards[[*rows]]))
+    if lacking := np.flatnonzero(flown < total).tolist():
+        words = [
+            f"{k} (has {flown[k]} of {total[k]} runs)" if flown[k] else str(k) for k in lacking
+        ]
         raise ResultError(
-            f"{folder}: of {count} shards, these are missing or partly flown: {', '.join(lacking)}. Fly each, as by"
-            f" `rigidfleet sweep {folder} --shard {lacking[0].split()[0]}/{count}`, and merge again."
+            f"{folder}: of {count} shards, these are missing or partly flown: {', '.join(words)}. Fly each, as by"
+            f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count}`, and merge again."
         )
-    with Store(folder, sweep, replace=replace) as store:
-        store.insert(rows.values())
+    with Store(folder, sweep, "", replace) as store:
+        store.insert(row for _, row in rows.values())
     return read(folder)
+
+
+def _shard_of_runs(runs: int, count: int) -> Ints:
+    """Number (runs,), from 1, of the shard that flies each run, of ``count`` shards."""
+    return np.arange(runs) // GROUP % count + 1

@@ -77,7 +77,7 @@ class Table:
 
 
 class Store:
-    """Store of one sweep, or of one ``shard`` of it, open for writing; a context manager.
+    """Store of one sweep, or of one ``shard`` of it unless that is "", open for writing; a context manager.
 
     Raises
     ------
@@ -85,9 +85,7 @@ class Store:
         The folder contains another sweep or shard or a damaged file, or it cannot be written.
     """
 
-    def __init__(
-        self, folder: Path, sweep: Sweep, *, shard: str = "", replace: bool = False
-    ) -> None:
+    def __init__(self, folder: Path, sweep: Sweep, shard: str, replace: bool) -> None:
         self.path, self.shard = folder / FILE, shard
         with _as_result_errors(self.path), ExitStack() as opened:
             folder.mkdir(parents=True, exist_ok=True)
@@ -155,10 +153,9 @@ class Store:
                     " --out to choose another folder."
                 )
             if there and (shard := there.get("shard", "")) != self.shard:
-                go_on = f"rigidfleet sweep {self.path.parents[2]} --shard {shard or '1/1'}"
                 raise ResultError(
-                    f"{self.path.parent}: contains shard {shard or '1/1'} of this sweep, not {self.shard or 'all'}. Go"
-                    f" on by `{go_on}`, use --force to overwrite, or --out to choose another folder."
+                    f"{self.path.parent}: contains {shard or 'all'} of this sweep, not {self.shard or 'all'}. Go on by"
+                    f" `rigidfleet sweep {self.path.parents[2]} --shard {shard or '1/1'}`, or use --force to overwrite."
                 )
             if there and (n := json.loads(there["sweep"])["runs"]) > sweep.runs:
                 raise ResultError(
@@ -229,10 +226,11 @@ def contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]
         entries = dict(db.execute("SELECT key, value FROM sweep"))
         sweep = Sweep.from_json(entries["sweep"])
         shards = int(entries.get("shard", "").partition("/")[2] or 1)
-        common = json.loads(entries["identity"]) | {"runs": sweep.runs, "shards": shards}
+        common = {"number of runs": sweep.runs, "number of shards": shards}
         known = _column_names(db)
         names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
-        return sweep, common, db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
+        rows = db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
+        return sweep, json.loads(entries["identity"]) | common, rows
 
 
 @contextmanager
@@ -292,8 +290,6 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> str:
         "vary": "variations",
         "evaluate": "what is evaluated",
         "code": "file of the controller",
-        "runs": "number of runs",
-        "shards": "number of shards",
     }
     keys = [key for key in {**new, **old} if old.get(key) != new.get(key)]
     return ", ".join(names.get(key, key.replace("_", " ")) for key in keys)

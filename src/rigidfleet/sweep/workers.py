@@ -13,7 +13,6 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Process
 from contextlib import contextmanager
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
-from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.processes import safe_path
@@ -27,8 +26,6 @@ if TYPE_CHECKING:
 
 #: Maximum time to wait for a scheduler [s].
 _CONNECT = 20.0
-#: Maximum time without any worker in a cluster [s]: others may wait in a queue for their machines.
-_ALONE = 300.0
 
 
 def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
@@ -160,42 +157,22 @@ def cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
             f"--cluster {address}: no scheduler answers ({why}). Start one by `dask scheduler` and give the address"
             " that it prints, for example tcp://HOST:8786."
         ) from None
-    seen = monotonic()
-
-    def count() -> int:
-        nonlocal seen
-        if workers := sum(client.nthreads().values()):
-            seen = monotonic()
-        elif monotonic() - seen > _ALONE:
-            raise TimeoutError(
-                f"no worker has come for {_ALONE:g} s. Start some by `dask worker {address}`."
-            )
-        return workers
-
-    log = logging.getLogger("distributed.client")
-    before = log.level
+    executor = client.get_executor(pure=False)
     try:
-        with client:
-            executor = client.get_executor(pure=False)
-            try:
-                yield executor, count
-            except RigidfleetError:
-                log.setLevel(logging.CRITICAL + 1)  # the client would log a traceback as it closes
-                raise
-            finally:
-                executor.shutdown(wait=False)
+        yield executor, lambda: sum(client.nthreads().values())
     finally:
+        log = logging.getLogger("distributed.client")
+        before = log.level
+        log.setLevel(logging.CRITICAL + 1)  # as it closes without a scheduler, it logs a traceback
+        executor.shutdown(wait=False)
+        client.close()
         log.setLevel(before)
 
 
 def why_failed(error: Exception) -> str:
     """Why work that was handed to an executor did not come back, and what to do."""
-    if isinstance(error, TimeoutError) and error.args:
-        return str(error)
     if isinstance(error, CancelledError | OSError):
         return "the scheduler of the cluster ended, or the connection to it."
-    if isinstance(error, BrokenExecutor):
-        return "a worker died, and the executor with it. If memory is short, use fewer workers."
-    if type(error).__name__ == "KilledWorker":  # of Dask, which may be missing
-        return "several workers died one after the other in the same runs. If memory is short, use fewer on a machine."
+    if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # Dask's
+        return "workers died in the middle of runs. If memory is short, use fewer of them."
     return f"a worker failed: {type(error).__name__}: {error}."

@@ -242,11 +242,8 @@ class _StudySweeps:
 
         # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
         first, self.first = self.first, False
-        several = self.count > 1 and not first
-        table = fly(
-            sweep, folder, workers=self.count if several else 1, progress=tell,
-            pool=self._processes() if several else None,
-        )  # fmt: skip
+        pool = self._processes() if self.count > 1 and not first else None
+        table = fly(sweep, folder, workers=self.count if pool else 1, progress=tell, pool=pool)
         self.done, self.flown, self.failed = (
             self.done + last.done, self.flown + last.flown, self.failed + last.failed
         )  # fmt: skip

@@ -135,7 +135,7 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = pack_anew(segment), pack_anew(UNRECORDED)
+        self._kept = pack_anew(segment), pack(UNRECORDED)
         self.monitor = monitor._replace(
             recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
