@@ -45,7 +45,6 @@ import tempfile
 import threading
 import time
 import tomllib
-import types
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -465,7 +464,7 @@ def fly_with(plain: str) -> None:
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_distances(first, end, problem, state, watch.monitor)
 
-    def solids(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
+    def clearances(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
         for step in range(first, end):
             row = monitor.row_of(step, state)
             t, h = state.trail.clock[row]
@@ -482,9 +481,8 @@ def fly_with(plain: str) -> None:
         with np.errstate(all="ignore"):
             return int(guard.avoid(problem, work, flight, state, avoidance))
 
-    module: Any = types.ModuleType("rigidfleet.kernel.engine.solids")
-    module.watch_solids = solids  # in the place of the module that compiles
-    sys.modules[module.__name__] = module
+    watching: Any = native.Watch
+    watching.clearances = clearances
     if plain == "monitor":
         monitor.call_recorder = record
         for function in (bound_moves, distances, forces):
