@@ -543,6 +543,29 @@ def test_gltf(flight, tmp_path):
 
 @pytest.mark.parametrize("name", ["skyc", "gltf", "compressed"])
 @pytest.mark.parametrize("omega", [0.5, 0.9, 3.0])
+def test_pieces_are_as_long_as_the_tolerance_allows(flight):
+    """Of vehicles fitted together, each has pieces of its own: none could go on for one more interval.
+
+    SciPy makes the same pieces from the closed form's derivatives, and the closed form says how far off they are.
+    """
+    shaken_flight = replace(flight, slot_position=flight.slot_position.copy())
+    result, _ = exported_motion(shaken_flight, flown=False)
+    for agent, curve in enumerate(fit_curves(result.ways(), 1e-3)):
+        time = np.unique(flight.time.round(9))
+        at = np.searchsorted(time, curve.time.round(9))
+        assert len(curve.pieces) > 3
+
+        def error(i, j, time=time, agent=agent):
+            states = motion(time[[i, j]])[0][:, :, agent]
+            piece = BPoly.from_derivatives(time[[i, j]], states.swapaxes(0, 1))
+            t = np.linspace(time[i], time[j], 4 * (j - i) + 1)
+            return np.linalg.norm(piece(t) - motion(t)[0][0, :, agent], axis=1).max()
+
+        for i, j in itertools.pairwise(at.tolist()):
+            assert error(i, j) < 1.01e-3
+            assert j == len(time) - 1 or error(i, j + 1) > 0.99e-3
+
+
 def test_yaw_keeps_half_a_degree(flight, tmp_path, name, omega):
     """Tolerances of fitted yaw, of lines through it and of rounding stay within half a degree in sum."""
     angle = omega * flight.time[:, None] + 0.5 * np.arange(N)
