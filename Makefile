@@ -13,7 +13,7 @@ BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints cons
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test door bench peers robustness avoidance exports replays docs package lint format constraints clean
+.PHONY: help setup demo test versions door bench peers robustness avoidance exports replays docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -25,6 +25,9 @@ demo: .venv/.core  ## Fly the paper's narrow passage
 
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
+
+versions: .venv/.uv  ## Fly with the lowest versions and the newest, on every Python found
+	@$(BIN)/python tests/versions.py
 
 door: .venv/.dev  ## Give 2,000 mutants of known flights to `assess`
 	@$(BIN)/python tests/door.py
@@ -74,10 +77,12 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 
-constraints: .venv/.dev  ## Choose newer versions of all packages
+constraints: .venv/.dev  ## Choose newer versions of all packages, and the lowest that are declared
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
 		--all-extras --group dev --group peers --group crowds --group vehicles --group interchange --group oracles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
+	@$(BIN)/uv pip compile --quiet --python-version 3.11 --resolution lowest-direct --upgrade --no-header --no-annotate \
+		--all-extras pyproject.toml --output-file constraints-lowest.txt
 
 clean:  ## Remove .venv, caches and builds
 	@rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache build dist site

@@ -232,14 +232,14 @@ def test_a_store_of_an_earlier_version_is_read_and_goes_on(tmp_path):
         RunRecord(k, True, "", "", codes[k], {name: float(k + 1) for name in METRICS}, 0.1)
         for k in (0, 1)
     ]
-    with Store(tmp_path, sweep) as store:
+    with Store(tmp_path, sweep, "", replace=False) as store:
         store.add(rows[:1])
     with closing(sqlite3.connect(tmp_path / FILE)) as db:
         db.execute("ALTER TABLE runs DROP COLUMN vertical_jerk")
     table = read(tmp_path)
     assert np.isnan(table.metrics["vertical_jerk"]).tolist() == [True]
     assert table.metrics["speed"].tolist() == [1.0]
-    with Store(tmp_path, sweep) as store:
+    with Store(tmp_path, sweep, "", replace=False) as store:
         store.add(rows[1:])
     table = read(tmp_path)
     np.testing.assert_array_equal(table.metrics["vertical_jerk"], [np.nan, 2.0])

@@ -227,6 +227,13 @@ class Margins:
     phase: float = math.nan
     delay: float = math.nan
 
+    def common(self, other: Margins) -> Margins:
+        """The smaller margins of both: those of their loops together."""
+        if not (self.stable and other.stable):
+            return Margins(stable=False)
+        gain = max(self.gain[0], other.gain[0]), min(self.gain[1], other.gain[1])
+        return Margins(True, gain, min(self.phase, other.phase), min(self.delay, other.delay))
+
     def data(self) -> dict[str, Any]:
         """Plain data: the phase in degrees."""
         phase = math.degrees(self.phase)

@@ -138,9 +138,8 @@ class ActivePhase:
         self.next_loss = self._loss_ahead()  # of a vehicle or a link [s]
         self.asked = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
-        self.counted = np.zeros(
-            3, dtype=np.int64
-        )  # evaluations, steps and rejections before a loss
+        # Evaluations, steps and rejections before a loss.
+        self.counted = np.zeros(3, dtype=np.int64)
         self.solves: list[tuple[str, Counts]] = []  # by method, before a loss
         self.quiet_since = math.inf  # since when the phase has been settled [s]
         self.stop = math.inf  # time at which the caller wants a sample [s]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import platform
+from dataclasses import dataclass, field
 
 from rigidfleet.errors import MissionError
 
@@ -25,6 +26,7 @@ class RunRecord:
     codes : value of every column of the sweep, encoded by `Variation.code`
     metrics : value of each of `METRICS`; NaN if it does not apply
     wall : wall time of the run [s]
+    level : level of the machine code that flew it; between levels the last bits of a row differ
     """
 
     run: int
@@ -34,6 +36,7 @@ class RunRecord:
     codes: tuple[float, ...]
     metrics: dict[str, float]
     wall: float
+    level: str = field(default_factory=platform.machine)
 
 
 def refusal(error: MissionError) -> tuple[str, str]:

@@ -191,9 +191,10 @@ def _overflow_user() -> int | None:
 
 def _others_write(path: str | Path, state: os.stat_result) -> bool:
     """Whether others can write an item, even if only members of a group."""
+    if not _OWNERS:
+        return False
     mode = state.st_mode
-    group = mode & stat.S_IWGRP and not _own_group(path, state)
-    return _OWNERS and bool(mode & stat.S_IWOTH or group)
+    return bool(mode & stat.S_IWOTH or (mode & stat.S_IWGRP and not _own_group(path, state)))
 
 
 def _own_group(path: str | Path, state: os.stat_result) -> bool:

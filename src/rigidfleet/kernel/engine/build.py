@@ -16,7 +16,7 @@ from typing import Any
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 
-from rigidfleet.kernel import dopri5, measurement, monitor, nearest, recorder, recursion
+from rigidfleet.kernel import dopri5, measurement, monitor, recorder, recursion
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
@@ -77,9 +77,7 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
 def apart() -> list[bytes]:
     """Object codes of monitor, measurement, clearances, recursions and packing, which share little with the rest."""
-    problem, workspace, integrator, _, _, watching, *_, measured, spectrum, boxes, recursing = (
-        _pointers()
-    )
+    problem, workspace, integrator, _, _, watching, *_, measured, recursing = _pointers()
 
     def bound_moves(p, state, watch):
         monitor.bound_moves(problem(p), integrator(state), watching(watch))
@@ -108,14 +106,12 @@ def apart() -> list[bytes]:
         watch_distances,
         watch_forces,
         caller(measurement.measure, measured),
-        caller(measurement.spectrum, spectrum),
-        caller(nearest.nearest_boxes, boxes),
         caller(recursion.follow, recursing),
         gather,
     )
     entries = list(objects.ENTRIES["flight"].items())[2:-1]
     return [
-        _object(*_module(function, name, words), loops=name == "nearest")
+        _object(*_module(function, name, words))
         for function, (name, words) in zip(functions, entries, strict=True)
     ]
 
@@ -124,7 +120,7 @@ def sampled_code() -> list[bytes]:
     """Object code of the two C functions of sampled flights."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
-    problem, workspace, *_, flight, state, segment, evaluation, _, _, _, _, _ = _pointers()
+    problem, workspace, *_, flight, state, segment, evaluation, _, _, _ = _pointers()
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -143,7 +139,7 @@ def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
-    problem, workspace, *_, flight, state, _, _, avoidance, _, _, _, _ = _pointers()
+    problem, workspace, *_, flight, state, _, _, avoidance, _, _ = _pointers()
 
     def avoid(f, s, address, _):
         a = avoidance(address)
@@ -172,15 +168,10 @@ def _object(
     name: str,
     hot: tuple[str, ...] = _HOT,
     sizes: Mapping[str, int] = ANY,
-    *,
-    loops: bool = False,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`.
-
-    ``loops``: make vectors of its loops.
-    """
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`."""
     module = _simplify(with_sizes(text, sizes), symbol, name, hot)
-    builder = _passes(3, loops=loops)
+    builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
@@ -210,10 +201,10 @@ def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) ->
     return module
 
 
-def _passes(level: int, *, loops: bool = False) -> Any:
+def _passes(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
     # Most loops are short, and the integrator's sums use vectors already
-    options.loop_vectorization = loops
+    options.loop_vectorization = False
     return llvm.create_pass_builder(objects.target_machine(), options)
 
 

@@ -34,7 +34,7 @@ from rigidfleet.kernel.engine.objects import (
     target_machine,
 )
 from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, pack_anew, use
-from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
+from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import (
     Problem,
     Workspace,
@@ -47,8 +47,7 @@ from rigidfleet.kernel.records import (
     Segment,
     recorder,
 )
-from rigidfleet.solids import distance
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Floats
 
 
 def integrate(
@@ -123,7 +122,7 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = pack_anew(segment), pack_anew(UNRECORDED)
+        self._kept = pack_anew(segment), pack(UNRECORDED)
         self.monitor = monitor._replace(
             recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
@@ -177,20 +176,6 @@ def _call(function: Any, *arguments: Packed) -> int:
 def measure(measured: Measured) -> None:
     """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
     _call(_code().measure, pack_anew(measured))
-
-
-def least_singular_values(r: Floats, edges: Ints) -> Floats:
-    """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
-    spectrum = spectrum_of(r, edges)
-    _call(_code().spectrum, pack_anew(spectrum))
-    return spectrum.values
-
-
-def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
-    """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
-    nearest = nearest_of(r, radius, boxes)
-    _call(_code().nearest, pack_anew(nearest))
-    return nearest.least, nearest.nearest
 
 
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
@@ -260,7 +245,6 @@ def _link(part: str, parts: Sequence[bytes], unkept: list[bytes] | None = None) 
     }
     if part == "flight":
         use(calls["gather"], engine)
-        distance.use(nearest_boxes)
     return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 

@@ -22,8 +22,6 @@ ENTRIES = {
         "watch_distances": 5,  # first, end, problem, integrator, monitor
         "watch_forces": 5,  # last, problem, workspace, integrator, monitor
         "measure": 1,
-        "spectrum": 1,
-        "nearest": 1,
         "follow": 1,
         "gather": 4,  # objects, count, asked, words
         "integrate_three": 4,  # the first, for three agents with three edges

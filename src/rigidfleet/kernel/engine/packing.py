@@ -14,14 +14,7 @@ import numpy as np
 
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance
-from rigidfleet.kernel.measured import (
-    Measured,
-    Nearest,
-    SingularValues,
-    measurement_of,
-    nearest_of,
-    spectrum_of,
-)
+from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
@@ -244,8 +237,6 @@ def examples() -> tuple[
     fleet.Evaluation,
     AvoidanceArrays,
     Measured,
-    SingularValues,
-    Nearest,
     Recursion,
 ]:
     """One minimal example of each named tuple; its fields have the types that all have."""
@@ -280,7 +271,6 @@ def examples() -> tuple[
         measurement_of(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
                  r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
-        spectrum_of(rows, np.zeros((0, 2), dtype=np.int64)), nearest_of(rows, one, nowhere),
         Recursion(np.zeros((0, 1)), none, False),
     )  # fmt: skip
 

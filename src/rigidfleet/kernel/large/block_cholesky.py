@@ -55,9 +55,8 @@ def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pat
     mark[:] = -1
     next_ = column[:-1].copy()
     fill_blocks(first, left, parent, mark, next_, blocks_of)
-    key = (
-        np.repeat(np.arange(n), np.diff(column)) * n + blocks_of.row
-    )  # sorted, as rows are in a column
+    # Sorted, as rows are in a column
+    key = np.repeat(np.arange(n), np.diff(column)) * n + blocks_of.row
     low, high = np.sort(place[edges], axis=1).T
     blocks_of.of_edge[:] = np.searchsorted(key, low * n + high)
     return blocks_of

@@ -85,9 +85,8 @@ class LargeSolver:
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
         self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))
         self.least = self.mu * self.mbar * self.setup.floor * math.sqrt(n)
-        self.pattern: block_cholesky.Pattern | None = (
-            None  # not needed as long as elimination succeeds
-        )
+        # Not needed as long as elimination succeeds
+        self.pattern: block_cholesky.Pattern | None = None
         self.pulled = True  # whether the workspace has the multipliers of the last evaluation
         self._calls = [_callable(method) for method in (self._solve, self._pull)]
         self.address, self.multipliers = (
@@ -206,9 +205,8 @@ class LargeSolver:
         count = np.diff(self.pattern.column).astype(float)
         self.worth = 0.75 * float((count**2).sum() / count.sum())
         self.fresh, self.wasted = 0, 0.0  # iterations with a new factor, and the excess since
-        self.axes: Floats | None = (
-            None  # axes of the marker agents when the factor was made; None: no factor
-        )
+        # Axes of the marker agents when the factor was made; None: no factor
+        self.axes: Floats | None = None
 
     def _system(self, number: int) -> Floats | None:
         """The solution x (N, 3) of K x = g for the given system of an evaluation; None if there is none.
