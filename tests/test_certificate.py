@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rigidfleet import MissionError, assess, check, simulate
 from rigidfleet.formation import assignment, shapes
+from rigidfleet.math.products import product_in_blocks
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.preview import preview
 from rigidfleet.result import Result
