@@ -3,8 +3,9 @@
 `python tests/mutants.py --into FILE` draws 100 mutants by a seed, over guard, barriers, monitor and checks in
 proportion to their lines of code, and tests each. It writes a line of JSON for each into the file, goes on there if it
 was stopped, tests survivors again, and lists those that are left. Each calls for a test, or for an entry in
-`mutants.toml` with the proof that nothing changes. `--count`, `--seed` and `--jobs` are as they say, `--only 3 7` takes
-some of those drawn, `--list` runs none, and `--as-is` tells which tests pass without a fault, and how long they take.
+`mutants.toml` with the proof that nothing changes. `--count`, `--seed` and `--jobs` are as they say, a mutant on which
+the tests have spent `--most` seconds survives, `--only 3 7` takes some of those drawn, `--list` runs none, and
+`--as-is` tells which tests pass without a fault, and how long they take.
 
 The operators:
 
@@ -416,8 +417,10 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
             name for name, of in reach.items() if of["passes"] and here in map(list, of["reaches"])
         ]
         put_in(mutant)
-        by = ""
+        by, begun = "", time.process_time()
         for name in sorted(names, key=lambda x: reach[x]["s"]):
+            if time.process_time() - begun > task["most"]:
+                break
             words = json.dumps({"killed": True, "by": f"time: {name}", "tests": len(names)})
             limit_time(TIMES * reach[name]["s"] + MORE, out, words)
             if not passes(session, items[name]):
@@ -543,6 +546,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", type=int, nargs="*")
     parser.add_argument("--into", help="file of results, which are kept")
+    parser.add_argument("--most", type=float, default=30.0, help="processor time of a mutant [s]")
     parser.add_argument("--list", action="store_true")
     parser.add_argument("--as-is", action="store_true", help="run the tests without a fault")
     given = parser.parse_args()

@@ -575,6 +575,18 @@ def test_an_obstacle_may_have_a_comma_in_its_name(height):
     assert words in finding.message
 
 
+def test_who_starts_on_an_obstacle_with_a_comma_in_its_name_stands_on_it():
+    """The name is told whole there, too."""
+    roof = {"kind": "box", "name": "roof, north", "min": [-9, -9, -9], "max": [9, 9, 0]}
+    one = {"mass": 1.0, "radius": 0.25, "position": [[0.0, 0.0, 0.25]]}
+    up = [{"kind": "fly", "position": [0, 0, 3], "duration": 4.0}]
+    finding = found(
+        assess(simulate(a_mission({}, 1, up, agents=one, obstacles=[roof]))), "clearance_start"
+    )
+    assert finding.who == "agent 1, roof, north"
+    assert "agent 1 stands in contact with 'roof, north'" in finding.message
+
+
 def test_a_record_says_how_many_contradictions_it_has():
     """The first one is told, and how many others there are."""
     mission = a_mission(TRIANGLE, 3)

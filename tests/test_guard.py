@@ -219,7 +219,7 @@ def test_who_passes_beside_another_is_left_alone(seed):
     They are nearest somewhere in the tick, of which a bound from either end would be of no use.
     """
     rng = np.random.default_rng(seed)
-    turn = Rotation.random(random_state=seed)
+    turn = Rotation.from_rotvec(2.0 * rng.normal(size=3))
     part = rng.uniform(0.3, 0.7)
     for gap, free in ((2 * RADIUS + 0.15, True), (2 * RADIUS - 0.05, False)):
         # Beyond the stop points of both, they would have met long before if they could not pass.
@@ -654,7 +654,7 @@ def tilted(crowd: Crowd, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarr
     """Give quadrotors attitudes, rates and motor speeds; body z axes, their rates of change, and thrusts per mass."""
     S = crowd.state.S
     turn = Rotation.from_rotvec(rng.normal(0.0, 0.2, (len(S), 3)))
-    S[:, 6:10] = turn.as_quat(scalar_first=True)
+    S[:, 6:10] = turn.as_quat()[:, [3, 0, 1, 2]]
     S[:, 10:13] = rng.normal(0.0, 0.5, (len(S), 3))
     S[:, 13:] *= rng.uniform(0.8, 1.1, (len(S), 4))
     step = 1e-6
@@ -717,6 +717,13 @@ def test_the_tilt_of_a_quadrotor_is_limited_and_its_lift_kept():
     crowd([[0.0, 0, 0]], np.zeros((1, 3)), [[12.0, -9.0, -1.0]])
     up = 9.81 - 1.0
     assert crowd.a.requested[0] == pytest.approx([0.8 * up, -0.6 * up, -1.0])
+
+
+def test_quadrotors_that_fly_apart_are_still_where_they_are():
+    """The points led are farther apart than the vehicles, whose places count."""
+    crowd = quadrotors(2, filtered=False)
+    crowd([[0.0, 0, 0], [0.8, 0, 0]], [[-1.0, 0, 0], [1.0, 0, 0]], np.zeros((2, 3)))
+    assert crowd.a.margin[PAIR, 0] == pytest.approx(0.8 - 2 * RADIUS, abs=1e-6)
 
 
 class Hulls:

@@ -101,13 +101,17 @@ JUMPS = {records.SEPARATION_FLYING, records.SEPARATION_BELOW}
 
 
 def agrees(
-    found: Watched, right: dict[int, np.ndarray], clock: np.ndarray, close: float, kinds: Any = None
+    outcome: Watched,
+    right: dict[int, np.ndarray],
+    clock: np.ndarray,
+    close: float,
+    kinds: Any = None,
 ) -> None:
     """Assert that each worst value is that of the samples, with its time and whom it concerns."""
-    pairs = list(combinations(range(found.n), 2))
+    pairs = list(combinations(range(outcome.n), 2))
     for kind in right if kinds is None else kinds:
         value, t, who = least(right[kind], clock)
-        x, when, whom = found.worst(kind)
+        x, when, whom = outcome.worst(kind)
         if not np.isfinite(value):
             continue
         slack = 4e-3 if kind in JUMPS or kind == records.CLEARANCE else close
@@ -141,8 +145,8 @@ def test_extremes_of_curves_are_those_of_dense_samples(seed):
     n, steps = 4, 2
     r, v, clock = curves(rng, steps, n)
     radius = rng.uniform(0.05, 0.3, n)
-    found = Watched(r, v, clock, radius=radius, boxes=BOX, fence=FENCE, altitude=ALTITUDE).take()
-    agrees(found, expected(sampled(r), sampled(v), radius), clock, 2e-4)
+    outcome = Watched(r, v, clock, radius=radius, boxes=BOX, fence=FENCE, altitude=ALTITUDE).take()
+    agrees(outcome, expected(sampled(r), sampled(v), radius), clock, 2e-4)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -155,12 +159,12 @@ def test_of_many_agents_the_one_that_comes_nearest_to_a_box_is_not_passed_over(s
     r = (0.6 * rng.normal(size=(1, 5, n, 3)) + centre).reshape(1, 5, 3 * n)
     clock = np.array([[0.0, 0.5]])
     none = np.zeros((0, 2), dtype=np.int64)
-    found = Watched(r, 0 * r, clock, radius=0.1, boxes=BOX, pairs=none, columns=none).take()
+    outcome = Watched(r, 0 * r, clock, radius=0.1, boxes=BOX, pairs=none, columns=none).take()
     x = sampled(r)
     beyond = np.linalg.norm(np.maximum(np.maximum(BOX[0, :3] - x, x - BOX[0, 3:]), 0.0), axis=3)
     inside = np.minimum(x - BOX[0, :3], BOX[0, 3:] - x).min(axis=3)
     clearance = np.where(beyond > 0.0, beyond, -inside) - 0.1
-    agrees(found, {records.CLEARANCE: clearance}, clock, 1e-4)
+    agrees(outcome, {records.CLEARANCE: clearance}, clock, 1e-4)
 
 
 def test_speeds_by_direction_are_not_searched_for_where_they_have_no_limit():
@@ -168,9 +172,9 @@ def test_speeds_by_direction_are_not_searched_for_where_they_have_no_limit():
     r, v, clock = curves(np.random.default_rng(0), 1, 2)
     worst = np.full(records.QUANTITIES, np.inf)
     worst[[records.HORIZONTAL_SPEED, records.VERTICAL_SPEED]] = -np.inf
-    found = Watched(r, v, clock, radius=0.1, worst=worst.copy()).take()
-    assert np.array_equal(found.monitor.worst == -np.inf, worst == -np.inf)
-    assert found.worst(records.SPEED)[0] < 0.0
+    outcome = Watched(r, v, clock, radius=0.1, worst=worst.copy()).take()
+    assert np.array_equal(outcome.monitor.worst == -np.inf, worst == -np.inf)
+    assert outcome.worst(records.SPEED)[0] < 0.0
 
 
 def test_agents_that_are_lost_are_watched_no_more_but_where_they_strike():
@@ -180,21 +184,21 @@ def test_agents_that_are_lost_are_watched_no_more_but_where_they_strike():
     left = np.array([True, False, True, True])
     pairs = np.array([(0, 2), (0, 3), (2, 3)])
     struck = np.array([(1, 0), (1, 2), (1, 3)])
-    found = Watched(
+    outcome = Watched(
         r, v, clock, radius=0.1, left=left, pairs=pairs, columns=pairs, struck=struck
     ).take()
     x, u = sampled(r), sampled(v)
-    right = expected(x, u, found.radius)
+    right = expected(x, u, outcome.radius)
     for kind in (records.LOWEST, records.HIGHEST, records.SPEED):
         value, t, who = least(right[kind][:, :, left], clock)
-        assert found.worst(kind)[0] == pytest.approx(value, abs=1e-5)
-        assert found.worst(kind)[2] == [int(np.flatnonzero(left)[who]), -1]
+        assert outcome.worst(kind)[0] == pytest.approx(value, abs=1e-5)
+        assert outcome.worst(kind)[2] == [int(np.flatnonzero(left)[who]), -1]
     for kind, among in ((records.SEPARATION, pairs), (records.LOST, struck)):
         apart = np.linalg.norm(x[:, :, among[:, 0]] - x[:, :, among[:, 1]], axis=3) - 0.2
         value, t, who = least(apart, clock)
-        assert found.worst(kind)[0] == pytest.approx(value, abs=1e-5)
-        assert found.worst(kind)[1] == pytest.approx(t, abs=1e-3)
-        assert found.worst(kind)[2] == among[who].tolist()
+        assert outcome.worst(kind)[0] == pytest.approx(value, abs=1e-5)
+        assert outcome.worst(kind)[1] == pytest.approx(t, abs=1e-3)
+        assert outcome.worst(kind)[2] == among[who].tolist()
 
 
 def turning(rng: np.random.Generator, steps: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +211,7 @@ def turning(rng: np.random.Generator, steps: int, rate: float) -> tuple[np.ndarr
     )
     q *= np.sign(q @ q[0])[:, None]
     points = FROM_KNOTS @ q.reshape(steps, 5, 4)
-    matrices = Rotation.from_quat((BASIS @ points).reshape(-1, 4), scalar_first=True).as_matrix()
+    matrices = Rotation.from_quat((BASIS @ points).reshape(-1, 4)[:, [1, 2, 3, 0]]).as_matrix()
     return points, matrices.reshape(steps, len(FINE), 3, 3)
 
 
@@ -231,21 +235,21 @@ def test_extremes_of_curves_in_body_axes_are_those_of_the_world(seed, obstacles)
         if obstacles
         else {"columns": np.zeros((0, 2), int)}
     )
-    found = Watched(r, v, clock, radius=0.1, body=(q, centre), **some).take()
+    outcome = Watched(r, v, clock, radius=0.1, body=(q, centre), **some).take()
     c = BASIS @ centre
     x, u = (
         sampled(r) @ T.swapaxes(2, 3) + c[:, :, None, :3],
         sampled(v) @ T.swapaxes(2, 3) + c[:, :, None, 3:],
     )
     alone = {records.SEPARATION, records.LOWEST, records.HIGHEST, records.SPEED}
-    agrees(found, expected(x, u, found.radius), clock, 1e-4, None if obstacles else alone)
+    agrees(outcome, expected(x, u, outcome.radius), clock, 1e-4, None if obstacles else alone)
 
 
 @pytest.mark.parametrize("axis", range(3))
 def test_of_many_agents_in_body_axes_the_extreme_ones_are_looked_at(axis):
     """Of twenty in axes that turn, the centre travelling, the last is the fastest, and reaches farthest, along an axis.
 
-    It is found although all others have been looked at before.
+    It is outcome although all others have been looked at before.
     """
     rng = np.random.default_rng(3)
     n, steps = 20, 2
@@ -257,7 +261,7 @@ def test_of_many_agents_in_body_axes_the_extreme_ones_are_looked_at(axis):
     centre = 0.5 * rng.normal(size=(steps, 5, 6))
     clock = np.stack([np.arange(steps) * 0.5, np.full(steps, 0.5)], axis=1)
     none = np.zeros((0, 2), dtype=np.int64)
-    found = Watched(r, v, clock, radius=0.1, body=(q, centre), pairs=none, columns=none).take()
+    outcome = Watched(r, v, clock, radius=0.1, body=(q, centre), pairs=none, columns=none).take()
     c = BASIS @ centre
     x = place @ T.swapaxes(2, 3) + c[:, :, None, :3]
     u = speed @ T.swapaxes(2, 3) + c[:, :, None, 3:]
@@ -266,7 +270,7 @@ def test_of_many_agents_in_body_axes_the_extreme_ones_are_looked_at(axis):
         records.HIGHEST: -x[..., 2],
         records.SPEED: -np.linalg.norm(u, axis=3),
     }
-    agrees(found, right, clock, 1e-4)
+    agrees(outcome, right, clock, 1e-4)
 
 
 # -- bounds of how far distances change ----------------------------------------------------------------
@@ -291,11 +295,11 @@ def test_no_distance_changes_by_more_than_its_bound(seed, body):
     if body:
         q, T = turning(rng, 1, 0.1)
         axes = q, np.zeros((1, 5, 6))
-    found = Watched(
+    outcome = Watched(
         r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, left=left, body=axes, pairs=none, columns=none
     )
-    found.watch.bound_moves(found.problem, found.state)
-    space, above = found.monitor.moves
+    outcome.watch.bound_moves(outcome.problem, outcome.state)
+    space, above = outcome.monitor.moves
     x = (sampled(r) @ T.swapaxes(2, 3))[0, :, :4]
     i, j = np.triu_indices(4, 1)
     for bound, axes_seen in ((space, 3), (above, 2)):
@@ -320,9 +324,9 @@ def test_one_that_moves_alone_changes_its_distances_by_its_way(axis):
     r = np.tile(place.reshape(-1), (1, 5, 1))
     r[0, :, 9 + axis] += KNOTS
     none = np.zeros((0, 2), dtype=np.int64)
-    found = Watched(r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, pairs=none, columns=none)
-    found.watch.bound_moves(found.problem, found.state)
-    assert 0.95 <= found.monitor.moves[0] <= 2.0
+    outcome = Watched(r, 0 * r, np.array([[0.0, 0.5]]), radius=0.1, pairs=none, columns=none)
+    outcome.watch.bound_moves(outcome.problem, outcome.state)
+    assert 0.95 <= outcome.monitor.moves[0] <= 2.0
 
 
 # -- forces --------------------------------------------------------------------------------------------
@@ -378,10 +382,10 @@ def test_greatest_forces_of_a_flight_are_those_of_dense_samples():
                 continue
             x = phase.extremes[name]
             sample, column = np.unravel_index(int(np.nanargmax(size)), size.shape)
-            most, found = float(size[sample, column]), x.value if name in beyond else abs(x.value)
-            assert found >= most - 1e-5 * abs(most), (name, found, most)
-            assert found <= most + 2e-3 * max(1.0, abs(most)), (name, found, most)
-            if abs(found - most) < 1e-4 * abs(most):
+            most, outcome = float(size[sample, column]), x.value if name in beyond else abs(x.value)
+            assert outcome >= most - 1e-5 * abs(most), (name, outcome, most)
+            assert outcome <= most + 2e-3 * max(1.0, abs(most)), (name, outcome, most)
+            if abs(outcome - most) < 1e-4 * abs(most):
                 assert x.time == pytest.approx(result.time[at][sample], abs=2e-3), name
                 whom = (column, -1) if name not in of_edges else tuple(result.edges[column])
                 assert (x.who, x.other) == whom, name

@@ -244,3 +244,18 @@ def test_a_store_of_an_earlier_version_is_read_and_goes_on(tmp_path):
     table = read(tmp_path)
     np.testing.assert_array_equal(table.metrics["vertical_jerk"], [np.nan, 2.0])
     assert table.metrics["steps"].tolist() == [1.0, 2.0]
+
+
+def test_the_safety_table_measures_no_distances_again(monkeypatch):
+    """What the verdict has measured between vehicles is not measured a second time for the table."""
+    flight = rf.simulate("narrow-passage")
+    verdict = rf.assess(flight)
+    rows = {row.quantity: row for row in safety(flight, verdict)}
+    monkeypatch.setattr("rigidfleet.math.proximity.closeness", None)
+    again = {row.quantity: row for row in safety(flight, verdict)}
+    assert again == rows
+    z = flight.position[..., 2]
+    assert rows["lowest"].worst is not None
+    assert rows["lowest"].worst.value == pytest.approx(z.min(), abs=1e-4)
+    assert rows["lowest"].worst.value <= z.min()
+    assert verdict.by_name["clearance"].limit == rows["clearance"].limit == 0.0
