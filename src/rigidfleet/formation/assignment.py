@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.math.products import product_in_blocks
 from rigidfleet.math.rigid_body import centred, kabsch
 from rigidfleet.typing import Floats, Ints
 
@@ -226,8 +227,6 @@ def _nearest_slots(p: Floats, q: Floats) -> Ints:
 
 #: Number of agents whose exchanges with all others are found together.
 _TOGETHER = 64
-#: Number of columns of a product for which OpenBLAS starts no threads: of at most 2^18 multiplications.
-_BLOCK = 512
 #: A sum of squares counts as reduced beyond this share of the greatest squares.
 _ROUNDING = 1e-12
 
@@ -249,7 +248,7 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
             i = np.arange(first, min(first + _TOGETHER, n))
             while len(i):
                 own = np.einsum("ia,ia->i", p, slots)
-                crossed = _product(np.hstack([p[i], slots[i]]), np.hstack([slots, p]).T)
+                crossed = product_in_blocks(np.hstack([p[i], slots[i]]), np.hstack([slots, p]).T)
                 xy = own[i, None] + own - crossed
                 j = xy.argmin(axis=1)
                 gain = xy[np.arange(len(i)), j]
@@ -263,17 +262,6 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
                 slots = q[order]
                 i = np.union1d(i, j[(j >= first) & (j < first + _TOGETHER)])
     return order
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    """The product of a wide and a long matrix, in blocks for which BLAS starts no threads.
-
-    Threads of BLAS wait actively: for products so small, they would take 4 to 20 times the processor time.
-    """
-    product = np.empty((len(a), b.shape[1]))
-    for k in range(0, b.shape[1], _BLOCK):
-        np.matmul(a, b[:, k : k + _BLOCK], out=product[:, k : k + _BLOCK])
-    return product
 
 
 def _disjoint_pairs(i: Ints, j: Ints) -> tuple[Ints, Ints]:
