@@ -254,11 +254,11 @@ def _library(part: str) -> Library:
 
 
 def _load(part: str) -> Library:
-    for file in _shipped(sources_digest()):
+    for file in _shipped_code(sources_digest()):
         return _link(part, *_of_shared_object(file))
     if (parts := _read(part)) is not None:
         return _link(part, *_of_objects(parts))
-    if _shipped("*"):
+    if _shipped_code("*"):
         warnings.warn(
             "the kernel's sources were changed since its machine code was made: they are compiled again",
             RuntimeWarning,
@@ -331,7 +331,7 @@ def _compile(part: str) -> list[bytes]:
     return build.LIBRARIES.get(part, build.machine_code)()
 
 
-def _shipped(digest: str) -> list[Path]:
+def _shipped_code(digest: str) -> list[Path]:
     """Shared objects of this level that came with the package, made of sources with a digest, or of any ("*").
 
     Raises
@@ -381,7 +381,7 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
 
 def is_compiled() -> bool:
     """Return whether there is machine code, shipped or in the cache, so that nothing has to be compiled."""
-    if _shipped(sources_digest()):
+    if _shipped_code(sources_digest()):
         return True
     try:
         with open_safely(_file("flight")):
