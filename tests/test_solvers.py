@@ -49,7 +49,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
         steps = solvers.elimination_steps(len(p), edges)
         order = None if steps is None else ordering.order(steps, edges)
     setup = Setup(order, solvers.Dissection(p, edges), tolerance)
-    return LargeSolver(vehicles, edges, law, work, setup)
+    return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
 
 def solved(solver, b) -> np.ndarray:
