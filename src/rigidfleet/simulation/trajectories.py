@@ -288,8 +288,8 @@ def of_curve(
     for k in range(0, len(parts), together):  # in blocks, to save memory
         block = curve.part(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
-        _watch(watch, way, grid, spans)
-        _accelerations(fastest, way, directed=watch.directed)
+        watch_way(watch, way, grid, spans)
+        accelerations(fastest, way, directed=watch.directed)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     watch.only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.phase())
@@ -399,7 +399,7 @@ def _split(time: Floats, parts: Ints) -> Floats:
     return np.append(time[k] + np.diff(time)[k] * share, time[-1])
 
 
-def _watch(
+def watch_way(
     watch: CurveWatch, way: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
 ) -> None:
     """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree.
@@ -438,7 +438,7 @@ def _parts(way: Piecewise) -> Ints:
     return np.ceil((size @ np.array(weight) / _CLOSE) ** 0.2).clip(1, _PARTS).astype(np.int64)
 
 
-def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
+def accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
     n = curve.pieces.shape[1]
     if curve.pieces.shape[-1] < 3:
