@@ -30,6 +30,7 @@ from rigidfleet.plotting.curves import (
     limited_motions,
     motion,
 )
+from rigidfleet.plotting.logged import plan_and_flight
 from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
@@ -58,6 +59,7 @@ __all__ = [
     "inputs",
     "motion",
     "operation",
+    "plan_and_flight",
     "plot",
     "rotors",
     "summary",
@@ -69,7 +71,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     draw.__name__: draw
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
-        clearance, formations, disturbance, rotors, vehicles, operation, motion,
+        clearance, formations, disturbance, rotors, vehicles, operation, motion, plan_and_flight,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -104,6 +106,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "vehicles": not has_rotors(result),
         "operation": not leaves_ground(result),
         "motion": not limited_motions(result),
+        "plan_and_flight": "bands" not in result.statistics,
     }
     # Of trajectories that others made, most panels of the summary would be empty.
     empty["summary"] = empty["distances"] and empty["inputs"] and empty["attitude"]

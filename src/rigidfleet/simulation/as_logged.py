@@ -20,7 +20,7 @@ from rigidfleet.assessment.doubt import DrawnWays, facts_of, verdict_with_doubt
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
-from rigidfleet.math.piecewise import Piecewise, join, pad
+from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.math.smoothing import (
     NoiseEstimate,
     PositionNoise,
@@ -35,7 +35,7 @@ from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.extremes import CurveWatch
 from rigidfleet.simulation.recording import Places, distances, text_of
-from rigidfleet.simulation.trajectories import accelerations, of_curve, watch_way
+from rigidfleet.simulation.trajectories import of_curve, watch_curve
 from rigidfleet.typing import Floats
 
 #: What is believed of clocks: that they are those of the plan as recorded, that one offset is all that they differ from
@@ -47,6 +47,8 @@ _STEP = 0.025
 _KNOTS, _MOST, _LEAST = 8_000_000, 40, 12
 #: Standard deviations of a position by which a vehicle that stands on something may be in it.
 _TOUCH = 4.0
+#: Times for which a result keeps how far places are in doubt.
+_BANDS = 500
 #: Share by which the noise that samples show is more than the one stated.
 _MORE = 1.5
 #: Correlation times of noise of which no more is known than its size [s].
@@ -131,6 +133,13 @@ def judge_log(
         models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau), step) for tau in unknown)]
         late = alignment.fit[1, 0] if alignment and doubts.clock == "offset" else 0.0
         deviations = DrawnWays(flown, _deviations(flown, models, late))
+        if plan is not None:
+            step = -(-len(flown.time) // _BANDS)
+            place = np.linalg.norm(deviations.states[:, 0, ::step], axis=3).max(axis=0).round(6)
+            flown.statistics["bands"] = {
+                "time": flown.time[::step].tolist(),
+                "place": place.tolist(),
+            }
     facts = facts_of(flown, deviations, estimate, alignment, doubts.clock)
     flown.statistics["doubt"] = facts
     verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
@@ -239,11 +248,8 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
             dict[str, Extremum](),
         )
         if until - since > 1e-9:
-            part = way.between(since, until)
-            part = Piecewise(part.time, pad(part.pieces, 2))
-            watch_way(watch, part, grid, spans)
-            accelerations(extremes, part, directed=watch.directed)
-            extremes |= watch.phase()
+            fastest = watch_curve(watch, way.between(since, until), grid, spans)
+            extremes = watch.phase() | fastest
         records.append(replace(record, extremes=extremes, settled=None, controller=None))
     watch.only(np.ones(n, dtype=np.bool_))
     watch.flight(records)

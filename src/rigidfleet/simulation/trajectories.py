@@ -283,13 +283,7 @@ def of_curve(
     # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
     near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
     grid = time[0] + near * np.arange(1, math.ceil(span / near))
-    fastest: dict[str, Extremum] = {}
-    together = max(1, _TOGETHER // (4 * n * powers))
-    for k in range(0, len(parts), together):  # in blocks, to save memory
-        block = curve.part(k, k + together)
-        way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
-        watch_way(watch, way, grid, spans)
-        accelerations(fastest, way, directed=watch.directed)
+    fastest = watch_curve(watch, curve, grid, spans)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     watch.only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.phase())
@@ -399,7 +393,21 @@ def _split(time: Floats, parts: Ints) -> Floats:
     return np.append(time[k] + np.diff(time)[k] * share, time[-1])
 
 
-def watch_way(
+def watch_curve(
+    watch: CurveWatch, curve: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
+) -> dict[str, Extremum]:
+    """Watch a curve (K, N, 3 or more, P), see `_watch`, and return its greatest accelerations."""
+    fastest: dict[str, Extremum] = {}
+    together = max(1, _TOGETHER // (4 * curve.pieces.shape[1] * curve.pieces.shape[-1]))
+    for k in range(0, len(curve.pieces), together):  # in blocks, to save memory
+        block = curve.part(k, k + together)
+        way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
+        _watch(watch, way, grid, spans)
+        _accelerations(fastest, way, directed=watch.directed)
+    return fastest
+
+
+def _watch(
     watch: CurveWatch, way: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
 ) -> None:
     """Watch positions (K, N, 3, P) in steps that end at times of a grid, within `_CLOSE` of curves of fourth degree.
@@ -438,7 +446,7 @@ def _parts(way: Piecewise) -> Ints:
     return np.ceil((size @ np.array(weight) / _CLOSE) ** 0.2).clip(1, _PARTS).astype(np.int64)
 
 
-def accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
+def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
     n = curve.pieces.shape[1]
     if curve.pieces.shape[-1] < 3:
