@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from statistics import NormalDist
 from typing import Any
 
@@ -14,7 +14,9 @@ import numpy as np
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import plain
+from rigidfleet._common.quantities import display_unit
 from rigidfleet.sweep import store
+from rigidfleet.sweep.faults import UNITS
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.sweep.variation import is_number
@@ -74,6 +76,29 @@ class Driver:
 
 
 @dataclass(frozen=True)
+class Borne:
+    """How often a fault of a drill fails, and the worst run that does: the one of least separation, in words.
+
+    Attributes
+    ----------
+    fault, magnitude, unit : what happens, and by how much
+    vehicles : to how many
+    failed : rate of the runs that fail
+    separation : least separation of all runs that was measured [m]; None if none was
+    run, detail : number and message of the worst run; -1 and "" if none fails
+    """
+
+    fault: str
+    magnitude: float
+    unit: str
+    vehicles: int
+    failed: Rate
+    separation: float | None
+    run: int
+    detail: str
+
+
+@dataclass(frozen=True)
 class Summary(Shown):
     """Summary of a sweep.
 
@@ -90,6 +115,7 @@ class Summary(Shown):
     random_numbers : "shared": all runs have the same ones; "own": each run has its own; "varied": their seeds vary;
         "none": no random numbers act
     levels : number of runs by the level of machine code that flew them, if it is known
+    drill : how often each fault of a drill fails, in order; empty for other sweeps
     """
 
     name: str
@@ -104,10 +130,13 @@ class Summary(Shown):
     by_value: dict[str, dict[str, Rate]]
     random_numbers: str
     levels: dict[str, int]
+    drill: list[Borne] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """The summary as plain data."""
         data = asdict(self)
+        if not self.drill:
+            del data["drill"]
         data["percentiles"] = {
             name: dict(zip(map(str, PERCENTILES), values, strict=True))
             for name, values in self.percentiles.items()
@@ -124,7 +153,9 @@ class Summary(Shown):
         """Percentiles, reasons of failure, rank correlations, and the rate of success."""
         s, n = self.success, len(self.drivers)
         strong = [d for d in self.drivers if d.adjusted < _CHANCE]
-        parts = [self._percentiles(), self._reasons(), self._correlations(strong)]
+        parts: list[Any] = [self._percentiles(), self._reasons(), self._correlations(strong)]
+        if self.drill:
+            parts = [self._cases(), self._reasons()]
         if n:
             words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
             parts.append(Line(words))
@@ -135,13 +166,32 @@ class Summary(Shown):
         if len(self.levels) > 1:
             levels = ", ".join(f"{count} by {level}" for level, count in self.levels.items())
             parts.append(Line(f"Levels of machine code, whose last bits differ: {levels}.", "note"))
-        for name, rates in self.by_value.items():
+        for name, rates in () if self.drill else self.by_value.items():
             rows = [Row((word, f"{100 * r.rate:.3g} %", r.interval)) for word, r in rates.items()]
             parts.append(FactTable((name, "passed", "95 % interval"), rows))
         if s.of:
             words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} % (95 % interval {s.interval})."
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
+
+    def _cases(self) -> FactTable:
+        rows = [
+            Row(
+                (
+                    x.fault,
+                    f"{x.magnitude:g} {display_unit(x.unit)}".strip(),
+                    x.vehicles,
+                    f"{x.failed.count} of {x.failed.of}",
+                    f"{100 * x.failed.rate:.3g} %",
+                    x.separation,
+                    f"run {x.run}: {x.detail}" if x.detail else "",
+                ),
+                level="fails" if x.failed.count else "ok",
+            )
+            for x in self.drill
+        ]
+        heads = "fault", "by", "vehicles", "fail", "share", "least apart [m]", "the worst"
+        return FactTable(heads, rows, ("the worst",))
 
     def _percentiles(self) -> FactTable:
         rows = [
@@ -205,7 +255,32 @@ def summarise(table: store.Table) -> Summary:
         by_value,
         numbers if sweep.random else "none",
         table.levels,
+        borne(table),
     )
+
+
+def borne(table: store.Table) -> list[Borne]:
+    """How often each fault of a drill fails; empty for other sweeps."""
+    cases = []
+    for codes in np.unique(table.codes, axis=0) if table.sweep.drill else ():
+        some = np.flatnonzero((table.codes == codes).all(axis=1))
+        apart = table.metrics["separation"][some]
+        order = some[np.argsort(np.nan_to_num(apart, nan=np.inf), kind="stable")]
+        worst = next((k for k in order.tolist() if not table.passed[k]), None)
+        run, detail = (
+            (-1, "") if worst is None else (int(table.run[worst]), str(table.detail[worst]))
+        )
+        fault, size, count = (
+            c.variation.value(x) for c, x in zip(table.sweep.columns, codes.tolist(), strict=True)
+        )
+        least = float(np.fmin.reduce(apart))
+        cases.append(
+            Borne(
+                fault, size, UNITS[fault], int(count), rate(~table.passed[some]),
+                least if math.isfinite(least) else None, run, detail,
+            )
+        )  # fmt: skip
+    return cases
 
 
 def failures(table: store.Table) -> dict[str, int]:
@@ -265,7 +340,9 @@ def varied_numbers(table: store.Table) -> dict[str, Floats]:
 
 
 def drivers(table: store.Table) -> list[Driver]:
-    """Rank correlation of every varied number with every outcome, strongest first."""
+    """Rank correlation of every varied number with every outcome, strongest first; of a drill's faults, none."""
+    if table.sweep.drill is not None:
+        return []
     tested: list[tuple[str, str, float, float]] = []
     numbers = varied_numbers(table)
     ranked = {name: _ranks(x) for name, x in numbers.items()}
