@@ -124,7 +124,7 @@ class Sweep:
         self.mission, self.variations, self.header = mission, tuple(variations), header
         self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
         self.drill = header.drill
-        trials = 1 if self.drill is None else self.drill.trials
+        trials = self.drill.trials if self.drill else 1
         self.runs = header.runs or trials * math.prod(self.grid_sizes.values())
         if self.runs > _RUNS:
             raise RigidfleetError(f"the grid has {self.runs:,} points: give runs, or fewer values.")
@@ -201,11 +201,12 @@ class Sweep:
         data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
-        if isinstance(drill := data.get("drill"), dict):
-            data["drill"] = faults.with_files_of(drill, path.parent)
         controllers.add_search_folder(path.parent)
         variations, header = _check(data, origin, mission)
         assert mission is not None  # otherwise the check has raised
+        if header.drill:
+            drill = header.drill.from_folder(path.parent)
+            header = header.model_copy(update={"drill": drill})
         return cls(mission, variations, header, path.stem)
 
     @classmethod
@@ -226,9 +227,8 @@ class Sweep:
         """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
         data = self._data()
         del data["runs"], data["name"]
-        code = {"code": self.law[1]} if self.law[0] else {}
-        files = {"files": self.drill.digest} if self.drill and self.drill.digest else {}
-        return data | {"version": __version__} | code | files
+        files = {"code": self.law[1], "files": self.drill.digest if self.drill else ""}
+        return data | {"version": __version__} | {key: x for key, x in files.items() if x}
 
     @cached_property
     def law(self) -> tuple[Any, str]:
@@ -266,11 +266,7 @@ class Sweep:
     @cached_property
     def whole(self) -> dict[str, Any]:
         """The mission as plain data with all defaults."""
-        # The case of a drill is varied like a table of the mission.
-        case = (
-            {} if self.drill is None else {"drill": {"fault": "", "magnitude": 0.0, "vehicles": 0}}
-        )
-        return keypaths.whole_document(self.mission) | case
+        return keypaths.whole_document(self.mission)
 
     @cached_property
     def columns(self) -> list[SweepColumn]:
@@ -279,8 +275,12 @@ class Sweep:
             SweepColumn(v, keys, grid)
             for v in self.variations
             for grid in [v.grid if isinstance(v, Gridded) else None]
-            for keys in keypaths.expand(self.whole, v.path)
+            for keys in self._places(v.path)
         ]
+
+    def _places(self, path: str) -> list[Keys]:
+        """Keys of all places that match a path; a case of a drill is none of the mission."""
+        return [tuple(path.split("."))] if self.drill else keypaths.expand(self.whole, path)
 
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:
@@ -313,14 +313,12 @@ class Sweep:
         self, mission: Mission, run: int, values: Sequence[Any] | None = None
     ) -> dict[str, Any]:
         varied = {column.keys for column in self.columns}
-        document = mission.to_dict()
-        for column, value in zip(self.columns, values or self.values(run), strict=True):
+        document, values = mission.to_dict(), values or self.values(run)
+        if self.drill:
+            stream = faults.stream_of(self.seed, run, 2)
+            faults.disturb(document, *values[:2], stream, mission.n_agents, self._end)
+        for column, value in zip(self.columns, values, strict=True) if not self.drill else ():
             apply_value(document, self.whole, column, value)
-        if (case := document.pop("drill", None)) and case["fault"] in faults.FLOWN:
-            faults.disturb(
-                document, case["fault"], case["magnitude"], faults.stream_of(self.seed, run), mission.n_agents,
-                self._end,
-            )  # fmt: skip
         if self.header.random_numbers == "own":
             stream = np.random.SeedSequence(self.seed, spawn_key=(run, 1))
             seed = int(stream.generate_state(1)[0] >> 1)
@@ -353,9 +351,7 @@ class Sweep:
         """
         from rigidfleet.planning.timing import expand_mission, matters_to_plan
 
-        if self.drill is None and any(
-            matters_to_plan(self.mission, column.keys) for column in self.columns
-        ):
+        if any(matters_to_plan(self.mission, column.keys) for column in self.columns):
             return self.mission
         with suppress(MissionError):  # without a way, each run says so
             return expand_mission(self.mission)
@@ -482,17 +478,14 @@ def _check(
 
 
 def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -> list[Variation]:
-    """The cases of a drill, as grids; nothing else varies."""
+    """The cases of a drill; nothing else varies."""
     for key, default in (("vary", []), ("evaluate", "flight")):
         if collector.data.get(key, default) != default:
             collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
-    if mission is None:
-        return []
-    if problem := drill.problem(mission.n_agents):
-        key, *words = problem
-        collector.add(("drill", key), *words, getattr(drill, key))
-        return []
-    return [*drill.grids(mission.n_agents)]
+    if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
+        problem = "needs a mission that is flown, not files"
+        collector.add(("drill", *flown), problem, "remove it, or files")
+    return [] if mission is None else drill.grids(mission.n_agents)
 
 
 def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:

@@ -14,10 +14,9 @@ import re
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from pydantic import Field, Strict
 
 from rigidfleet._common.quantities import MOTIONS
 from rigidfleet.errors import RigidfleetError
@@ -25,179 +24,125 @@ from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, piece_at
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.obstacles import Ground
-from rigidfleet.mission.values import Part, Positive
-from rigidfleet.sweep.variation import Grid
+from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, Whole, key
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.variation import Grid, Variation
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
 
-#: Number of vehicles up to which all that a fault moves are judged again; of more, those near others or a fence.
-_FEW = 30
-#: Faults of a part of the vehicles, of the whole show or one vehicle, and faults that are flown.
-PARTIAL = "late", "another", "stale", "bias"
-SETUP = "rotated", "shifted", "mirrored"
-FLOWN = "wind", "links", "lost"
-#: Units of magnitudes; "" for numbers of things.
-UNITS = {
-    "late": "s", "another": "", "stale": "", "bias": "m", "rotated": "deg", "shifted": "m", "mirrored": "deg",
-    "wind": "m/s", "links": "", "lost": "",
-}  # fmt: skip
-#: Magnitudes of a drill that names no fault.
-_SCAN: dict[str, tuple[float, ...]] = {
-    "late": (0.5, 1.0, 2.0, 5.0), "another": (1, 2), "rotated": (1.0, 3.0, 10.0), "shifted": (0.5, 2.0, 5.0),
-    "mirrored": (0.0, 90.0), "bias": (0.5, 1.0, 2.0), "wind": (2.0, 5.0), "lost": (1,),
-}  # fmt: skip
+#: Faults of some vehicles, of the whole show or one vehicle, and those that are flown, with units of their magnitudes.
+PARTIAL = {"late": "s", "another": "", "stale": "", "bias": "m"}
+SETUP = {"rotated": "deg", "shifted": "m", "mirrored": "deg"}
+FLOWN = {"wind": "m/s", "links": "", "lost": ""}
+UNITS = PARTIAL | SETUP | FLOWN
+#: Agents in a message.
 _AGENTS = re.compile(r"\bagent \d+|\bagents \d+(?:, \d+)* and \d+")
+_TURN = 2.0 * np.pi
 
 _Sizes = tuple[Positive, ...]
-_Counts = tuple[Annotated[int, Strict(), Field(ge=1, le=10**6)], ...]
-_Bearings = tuple[Annotated[float, Strict(), Field(ge=-360, le=360)], ...]
+_Counts = tuple[AgentNumber, ...]
 
 
 class Drill(Part):
-    """The table `[drill]` of a sweep file: the magnitudes of each fault. Without any, all faults have some."""
+    """The table `[drill]` of a sweep file: the magnitudes of each fault; if it names none, all have some."""
 
-    late: _Sizes = Field((), description="vehicles start so much later than the others [s]")
-    another: _Counts = Field(
-        (), description="vehicles fly, from their own pads, the files of those so many numbers on"
+    late: _Sizes = key("vehicles start so much later than the others [s]", (0.5, 1.0, 2.0, 5.0))
+    another: _Counts = key(
+        "vehicles fly, from their own pads, the files of so many numbers on", (1, 2)
     )
-    stale: tuple[str, ...] = Field(
-        (), description="vehicles fly an earlier version: missions or files of trajectories"
+    stale: tuple[str, ...] = key(
+        "vehicles fly an earlier version: missions, or files of others", ()
     )
-    bias: _Sizes = Field(
-        (), description="vehicles are off by so much, each in a horizontal direction of its own [m]"
+    bias: _Sizes = key(
+        "vehicles are off, each in a horizontal direction of its own [m]", (0.5, 1.0, 2.0)
     )
-    rotated: _Sizes = Field(
-        (), description="the show about its origin, or one vehicle about its pad, either way [deg]"
+    rotated: _Sizes = key(
+        "a vehicle about its pad, or the show about its origin [deg]", (1.0, 3.0, 10.0)
     )
-    shifted: _Sizes = Field(
-        (), description="the show, or one vehicle, in any horizontal direction [m]"
+    shifted: _Sizes = key(
+        "a vehicle, or the show, in any horizontal direction [m]", (0.5, 2.0, 5.0)
     )
-    mirrored: _Bearings = Field(
-        (),
-        description="the same, mirrored at the vertical plane of this bearing, clockwise from y [deg]",
+    mirrored: tuple[Angle, ...] = key(
+        "the same, at a plane of this bearing, clockwise from y [deg]", (0.0, 90.0)
     )
-    wind: _Sizes = Field(
-        (), description="wind beyond the forecast, from any horizontal direction [m/s]"
-    )
-    links: _Counts = Field((), description="so many links are lost, each at any time")
-    lost: _Counts = Field((), description="so many vehicles are lost, each at any time")
-    vehicles: _Counts = Field(
-        (1, 5),
-        description="of how many vehicles at a time late, another, stale and bias are faults",
-    )
-    trials: Annotated[int, Strict(), Field(ge=1, le=10**6)] = Field(
-        20,
-        description="how often each magnitude is tried, with other vehicles, directions and times",
-    )
-    files: tuple[str, ...] = Field(
-        (), description="trajectories of others that are flown, instead of the mission's"
-    )
+    wind: _Sizes = key("wind beyond the forecast, in any horizontal direction [m/s]", (2.0, 5.0))
+    links: _Counts = key("so many links are lost, each at any time", ())
+    lost: _Counts = key("so many vehicles are lost, each at any time", (1,))
+    vehicles: _Counts = key("of how many at once late, another, stale and bias are faults", (1, 5))
+    trials: Whole = key("trials of each magnitude: other vehicles, directions, times", 20, ge=1)
+    files: tuple[str, ...] = key("files of others that are flown, not those of the mission", ())
 
-    def problem(self, n: int) -> tuple[str, str, str] | None:
-        """Key, problem and remedy of what cannot be drilled with n vehicles; None if all can."""
-        for key in FLOWN:
-            if self.files and getattr(self, key):
-                return key, "needs a mission that is flown", "remove it, or files"
-        for key, most in (
-            ("vehicles", n),
-            ("another", n - 1),
-            ("lost", n - 1),
-            ("links", n * (n - 1) // 2),
-        ):
-            if (values := getattr(self, key)) != Drill().vehicles and max(values, default=0) > most:
-                return key, f"is more than {most}, with {n} vehicles", "give a smaller number"
-        return None
-
-    def cases(self, n: int) -> list[tuple[str, float, int]]:
-        """Fault, magnitude and number of vehicles of each case, for a show of n; of a stale file, its place."""
-        own = {k: x for k in UNITS if (x := getattr(self, k))}
-        scan = own or {k: x for k, x in _SCAN.items() if not (self.files and k in FLOWN)}
-        sizes = {k: range(1, len(x) + 1) if k == "stale" else x for k, x in scan.items()}
-        some = [k for k in self.vehicles if k <= n]
-        counts = {**dict.fromkeys(PARTIAL, some), **dict.fromkeys(SETUP, [n, 1] if n > 1 else [1])}
-        return [
+    def grids(self, n: int) -> list[Variation]:
+        """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
+        possible = PARTIAL | SETUP if self.files else UNITS
+        names = self.model_fields_set & UNITS.keys() or possible.keys()
+        some = sorted({min(count, n) for count in self.vehicles})
+        counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n})) | {"wind": [n]}
+        places = range(1, len(self.stale) + 1)
+        cases = [
             (fault, float(size), count)
-            for fault, every in sizes.items()
-            for size in every
-            for count in counts.get(fault, [n if fault == "wind" else int(size)])
-            if n > 1 or fault not in ("another", "links", "lost")
+            for fault in UNITS
+            if fault in names
+            for size in (places if fault == "stale" else getattr(self, fault))
+            for count in counts.get(fault, [int(size)])
         ]
-
-    def grids(self, n: int) -> list[Grid]:
-        """The cases as three grids that go together: a drill is a sweep over them."""
-        columns = zip(*self.cases(n), strict=True)
-        names = "fault", "magnitude", "vehicles"
+        columns = zip(("fault", "magnitude", "vehicles"), zip(*cases, strict=True), strict=False)
         return [
-            Grid(path=f"drill.{name}", kind="grid", values=values, group="drill")
-            for name, values in zip(names, columns, strict=True)
+            Grid(path=f"drill.{name}", kind="grid", values=x, group="drill") for name, x in columns
         ]
 
     @property
     def digest(self) -> str:
         """A digest of all files that it names; "" if it names none."""
-        paths = [
-            p
-            for name in (*self.files, *self.stale)
-            for p in sorted([Path(name), *Path(name).rglob("*")])
-        ]
-        whole = hashlib.sha256()
-        for path in paths:
-            whole.update(path.read_bytes() if path.is_file() else b"")
-        return whole.hexdigest() if paths else ""
+        named = [*map(Path, self.files + self.stale)]
+        paths = sorted(p for path in named for p in (path, *path.rglob("*")) if p.is_file())
+        return hashlib.sha256(b"".join(p.read_bytes() for p in paths)).hexdigest() if paths else ""
+
+    def from_folder(self, folder: Path) -> Drill:
+        """The same, with files as seen from a folder; names of shipped missions stay."""
+
+        def whole(name: str) -> str:
+            return name if name in mission_names() else str((folder / name).resolve())
+
+        named = {key: (*map(whole, getattr(self, key)),) for key in ("stale", "files")}
+        return self.model_copy(update={key: x for key, x in named.items() if x})
 
 
-def with_files_of(table: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """A table `[drill]` whose files, as seen from a folder, have whole paths; names of shipped missions stay."""
-
-    def whole(name: Any) -> Any:
-        shipped = not isinstance(name, str) or name in mission_names()
-        return name if shipped else str((folder / name).resolve())
-
-    named = {key: table[key] for key in ("stale", "files") if isinstance(table.get(key), list)}
-    return table | {key: [whole(name) for name in names] for key, names in named.items()}
-
-
-def stream_of(seed: int, run: int) -> np.random.Generator:
-    """Random numbers of a run of a drill."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(run, 2)))
+def stream_of(seed: int, *number: int) -> np.random.Generator:
+    """Random numbers of a run or of an order of the vehicles."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=number))
 
 
 def some_of(seed: int, n: int, count: int, trial: int) -> Ints:
-    """Which (S,) of n vehicles a fault concerns in a trial: over n / S trials, every vehicle once."""
+    """Which (S,) of n vehicles a fault concerns in a trial: in n / S trials, each of them once."""
     block, place = divmod(trial, n // count)
-    order = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(block, 3))).permutation(n)
+    order = stream_of(seed, block, 3).permutation(n)
     return np.sort(order[place * count : (place + 1) * count])
 
 
 def disturb(
-    document: dict[str, Any],
-    fault: str,
-    size: float,
-    stream: np.random.Generator,
-    n: int,
-    end: float,
-) -> None:
-    """Put a fault that is flown into the document of a mission of n vehicles that ends at a time [s]."""
+    document: dict[str, Any], fault: str, size: float, stream: np.random.Generator, n: int, end: float
+) -> None:  # fmt: skip
+    """Put a fault, if it is flown, into the document of a mission of n vehicles that ends at a time [s]."""
+    if fault not in FLOWN:
+        return
     table = document["disturbances"] = {**document.get("disturbances", {})}
     if fault == "wind":
-        gust = size * np.append(_heading(stream.uniform(0.0, 2.0 * np.pi)), 0.0)
-        table["wind"] = (np.array(table.get("wind", (0.0, 0.0, 0.0))) + gust).tolist()
+        wind = np.array(table.get("wind", (0.0, 0.0, 0.0)))
+        wind[:2] += size * _heading(stream.uniform(0.0, _TURN))[0]
+        table["wind"] = wind.tolist()
         return
-    times = stream.uniform(1e-3 * end, 0.999 * end, int(size)).tolist()
+    key, things = "agent", range(1, n + 1)
     if fault == "links":
-        table["links"] = links = {**table.get("links", {})}
-        known = [sorted(each["between"]) for each in links.get("lost", ())]
-        pairs = [pair for pair in (1 + proximity.all_pairs(n).T).tolist() if pair not in known]
-        some = stream.permutation(len(pairs))[: int(size)].tolist()
-        new = [{"between": pairs[k], "time": t} for k, t in zip(some, times, strict=False)]
-        links["lost"] = [*links.get("lost", ()), *new]
-    else:
-        known = [each["agent"] for each in table.get("lost", ())]
-        some = [i for i in (1 + stream.permutation(n)).tolist() if i not in known]
-        new = [{"agent": i, "time": t} for i, t in zip(some, times, strict=False)]
-        table["lost"] = [*table.get("lost", ()), *new]
+        key, things = "between", (1 + proximity.all_pairs(n).T).tolist()
+        table = table["links"] = {**table.get("links", {})}
+    there = [*table.get("lost", ())]
+    rest = [x for x in things if x not in [each[key] for each in there]]
+    some = stream.permutation(len(rest))[: int(size)].tolist()
+    times = stream.uniform(1e-3 * end, 0.999 * end, len(some)).tolist()
+    table["lost"] = there + [{key: rest[k], "time": t} for k, t in zip(some, times, strict=True)]
 
 
 def _heading(angle: Any) -> Floats:
@@ -222,53 +167,10 @@ class _Chords(NamedTuple):
         """Chords of ways (K, N, 4, P)."""
         points = Piecewise(way.time, pad(way.pieces[:, :, :3], 2)).bernstein()
         place = np.concatenate([points[..., 0], points[-1:, ..., -1]])
-        along = place[:-1, ..., None] + np.diff(place, axis=0)[..., None] * np.linspace(
-            0.0, 1.0, points.shape[-1]
-        )
-        sag = np.linalg.norm(points - along, axis=2).max(axis=-1)
+        share = np.linspace(0.0, 1.0, points.shape[-1])
+        points -= place[:-1, ..., None] + np.diff(place, axis=0)[..., None] * share
+        sag = np.linalg.norm(points, axis=2).max(axis=-1)
         return cls(np.ascontiguousarray(place.transpose(2, 0, 1)), sag)
-
-
-class Moved(NamedTuple):
-    """The ways of vehicles by a fault: those of a flight, moved over the ground, and begun later.
-
-    Attributes
-    ----------
-    who : (S,) the vehicles
-    source : (S,) of which vehicles they fly the ways
-    turn : (2, 2) rotation or reflection of x and y
-    shift : (S, 2) then added to x and y [m]
-    delay : by which they begin later [s]
-    version : place of the earlier version that they fly, from 1; 0: that of the show
-    """
-
-    who: Ints
-    source: Ints
-    turn: Floats
-    shift: Floats
-    delay: float = 0.0
-    version: int = 0
-
-    @property
-    def as_one(self) -> bool:
-        """Whether they keep their distances."""
-        own = not self.version and np.array_equal(self.source, self.who)
-        return own and not np.ptp(self.shift, axis=0).any()
-
-    def ways(self, curve: Piecewise) -> Piecewise:
-        """The same of ways (K, S, 4, P) of the sources."""
-        pieces = curve.pieces.copy()
-        pieces[:, :, :2] = np.einsum("ab,ksbp->ksap", self.turn, pieces[:, :, :2])
-        pieces[:, :, :2, 0] += self.shift
-        return Piecewise(curve.time + self.delay, pieces)
-
-
-def _gaps(a: Floats, b: Floats) -> Floats:
-    """Least distance (...) of points that move straight from a to b (3, ...) from the origin."""
-    d = b - a
-    share = -(a * d).sum(axis=0) / np.maximum((d * d).sum(axis=0), 1e-300)
-    a += np.clip(share, 0.0, 1.0) * d
-    return proximity.root_of_squares(a)
 
 
 class Show:
@@ -277,8 +179,8 @@ class Show:
     Attributes
     ----------
     curve : ways (K, N, 4, P) of x, y, z [m] and yaw [rad]
+    how : what these are, in words
     mission : whose radii, limits, fences and obstacles count
-    how : what the curve is, in words
 
     Raises
     ------
@@ -289,193 +191,147 @@ class Show:
     def __init__(self, mission: Mission, drill: Drill) -> None:
         from rigidfleet.simulation.trajectories import judged_as
 
-        self.drill, self.n = drill, mission.n_agents
-        self.curve, self.how, verdict = _ways(mission, drill.files)
-        if self.curve.pieces.shape[1] != self.n:
-            have = self.curve.pieces.shape[1]
-            raise RigidfleetError(
-                f"drill: files have {have} vehicles, and {mission.name} {self.n}. Give those of one show."
-            )
+        self.mission, self.drill, self.n = mission, drill, mission.n_agents
+        self.curve, self.how, verdict = self._ways(mission, drill.files)
         if not verdict.passed:
-            failed = next(check.message for check in verdict.checks if not check.passed)
+            why = next(check.message for check in verdict.checks if not check.passed)
             raise RigidfleetError(
-                f"drill: the flight fails without any fault: {failed}. Mend this first."
+                f"drill: the flight fails without any fault: {why}. Mend this first."
             )
-        # A fault leaves motions as they are.
-        data = judged_as(
-            self.curve.at(self.curve.time[:1])[0, :, :3], 1.0, mission=mission
-        ).to_dict()
-        motions = {q.name for q in MOTIONS}
+        data = judged_as(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
+        motions = {q.name for q in MOTIONS}  # which a fault leaves as they are
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
-        self.mission, self._data = mission, data
-        self.radius = mission.fleet.radius
-        limits = mission.limits
+        self._data, self.radius, limits = data, mission.fleet.radius, mission.limits
         self.reach = max(limits.separation or 0.0, limits.separation_below or 0.0)
+        solid = any(not isinstance(thing, Ground) for thing in mission.obstacles)
+        #: Whether it matters where the show is as a whole: flat ground is the same everywhere.
+        self.bounded = solid or limits.geofence is not None
         #: Coefficients (P, N, 4, K): arithmetic on long rows is fast.
         self._rows = np.ascontiguousarray(self.curve.pieces.transpose(3, 1, 2, 0))
         self._chords = _Chords.of(self.curve)
         self._on_knots: dict[bytes, _Chords] = {}  # one for each magnitude of a delay
 
     @cached_property
-    def _versions(self) -> list[Piecewise]:
+    def versions(self) -> list[Piecewise]:
         """The ways of earlier versions."""
-        versions = []
-        for name in self.drill.stale:
-            mission = name in mission_names() or Path(name).suffix == ".toml"
-            curve, *_ = _ways(
-                load_mission(name) if mission else self.mission, () if mission else (name,)
+        return [
+            self._ways(load_mission(name), ())[0]
+            if name in mission_names() or name.endswith(".toml")
+            else self._ways(self.mission, (name,))[0]
+            for name in self.drill.stale
+        ]
+
+    def _ways(self, mission: Mission, files: Sequence[str]) -> tuple[Piecewise, str, Verdict]:
+        """Ways of a mission's vehicles, or of those in files; what they are, in words; and the verdict."""
+        from rigidfleet.assessment import assess
+        from rigidfleet.foreign.files import read_trajectories
+        from rigidfleet.setpoints import ways_of
+        from rigidfleet.simulation.flight import simulate
+        from rigidfleet.simulation.trajectories import NAMES, of_curves
+
+        if files:
+            read = read_trajectories(files, spans="stand")
+            return join(read.curves), read.assumed, assess(of_curves(read, mission=mission))
+        if mission.n_agents != self.n:
+            raise RigidfleetError(
+                f"stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}."
             )
-            if curve.pieces.shape[1] != self.n:
-                have = curve.pieces.shape[1]
-                raise RigidfleetError(
-                    f"stale: {name} has {have} vehicles, and the show {self.n}. Name a version with as many."
-                )
-            versions.append(curve)
-        return versions
+        result = simulate(mission)
+        motion = result.motion(flown=False)
+        if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file
+            motion = result.motion(flown=True)
+        return ways_of(motion, slice(None)), NAMES[7], assess(result)
 
     def outcome(
         self, fault: str, size: float, who: Ints, stream: np.random.Generator
-    ) -> tuple[dict[str, float], str, str]:
-        """What was measured of a fault of vehicles (S,), the checks that it fails, and the first of these in words."""
-        verdict, every = self.verdict(self.moved_by(fault, size, who, stream))
-        if verdict is None:
+    ) -> tuple[dict[str, float | None], str, str]:
+        """What was measured of a fault of vehicles (S,), the checks that it fails, and the first of these in words.
+
+        Judged are these vehicles, and all that may come near them.
+        """
+        from rigidfleet.assessment import assess
+        from rigidfleet.simulation.trajectories import of_curve
+
+        again = np.isin(np.arange(self.n), who)
+        # A show that is moved as a whole changes no distance between its vehicles.
+        whole = fault in SETUP and again.all()
+        if whole and not self.bounded:
             return {}, "", ""
+        way, knots = self.way_with(fault, size, who, stream), self.curve.time
+        if not np.array_equal(knots, way.time):
+            knots = common_knots([self.curve, way])
+        way = way.on(knots, stays=True)
+        if not whole:
+            again |= self._near(who, _Chords.of(way), knots)
+        every = np.flatnonzero(again)
+        curve = self._some(every).on(knots, stays=True)
+        powers = max(x.pieces.shape[-1] for x in (curve, way))
+        pieces = pad(curve.pieces, powers)
+        pieces[:, np.isin(every, who)] = pad(way.pieces, powers)
+        agents = self.mission.agents
+        own = {
+            key: [getattr(agents, key)[i] for i in every] for key in ("position", "radius", "mass")
+        }
+        mission = Mission.from_plain(self._data | {"agents": own}, "drill")
+        verdict = assess(of_curve(Piecewise(knots, pieces), self.how, mission=mission))
         failed = [check for check in verdict.checks if not check.passed]
-        reason = ", ".join(dict.fromkeys(check.check for check in failed))
-        worst = {c.check: c.worst for c in verdict.checks if c.judged and c.worst is not None}
+        worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
 
         def in_fleet(match: re.Match[str]) -> str:
             return re.sub(r"\d+", lambda number: str(every[int(number[0]) - 1] + 1), match[0])
 
-        return worst, reason, _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
+        words = _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
+        return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
 
-    def moved_by(self, fault: str, size: float, who: Ints, stream: np.random.Generator) -> Moved:
-        """What a fault makes of the ways of vehicles (S,)."""
-        pads, turn, by = self.curve.pieces[0, :, :2, 0], np.eye(2), np.zeros((len(who), 2))
+    def way_with(
+        self, fault: str, size: float, who: Ints, stream: np.random.Generator
+    ) -> Piecewise:
+        """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
+        pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._some(who), np.eye(2), 0.0
         match fault:
             case "late":
-                return Moved(who, who, turn, by, delay=size)
+                return flown.later(size)
             case "stale":
-                return Moved(who, who, turn, by, version=int(size))
+                version = self.versions[int(size) - 1]
+                return Piecewise(version.time, version.pieces[:, who])
             case "another":
                 source = (who + int(size)) % self.n
-                return Moved(who, source, turn, pads[who] - pads[source])
+                flown, by = self._some(source), pads[who] - pads[source]
             case "bias" | "shifted":
-                angles = stream.uniform(0.0, 2.0 * np.pi, len(who) if fault == "bias" else 1)
-                return Moved(who, who, turn, by + size * _heading(angles))
+                by = size * _heading(stream.uniform(0.0, _TURN, len(who) if fault == "bias" else 1))
             case "rotated":
                 u, v = _heading(np.radians(size) * stream.choice([-1.0, 1.0]))[0]
                 turn = np.array([[v, u], [-u, v]])
             case "mirrored":
                 u = _heading(np.radians(size))
                 turn = 2.0 * u.T @ u - turn
-        if len(who) < self.n:  # one vehicle about its pad, the show about its origin
-            by = pads[who] - pads[who] @ turn.T
-        return Moved(who, who, turn, by)
+        if len(who) < self.n:  # a vehicle turns about its pad, the show about its origin
+            by = by + pads[who] - pads[who] @ turn.T
+        pieces = flown.pieces.copy()
+        pieces[:, :, :2] = np.einsum("ab,ksbp->ksap", turn, pieces[:, :, :2])
+        pieces[:, :, :2, 0] += by
+        return Piecewise(flown.time, pieces)
 
-    def verdict(self, moved: Moved) -> tuple[Verdict | None, Ints]:
-        """The verdict if vehicles fly other ways, and the vehicles (M,) that it is on; None if nothing can change.
-
-        These are all that may come near each other, or near a fence, by the other ways.
-        """
-        from rigidfleet.assessment import assess
-        from rigidfleet.simulation.trajectories import of_curve
-
-        who, source = moved.who, moved.source
-        flown = self._versions[moved.version - 1] if moved.version else self.curve
-        knots = self.curve.time
-        if moved.delay or moved.version:
-            knots = common_knots([self.curve, flown.later(moved.delay)])
-            own = _Chords.of(self._ways_by(moved, np.ones(len(who), dtype=np.bool_), knots))
-        else:
-            place = self._chords.place[:, :, source]
-            flat = np.tensordot(moved.turn, place[:2], 1) + moved.shift.T[:, None]
-            own = _Chords(np.concatenate([flat, place[2:]]), self._chords.sag[:, source])
-        again = np.zeros(self.n, dtype=np.bool_)
-        again[who] = True if len(who) <= _FEW else self._beside_fences(who, own)
-        # A show that is moved as a whole changes no distance between its vehicles.
-        whole = moved.as_one and len(who) == self.n
-        if not whole:
-            self._add_near(again, who, own, knots)
-        every = np.flatnonzero(again)
-        if not len(every):
-            return None, every
-        if len(every) == 1:  # a separation is of two
-            every = np.unique([*every, (every[0] + 1) % self.n])
-        mine = np.isin(who, every)
-        pieces = self._some(every).on(knots, stays=True).pieces
-        other = self._ways_by(moved, mine, knots).pieces
-        powers = max(pieces.shape[-1], other.shape[-1])
-        pieces = pad(pieces, powers)
-        pieces[:, np.isin(every, who)] = pad(other, powers)
-        result = of_curve(Piecewise(knots, pieces), self.how, mission=self._mission_of(every))
-        return assess(result), every
-
-    def _ways_by(self, moved: Moved, some: Bools, knots: Floats) -> Piecewise:
-        """The ways by a fault of some (S,) of the vehicles that it moves, on knots."""
-        source, flown = moved.source[some], self._some(moved.source[some])
-        if moved.version:
-            stale = self._versions[moved.version - 1]
-            flown = Piecewise(stale.time, stale.pieces[:, source])
-        part = moved._replace(source=source, shift=moved.shift[some])
-        return part.ways(flown).on(knots, stays=True)
-
-    def _beside_fences(self, who: Ints, own: _Chords) -> Bools:
-        """Which vehicles (S,) may come to a fence or an obstacle: flat ground is as far as it was."""
-        margin = np.full(own.sag.shape[1], np.inf)
-        fence = self.mission.limits.geofence
-        things = [thing for thing in self.mission.obstacles if not isinstance(thing, Ground)]
-        if fence is None and not things:
-            return margin <= 0.0
-        reach = 0.5 * np.linalg.norm(np.diff(own.place, axis=1), axis=0) + own.sag
-        reach = np.maximum(reach, np.roll(reach, 1, axis=0))
-        reach = np.concatenate([reach, reach[-1:]])
-        place = own.place.transpose(1, 2, 0)
-        if fence is not None:
-            margin = np.minimum(place - fence.min, np.array(fence.max) - place).min(axis=2) - reach
-            margin = margin.min(axis=0)
-        if any(thing.solid.moves for thing in things):
-            return np.ones(len(margin), dtype=np.bool_)
-        away, _ = proximity.obstacle_clearances(place, self.radius[who], things)
-        margin = np.minimum(margin, (away - reach).min(axis=0))
-        return margin <= 0.0
-
-    def _add_near(self, again: Bools, who: Ints, own: _Chords, knots: Floats) -> None:
-        """Add to those that are judged ``again`` (N,) who may come near one that moves, and who is nearest."""
+    def _near(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
+        """Which vehicles (N,) may come near one of those (S,) that fly by other chords, or are the nearest to it."""
         place, sag = (x.copy() for x in self._chords_on(knots))
         place[:, :, who], sag[:, who] = own
-        if len(who) > _FEW:
-            self._add_near_of_many(again, who, place, sag)
-            return
-        step = np.linalg.norm(np.diff(place, axis=1), axis=0).max(axis=0) + 2.0 * sag.max(axis=0)
+        # Between two knots none moves further than half of a step from the nearer one.
+        step = 0.5 * np.linalg.norm(np.diff(place, axis=1), axis=0).max(axis=0) + sag.max(axis=0)
+        near = np.zeros(self.n, dtype=np.bool_)
         for i in who.tolist():
             apart = place - place[:, :, i : i + 1]
-            radii = self.radius + self.radius[i]
-            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - radii
+            allowed = self.reach + self.radius + self.radius[i]
+            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - allowed
             ends[i] = np.inf
-            again[int(ends.argmin())] = True
-            # Between two knots neither moves further than half of a step from the nearer one.
-            near = np.flatnonzero(ends - 0.5 * (step + step[i]) < self.reach)
-            some = apart[:, :, near]
-            gap = _gaps(some[:, :-1], some[:, 1:]) - sag[:, near] - sag[:, i : i + 1]
-            again[near[gap.min(axis=0) - radii[near] < self.reach]] = True
-
-    def _add_near_of_many(self, again: Bools, who: Ints, place: Floats, sag: Floats) -> None:
-        """The same, if many vehicles move: a tree tells which two are near in each interval."""
-        from scipy.spatial import KDTree
-
-        moved = np.isin(np.arange(self.n), who)
-        widest = self.reach + 2.0 * self.radius.max()
-        for k in range(len(sag)):
-            a, b = place[:, k], place[:, k + 1]
-            step = b - a
-            half = 0.5 * np.linalg.norm(step - step.mean(axis=1, keepdims=True), axis=0) + sag[k]
-            tree = KDTree((0.5 * (a + b)).T, balanced_tree=False, compact_nodes=False)
-            i, j = tree.query_pairs(widest + 2.0 * half.max(), output_type="ndarray").T
-            i, j = (x[moved[i] | moved[j]] for x in (i, j))
-            gap = _gaps(a[:, j] - a[:, i], b[:, j] - b[:, i]) - sag[k, i] - sag[k, j]
-            near = gap - self.radius[i] - self.radius[j] < self.reach
-            again[i[near]] = again[j[near]] = True
+            near[ends.argmin()] = True
+            some = np.flatnonzero(ends < step + step[i])
+            a, d = apart[:, :-1, some], np.diff(apart[:, :, some], axis=1)
+            share = -(a * d).sum(axis=0) / np.maximum((d * d).sum(axis=0), 1e-300)
+            a += np.clip(share, 0.0, 1.0) * d
+            gap = proximity.root_of_squares(a) - sag[:, some] - sag[:, i : i + 1]
+            near[some[gap.min(axis=0) < allowed[some]]] = True
+        return near
 
     def _chords_on(self, knots: Floats) -> _Chords:
         """Chords of all vehicles on other knots: on a part of a piece, the sag may be twice that of the piece."""
@@ -493,36 +349,8 @@ class Show:
         """The ways of some vehicles."""
         return Piecewise(self.curve.time, self._rows[:, who].transpose(3, 1, 2, 0))
 
-    def _mission_of(self, who: Ints) -> Mission:
-        """What some of the vehicles are judged by."""
-        agents = self.mission.agents
-        own = {
-            key: [getattr(agents, key)[i] for i in who] for key in ("position", "radius", "mass")
-        }
-        return Mission.from_plain(self._data | {"agents": own}, "drill")
-
 
 @lru_cache(maxsize=2)
 def show_of(text: str, drill: Drill) -> Show:
     """The show of a mission's text: flown or read once for all faults."""
     return Show(Mission.from_toml(text, "mission of the drill"), drill)
-
-
-def _ways(mission: Mission, files: Sequence[str]) -> tuple[Piecewise, str, Verdict]:
-    """Ways (K, N, 4, P) of a mission's vehicles, or of those in files; what they are, in words; and the verdict."""
-    from rigidfleet.assessment import assess
-    from rigidfleet.simulation.trajectories import NAMES, of_curves
-
-    if files:
-        from rigidfleet.foreign.files import read_trajectories
-
-        read = read_trajectories(files, spans="stand")
-        return join(read.curves), read.assumed, assess(of_curves(read, mission=mission))
-    from rigidfleet.setpoints import ways_of
-    from rigidfleet.simulation.flight import simulate
-
-    result = simulate(mission)
-    motion = result.motion(flown=False)
-    if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file
-        motion = result.motion(flown=True)
-    return ways_of(motion, slice(None)), NAMES[7], assess(result)

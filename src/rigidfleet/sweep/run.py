@@ -16,8 +16,6 @@ from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal
 if TYPE_CHECKING:
     from rigidfleet.result import Result
 
-#: Metrics of a flight, the checks that it failed, and the first of these in words.
-_Outcome = tuple[dict[str, float], str, str]
 #: Number of consecutive runs in a group. The first run of a group is a multiple of it.
 GROUP = 8
 
@@ -32,24 +30,23 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         from rigidfleet.sweep.final_states import fly_final_states
 
         return fly_final_states(sweep, runs)
-    geometric: list[int] = []
-    if sweep.drill is not None:
-        geometric = [run for run in runs if sweep.values(run)[0] not in faults.FLOWN]
-    rows = [_record_fault(sweep, run) for run in geometric]
+    rows: list[RunRecord] = []
     groups: dict[int, list[int]] = {}
-    for run in sorted({*runs} - {*geometric}):
-        groups.setdefault(run // GROUP, []).append(run)
+    for run in runs:
+        if sweep.drill and sweep.values(run)[0] not in faults.FLOWN:
+            rows.append(_record_fault(sweep, run))
+        else:
+            groups.setdefault(run // GROUP, []).append(run)
     return rows + [row for group in groups.values() for row in _fly(sweep, group)]
 
 
 def _record_fault(sweep: Sweep, run: int) -> RunRecord:
     """Judge a geometric fault of a drill."""
-    assert sweep.drill is not None
-    show = faults.show_of(sweep.mission.text, sweep.drill)
+    show = faults.show_of(sweep.mission.text, sweep.header.drill or faults.Drill())
     begun = perf_counter()
     fault, size, count = values = sweep.values(run)
     who = faults.some_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
-    stream = faults.stream_of(sweep.seed, run)
+    stream = faults.stream_of(sweep.seed, run, 2)
     outcome = _value_or_error(lambda: show.outcome(fault, size, who, stream))
     return _record(sweep, run, values, outcome, perf_counter() - begun)
 
@@ -90,20 +87,13 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
         return error
 
 
-def _record(
-    sweep: Sweep,
-    run: int,
-    values: Sequence[Any],
-    flown: Result | _Outcome | Exception,
-    shared: float,
-) -> RunRecord:
-    """Judge a flight and measure it, unless that is done; ``shared``: its share of its group's time so far [s]."""
+def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, shared: float) -> RunRecord:
+    """Judge and measure a flight, unless it is the outcome; ``shared``: its share of its group's time so far [s]."""
     begun = perf_counter()
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
-    outcome: Any = flown
-    if not isinstance(flown, Exception | tuple):
-        outcome = _value_or_error(lambda: _judge(flown))
+    done = isinstance(flown, Exception | tuple)
+    outcome = flown if done else _value_or_error(lambda: _judge(flown))
     match outcome:
         case MissionError():
             reason, detail = refusal(outcome)
@@ -113,12 +103,12 @@ def _record(
             reason, detail = BROKEN, f"{type(outcome).__name__}: {outcome}"
         case _:
             known, reason, detail = outcome
-            metrics |= {name: x for name, x in known.items() if name in METRICS}
+            metrics |= {name: math.nan if x is None else x for name, x in known.items()}
     wall = shared + perf_counter() - begun
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
 
 
-def _judge(result: Result) -> _Outcome:
+def _judge(result: Result) -> tuple[dict[str, float], str, str]:
     """Metrics of a flight, and why it has failed."""
     from rigidfleet.assessment import assess
 

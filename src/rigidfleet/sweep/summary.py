@@ -77,15 +77,15 @@ class Driver:
 
 @dataclass(frozen=True)
 class Borne:
-    """How often a fault of a drill fails, and the worst run that does: the one of least separation, in words.
+    """How often a fault of a drill fails, and how.
 
     Attributes
     ----------
     fault, magnitude, unit : what happens, and by how much
     vehicles : to how many
     failed : rate of the runs that fail
-    separation : least separation of all runs that was measured [m]; None if none was
-    run, detail : number and message of the worst run; -1 and "" if none fails
+    separation : least separation that was measured [m]; None if none was
+    worst : of the runs that fail, the one of least separation; None if none does
     """
 
     fault: str
@@ -94,8 +94,7 @@ class Borne:
     vehicles: int
     failed: Rate
     separation: float | None
-    run: int
-    detail: str
+    worst: Example | None
 
 
 @dataclass(frozen=True)
@@ -175,21 +174,13 @@ class Summary(Shown):
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
     def _cases(self) -> FactTable:
-        rows = [
-            Row(
-                (
-                    x.fault,
-                    f"{x.magnitude:g} {display_unit(x.unit)}".strip(),
-                    x.vehicles,
-                    f"{x.failed.count} of {x.failed.of}",
-                    f"{100 * x.failed.rate:.3g} %",
-                    x.separation,
-                    f"run {x.run}: {x.detail}" if x.detail else "",
-                ),
-                level="fails" if x.failed.count else "ok",
-            )
-            for x in self.drill
-        ]
+        rows = []
+        for x in self.drill:
+            size, by = x.failed, f"{x.magnitude:g} {display_unit(x.unit)}".strip()
+            share = f"{size.count} of {size.of}", f"{100 * size.rate:.3g} %"
+            words = f"run {x.worst.run}: {x.worst.detail}" if x.worst else ""
+            level: Any = "fails" if size.count else "ok"
+            rows.append(Row((x.fault, by, x.vehicles, *share, x.separation, words), level))
         heads = "fault", "by", "vehicles", "fail", "share", "least apart [m]", "the worst"
         return FactTable(heads, rows, ("the worst",))
 
@@ -262,24 +253,18 @@ def summarise(table: store.Table) -> Summary:
 def borne(table: store.Table) -> list[Borne]:
     """How often each fault of a drill fails; empty for other sweeps."""
     cases = []
-    for codes in np.unique(table.codes, axis=0) if table.sweep.drill else ():
+    for codes in np.unique(table.codes, axis=0) if table.sweep.drill else []:
         some = np.flatnonzero((table.codes == codes).all(axis=1))
-        apart = table.metrics["separation"][some]
-        order = some[np.argsort(np.nan_to_num(apart, nan=np.inf), kind="stable")]
-        worst = next((k for k in order.tolist() if not table.passed[k]), None)
-        run, detail = (
-            (-1, "") if worst is None else (int(table.run[worst]), str(table.detail[worst]))
-        )
+        apart, passed = table.metrics["separation"][some], table.passed[some]
         fault, size, count = (
             c.variation.value(x) for c, x in zip(table.sweep.columns, codes.tolist(), strict=True)
         )
-        least = float(np.fmin.reduce(apart))
-        cases.append(
-            Borne(
-                fault, size, UNITS[fault], int(count), rate(~table.passed[some]),
-                least if math.isfinite(least) else None, run, detail,
-            )
-        )  # fmt: skip
+        worst, failed = None, some[~passed]
+        if len(failed):
+            k = failed[np.where(np.isnan(apart[~passed]), np.inf, apart[~passed]).argmin()]
+            worst = Example(int(table.run[k]), str(table.detail[k]))
+        least = float(np.fmin.reduce(apart)) if np.isfinite(apart).any() else None
+        cases.append(Borne(fault, size, UNITS[fault], int(count), rate(~passed), least, worst))
     return cases
 
 
