@@ -434,10 +434,10 @@ def _check(
     header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
     if header is not None and header.drill is not None:
-        variations = _cases(collector, header.drill, mission)
+        cases = _cases(collector, header.drill, mission)
         if collector.findings:
             raise SweepError(collector.findings)
-        return variations, header
+        return cases, header
     whole = None if mission is None else keypaths.whole_document(mission)
     variations: list[Variation] = []
     lacked: list[tuple[int, SweepColumn]] = []
@@ -483,9 +483,11 @@ def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -
         if collector.data.get(key, default) != default:
             collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
     if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
-        problem = "needs a mission that is flown, not files"
-        collector.add(("drill", *flown), problem, "remove it, or files")
-    return [] if mission is None else drill.grids(mission.n_agents)
+        collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
+    grids = drill.grids(1 if mission is None else mission.n_agents)
+    if not grids:
+        collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
+    return grids
 
 
 def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:

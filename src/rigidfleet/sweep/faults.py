@@ -48,26 +48,14 @@ _Counts = tuple[AgentNumber, ...]
 class Drill(Part):
     """The table `[drill]` of a sweep file: the magnitudes of each fault; if it names none, all have some."""
 
-    late: _Sizes = key("vehicles start so much later than the others [s]", (0.5, 1.0, 2.0, 5.0))
-    another: _Counts = key(
-        "vehicles fly, from their own pads, the files of so many numbers on", (1, 2)
-    )
-    stale: tuple[str, ...] = key(
-        "vehicles fly an earlier version: missions, or files of others", ()
-    )
-    bias: _Sizes = key(
-        "vehicles are off, each in a horizontal direction of its own [m]", (0.5, 1.0, 2.0)
-    )
-    rotated: _Sizes = key(
-        "a vehicle about its pad, or the show about its origin [deg]", (1.0, 3.0, 10.0)
-    )
-    shifted: _Sizes = key(
-        "a vehicle, or the show, in any horizontal direction [m]", (0.5, 2.0, 5.0)
-    )
-    mirrored: tuple[Angle, ...] = key(
-        "the same, at a plane of this bearing, clockwise from y [deg]", (0.0, 90.0)
-    )
-    wind: _Sizes = key("wind beyond the forecast, in any horizontal direction [m/s]", (2.0, 5.0))
+    late: _Sizes = key("vehicles start so much later than the others [s]", (0.5, 1, 2, 5))
+    another: _Counts = key("from their pads, vehicles fly files of so many numbers on", (1, 2))
+    stale: tuple[str, ...] = key("vehicles fly an earlier version: missions, or files", ())
+    bias: _Sizes = key("vehicles are off, in horizontal directions of their own [m]", (0.5, 1, 2))
+    rotated: _Sizes = key("a vehicle about its pad, the show about its origin [deg]", (1, 3, 10))
+    shifted: _Sizes = key("a vehicle or the show, in any horizontal direction [m]", (0.5, 2, 5))
+    mirrored: tuple[Angle, ...] = key("the same, at a plane of this bearing [deg]", (0, 90))
+    wind: _Sizes = key("wind beyond the forecast, in any horizontal direction [m/s]", (2, 5))
     links: _Counts = key("so many links are lost, each at any time", ())
     lost: _Counts = key("so many vehicles are lost, each at any time", (1,))
     vehicles: _Counts = key("of how many at once late, another, stale and bias are faults", (1, 5))
@@ -77,21 +65,20 @@ class Drill(Part):
     def grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
         possible = PARTIAL | SETUP if self.files else UNITS
-        names = self.model_fields_set & UNITS.keys() or possible.keys()
+        faults = self.model_fields_set & UNITS.keys() or possible.keys()
         some = sorted({min(count, n) for count in self.vehicles})
-        counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n})) | {"wind": [n]}
+        counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
         cases = [
             (fault, float(size), count)
             for fault in UNITS
-            if fault in names
+            if fault in faults
             for size in (places if fault == "stale" else getattr(self, fault))
-            for count in counts.get(fault, [int(size)])
+            for count in counts.get(fault, [int(size) if fault == "lost" else n])
         ]
-        columns = zip(("fault", "magnitude", "vehicles"), zip(*cases, strict=True), strict=False)
-        return [
-            Grid(path=f"drill.{name}", kind="grid", values=x, group="drill") for name, x in columns
-        ]
+        names = "drill.fault", "drill.magnitude", "drill.vehicles"
+        columns = zip(names, zip(*cases, strict=True), strict=False)
+        return [Grid(path=name, kind="grid", values=x, group="drill") for name, x in columns]
 
     @property
     def digest(self) -> str:
@@ -137,7 +124,8 @@ def disturb(
     key, things = "agent", range(1, n + 1)
     if fault == "links":
         key, things = "between", (1 + proximity.all_pairs(n).T).tolist()
-        table = table["links"] = {**table.get("links", {})}
+        table["links"] = {**table.get("links", {})}
+        table = table["links"]
     there = [*table.get("lost", ())]
     rest = [x for x in things if x not in [each[key] for each in there]]
     some = stream.permutation(len(rest))[: int(size)].tolist()
@@ -268,10 +256,8 @@ class Show:
         powers = max(x.pieces.shape[-1] for x in (curve, way))
         pieces = pad(curve.pieces, powers)
         pieces[:, np.isin(every, who)] = pad(way.pieces, powers)
-        agents = self.mission.agents
-        own = {
-            key: [getattr(agents, key)[i] for i in every] for key in ("position", "radius", "mass")
-        }
+        agents = self._data["agents"]
+        own = {key: [agents[key][i] for i in every] for key in ("position", "radius", "mass")}
         mission = Mission.from_plain(self._data | {"agents": own}, "drill")
         verdict = assess(of_curve(Piecewise(knots, pieces), self.how, mission=mission))
         failed = [check for check in verdict.checks if not check.passed]
