@@ -10,6 +10,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 import rigidfleet as rf
+from rigidfleet._common.facts import FactTable
 from rigidfleet.cli.app import main
 from rigidfleet.sweep import Sweep, faults, figures, fly, load
 from rigidfleet.sweep.faults import Drill, Show
@@ -297,10 +298,14 @@ def test_the_summary_has_the_share_of_each_fault(drilled):
             assert case["worst"]["detail"] == table.detail[case["worst"]["run"]]
     assert {0, 3} & {case["failed"]["count"] for case in data}
     figure = figures.shares(table)
+    assert figure is not None
     heights = [bar.get_height() for ax in figure.axes if ax.containers for bar in ax.containers[0]]
     assert heights == pytest.approx([100 * case["failed"]["rate"] for case in data])
-    shown = summary.facts().parts[0].rows
-    assert [row.cells[3] for row in shown] == [f"{case['failed']['count']} of 3" for case in data]
+    shown = summary.facts().parts[0]
+    assert isinstance(shown, FactTable)
+    assert [row.cells[3] for row in shown.rows] == [
+        f"{case['failed']['count']} of 3" for case in data
+    ]
 
 
 def test_faults_that_are_flown_are_missions():

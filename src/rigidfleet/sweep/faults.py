@@ -193,7 +193,7 @@ class Show:
         self.reach = max(limits.separation or 0.0, limits.separation_below or 0.0)
         solid = any(not isinstance(thing, Ground) for thing in mission.obstacles)
         #: Whether it matters where the show is as a whole: flat ground is the same everywhere.
-        self.bounded = solid or limits.geofence is not None
+        self.bounded = solid or limits.geofence or mission.fences or mission.people
         #: Coefficients (P, N, 4, K): arithmetic on long rows is fast.
         self._rows = np.ascontiguousarray(self.curve.pieces.transpose(3, 1, 2, 0))
         self._chords = _Chords.of(self.curve)
@@ -258,7 +258,10 @@ class Show:
         pieces[:, np.isin(every, who)] = pad(way.pieces, powers)
         agents = self._data["agents"]
         own = {key: [agents[key][i] for i in every] for key in ("position", "radius", "mass")}
-        mission = Mission.from_plain(self._data | {"agents": own}, "drill")
+        data = self._data | {"agents": own}
+        if air := data.get("disturbances"):
+            data["disturbances"] = air | {"drag": [air["drag"][i] for i in every]}
+        mission = Mission.from_plain(data, "drill")
         verdict = assess(of_curve(Piecewise(knots, pieces), self.how, mission=mission))
         failed = [check for check in verdict.checks if not check.passed]
         worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
