@@ -68,6 +68,14 @@ def rules(m: Draft) -> Breaches:
 def _abort(m: Draft) -> Breaches:
     """An abort is ordered in time, while slots are tracked."""
     options: Aborting | None = m.abort
+    if options is not None:
+        for k, agent in enumerate(options.agents):
+            yield from _loss(
+                m,
+                ("abort", "agents", k),
+                (agent,),
+                "leaves twice" if agent in options.agents[:k] else "",
+            )
     if options is None or options.at is None or m.end is None or m.findings:
         return
     begins = options.at + options.reaction

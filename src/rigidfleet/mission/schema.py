@@ -711,6 +711,11 @@ class Aborting(Part):
         "the other, or back along the plan. Places are those of the start, or a grid below if that is in the air",
         "any",
     )
+    agents: tuple[AgentNumber, ...] = key(
+        "numbers of the vehicles that go home, as soon as they come near no other one; the others fly the mission on. "
+        "Default: all go home",
+        (),
+    )
 
 
 class MissionHeader(Part):

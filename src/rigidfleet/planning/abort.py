@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,10 +29,12 @@ from rigidfleet.formation.assignment import (
 )
 from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import proximity, series
-from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.math.piecewise import Piecewise, join, pad
 from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.describe import STANDING
 from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import is_ground
+from rigidfleet.planning.certificate import certificate_of, of_ways
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
@@ -53,14 +55,14 @@ _SHORTEST, _LONGER, _TRIES, _KEPT = 0.5, 1.1, 40, 1.01
 _KNOTS, _NEAR = 0.2, 0.01
 #: Samples of a step at which limits are looked at, and greatest way between two at which clearance is [m].
 _LOOKS, _PACE = 33, 0.25
-#: Time between samples of vehicles that fly on [s]; how many of the nearest are looked at in so many parts of it.
-_SAMPLED, _LOOKED_AT, _FINE = 0.25, 20, 10
+#: Least and greatest time between samples of vehicles that fly on [s], and the latter over the number of vehicles.
+_SAMPLED = 0.05, 0.25, 5e-4
 #: How much farther than in the end vehicles are off their ways while drag changes.
 _OVERSHOOT = 1.1
+#: Time before its end within which the plan of those that fly on comes to rest on the ground [s].
+_TOUCHING = 1.0
 #: Steps back along the plan that are tried, and the time in which its clock starts and stops to run back [s].
 _BACK, _REVERSING = 1.0, 2.0
-#: Vehicles that start no higher above what is below them stand on it [m].
-_STANDING = 0.5
 #: Height of two stopped vehicles that counts as one [m], for `Ways` that are planned once.
 _SAME = 6
 #: Progress along the path, of the time of slowing down, by the share of that time: the rate falls from 1 to 0 as
@@ -120,6 +122,8 @@ class Abort:
     way : how the vehicles go home
     reason : why there is no way that is proved; "" if there is one
     number : of the ways from rest, which other aborts may share
+    home : the steps from rest of those that go home
+    waits, slows : how long these fly on before they slow down, and how long that takes [s]
     """
 
     ordered: float
@@ -128,6 +132,14 @@ class Abort:
     way: str
     reason: str = ""
     number: int = 0
+    home: tuple[Step, ...] = ()
+    waits: float = 0.0
+    slows: float = 0.0
+
+    @property
+    def stops(self) -> float:
+        """When those that go home have stopped on the plan [s]."""
+        return self.begins + self.waits + self.slows
 
     @property
     def end(self) -> float:
@@ -177,90 +189,70 @@ class Plan(NamedTuple):
     def states(self, time: Floats, orders: int, middle: Floats | None = None) -> Floats:
         """Position and derivatives (K, orders, N, 3) at times (K,) [s], in the legs of the times ``middle`` (K,)."""
         legs = self.number_at(time if middle is None else middle)
-        parts = [slot_derivatives(*self.legs[k].paths, time[legs == k], orders) for k in np.unique(legs)]  # fmt: skip
-        x = np.concatenate(parts)
+        parts = [(self.legs[k].paths, time[legs == k]) for k in np.unique(legs)]
+        x = np.concatenate([slot_derivatives(*paths, t, orders) for paths, t in parts])
         return x[np.argsort(np.argsort(legs, kind="stable"), kind="stable")]
 
     def least(self, begin: float, end: float, lost: Bools | None) -> Nearest:
         """The least separation that the legs between two times prove [s], lost vehicles (N,) set aside."""
-        from rigidfleet.planning.certificate import certificate_of
-
         best = _APART_FOR_EVER
         first, last = self.number_at(np.array([begin, end]))
         for leg in self.legs[first : last + 1]:
-            proved = (
-                leg.certificate
-                if lost is None
-                else certificate_of(leg.phase, leg.reference, leg.radius, lost)
-            )
+            proved = leg.certificate
+            if lost is not None:
+                proved = certificate_of(leg.phase, leg.reference, leg.radius, lost)
             if proved is not None:
                 best = min(best, Nearest(*proved[:3]))
         return best
 
 
-class Clock(NamedTuple):
-    """The time along the path [s] as a curve of the time since the beginning: a rest, a rate of 1 or -1, changes."""
+class Along(NamedTuple):
+    """The planned paths at another clock: the time along them [s], as a curve of the time since the beginning."""
 
-    curve: Piecewise
-
-    @classmethod
-    def slowing(cls, begin: float, time: float) -> Clock:
-        """From the rate 1 at ``begin`` to rest within a time [s]: half of it along the path."""
-        return cls(_path_time(begin, [(1.0, 0.0, time)]))
-
-    @classmethod
-    def back(cls, begin: float, end: float, time: float) -> Clock:
-        """Back from rest to rest, at the rate -1 between two changes of it that each take a time [s]."""
-        way = begin - end
-        time = min(time, way)
-        rates = [(0.0, -1.0, time), (-1.0, -1.0, way - time), (-1.0, 0.0, time)]
-        return cls(_path_time(begin, [x for x in rates if x[2] > 0.0]))
+    plan: Plan
+    clock: Piecewise
 
     @property
     def duration(self) -> float:
-        """Until it rests [s]."""
-        return float(self.curve.time[-1])
+        """Of the clock [s]."""
+        return float(self.clock.time[-1])
 
-    def states(self, plan: Plan, t: Floats, orders: int, middle: Floats | None = None) -> Floats:
-        """Position and derivatives (K, orders, N, 3) at times (K,) since the beginning, by the chain rule.
+    def at(self, t: Floats) -> Floats:
+        """Positions (K, N, 3) [m] at times (K,) since the beginning [s]."""
+        return self.plan.states(self.clock.at(t), 1)[:, 0]
 
-        At the times ``middle`` (K,) it is decided which leg counts.
-        """
-        s = self.curve.states(t, 4)
-        x = plan.states(s[0], orders, None if middle is None else self.curve.at(middle))
-        first, second, third = (rate[:, None, None] for rate in s[1:])
-        out = x.copy()
-        out[:, 1:2] = x[:, 1:2] * first[:, None]
-        if orders > 2:
-            out[:, 2] = x[:, 2] * first**2 + x[:, 1] * second
-        if orders > 3:
-            out[:, 3] = x[:, 3] * first**3 + 3.0 * x[:, 2] * first * second + x[:, 1] * third
-        return out
+    def states(self, t: Floats, middle: Floats | None = None) -> Floats:
+        """Position, velocity, acceleration, jerk (K, 4, N, 3) at times (K,), in the legs of the times ``middle``."""
+        s = self.clock.states(t, 4)
+        x = self.plan.states(s[0], 4, None if middle is None else self.clock.at(middle))
+        first, second, third = (rate[:, None, None] for rate in s[1:])  # and the chain rule
+        jerk = x[:, 3] * first**3 + 3.0 * x[:, 2] * first * second + x[:, 1] * third
+        moves = x[:, 0], x[:, 1] * first, x[:, 2] * first**2 + x[:, 1] * second, jerk
+        return np.stack(moves, axis=1)
 
-    def ways(self, plan: Plan) -> Piecewise:
+    def ways(self) -> Piecewise:
         """The ways of all vehicles (K, N, 3, 8): pieces that meet the path with three derivatives at their ends."""
         steps = max(2, math.ceil(self.duration / _KNOTS) + 1)
-        knots = [self.curve.time, np.linspace(0.0, self.duration, steps)]
-        fine = np.linspace(0.0, self.duration, 50 * steps)
-        path = self.curve.at(fine)
+        knots, fine = [self.clock.time], np.linspace(0.0, self.duration, 50 * steps)
+        path = self.clock.at(fine)
         order = np.argsort(path)
-        for leg in plan.legs:  # where the plan's own polynomials change
+        for leg in self.plan.legs:  # where the plan's own polynomials change
             own = np.unique([leg.end, *leg.paths[0].knots, *leg.paths[1].knots])
             own = own[(own > path.min()) & (own < path.max())]
             if len(own) < 4 * steps:
                 knots.append(np.interp(own, path[order], fine[order]))
-        time = np.unique(np.round(np.concatenate(knots), 9))
+        time = np.unique(np.concatenate([np.linspace(0.0, self.duration, steps), *knots]))
         time = time[np.append(True, np.diff(time) > _NEAR)]
         time[-1] = self.duration
         middle = 0.5 * (time[:-1] + time[1:])
-        begin, end = (self.states(plan, t, 4, middle).swapaxes(0, 1) for t in (time[:-1], time[1:]))
-        return Piecewise.of_ends(time, begin, end)
+        ends = (self.states(t, middle).swapaxes(0, 1) for t in (time[:-1], time[1:]))
+        return Piecewise.of_ends(time, *ends)
 
 
-def _path_time(begin: float, rates: Sequence[tuple[float, float, float]]) -> Piecewise:
-    """The curve of a clock whose rate goes from one value to another within each of several times [s]."""
+def _clock(begin: float, *rates: tuple[float, float, float]) -> Piecewise:
+    """The time along the path, from a beginning on, whose rate goes from one value to another within times [s]."""
     knots, pieces = [0.0], []
-    for before, after, time in rates:
+    for before, after, time in (x for x in rates if x[2] > 0.0):
         share = before * np.eye(7)[1] + (after - before) * (np.eye(7)[1] - _SLOWING)
         piece = share * time ** (1.0 - np.arange(7.0))
         pieces.append(np.append(begin, piece[1:]))
@@ -325,32 +317,37 @@ class _Judge:
         time = duration * float(np.interp(share, flown, np.linspace(0.0, 1.0, 1001)))
         return Nearest(least, time, (int(who[i]), int(who[j])))
 
+    def least_time(self, time: float, excess: Callable[[float], Floats]) -> tuple[float, Floats]:
+        """The least time from a first one on [s] that exceeds no limit, and the shares of them that it takes."""
+        time = max(time, _SHORTEST)
+        for _ in range(_TRIES):
+            over = excess(time)
+            if over.max(initial=0.0) <= _KEPT:
+                break
+            time *= _LONGER
+        return time, over
+
     def straight(self, name: str, start: Floats, end: Floats, *, lands: bool = False) -> Step:
         """The step of straight ways, in step and from rest to rest, in the least time that keeps the limits."""
-        way = end - start
-        longest = float(np.linalg.norm(way, axis=1).max())
-        if longest < 1e-9:
-            time = 0.0
-        else:
-            fastest = DESCENT if lands else SPEED
-            time = max(_SHORTEST, 2.1875 * longest / fastest)
-            limits = [q for q in self.home if np.isfinite(q.most).any()]
+        way, time = end - start, 0.0
+        if (longest := float(np.linalg.norm(way, axis=1).max())) > 1e-9:
             x = np.linspace(0.0, 1.0, _LOOKS)
             s = series.derivatives(series.of_polynomials(np.tile(_BLEND, (_LOOKS, 1)), x, 4))
             moves = s.T[:, :, None, None] * way
             moves[:, 0] += start
-            allowed = np.maximum(self.shares(limits, 0.0 * moves), 1.0)  # at rest
-            for _ in range(_TRIES):
-                powers = time ** -np.array([0.0, 1.0, 2.0, 3.0])[:, None, None]
-                over = self.shares(limits, moves * powers) / allowed
-                if not len(over) or over.max() <= _KEPT:
-                    break
-                time *= _LONGER
+            allowed = self.shares(self.home, 0.0 * moves)  # at rest
+
+            def excess(time: float) -> Floats:
+                powers = time ** -np.arange(4.0)[:, None, None]
+                return self.shares(self.home, moves * powers) / np.maximum(allowed, 1.0)
+
+            fastest = DESCENT if lands else SPEED
+            time, _ = self.least_time(2.1875 * longest / fastest, excess)
         scaled = _BLEND * max(time, 1e-3) ** -np.arange(8.0)
         piece = start[..., None] * np.eye(8)[0] + way[..., None] * scaled
         curve = Piecewise(np.array([0.0, max(time, 1e-3)]), piece[None])
         least, off = self.nearest(start, end, time), self.off_at(curve.at, time)
-        return Step(name, time, least, curve.at, lambda: curve, end, off, lands)
+        return Step(name, time, least, curve.at, partial(_itself, curve), end, off, lands)
 
     def obstruction(self, step: Step, begin: float, *, along: bool = False) -> str:
         """What keeps a step from being flown, from a time [s] on; "" if nothing does.
@@ -386,11 +383,10 @@ class _Judge:
         if not things:
             return ""
         room, near = proximity.obstacle_clearances(r, radius, things, begin + time)
-        room = (
-            room - _PACE
-        )  # more than half of the way between two samples, at twice the mean speed
         k, i = np.unravel_index(int(room.argmin()), room.shape)
-        if room[k, i] < 0.0:
+        if (
+            room[k, i] < _PACE
+        ):  # more than half the way between two samples, at twice the mean speed
             thing = things[int(near[k, i])].name
             return f"'{thing}' stands in the way {step.name} of agent {self.left[i] + 1}"
         return ""
@@ -411,13 +407,15 @@ Ways = tuple[list[Step], str, str]
 class Homes:
     """Ways home from rest; those of equal stopped places are planned once."""
 
-    def __init__(self, mission: Mission, plan: Plan, lost: Bools | None = None) -> None:
+    def __init__(
+        self, mission: Mission, plan: Plan, lost: Bools | None = None, to: str | None = None
+    ) -> None:
         self.mission, self.plan, self.judge = mission, plan, _Judge(mission, lost)
-        self.to = mission.aborting.to
+        self.to = to or mission.aborting.to
         start = mission.fleet.position
         below = mission.height_at(*start.T)
         stands = start[:, 2] - mission.fleet.radius - below
-        self.stands = bool(np.isfinite(below).all() and stands.max() <= _STANDING)
+        self.stands = bool(np.isfinite(below).all() and stands.max() <= STANDING)
         self.start = np.column_stack([start[:, :2], below + ABOVE + mission.fleet.radius])
         self.known: dict[bytes, tuple[int, Ways]] = {}
         self.moves = any(x.solid.moves for x in self.judge.things)
@@ -426,7 +424,7 @@ class Homes:
         """Number and ways from places (N, 3) [m] where all rest at ``begin`` [s], at a time [s] along the plan."""
         key = np.round(r, _SAME).tobytes() + (np.array([begin]).tobytes() if self.moves else b"")
         if key not in self.known:
-            number, ways = len(self.known), self._search(r, begin)
+            number, ways = len(self.known), self.search(r, begin)
             self.known[key] = number, ways
             if not ways[0] and np.isfinite(self.places(r)).all():
                 self.known[key] = number, self._back(ways, begin, path)
@@ -437,50 +435,69 @@ class Homes:
         judge = self.judge
         for k in range(1, math.ceil(path / _BACK) + 1):
             to = max(0.0, path - k * _BACK)
-            clock = Clock.back(path, to, _REVERSING)
-            step = self.along("back along the plan", clock, to, path)
+            time = min(_REVERSING, path - to)
+            rates = (0.0, -1.0, time), (-1.0, -1.0, path - to - time), (-1.0, 0.0, time)
+            step = self.along("back along the plan", _clock(path, *rates), to)
             if judge.obstruction(step, begin, along=True):
                 continue
-            steps, way, _ = self._search(step.end, begin + step.duration)
+            steps, way, _ = self.search(step.end, begin + step.duration)
             if way:
                 return [step, *steps], f"back along the plan, and {way}", ""
         return ways
 
-    def along(self, name: str, clock: Clock, first: float, last: float) -> Step:
-        """A step along the plan by a clock, between two times along it [s]."""
-        plan = self.plan
-        least = plan.least(min(first, plan.end), min(last, plan.end), self.judge.lost)
-        end = clock.states(plan, np.array([clock.duration]), 1)[0, 0]
+    def along(self, name: str, clock: Piecewise, to: float) -> Step:
+        """A step along the plan by a clock, from its first time to another one [s], in either direction."""
+        along, end = Along(self.plan, clock), self.plan.end
+        first, last = sorted((float(clock.pieces[0, 0]), to))
+        least = self.plan.least(min(first, end), min(last, end), self.judge.lost)
+        time = along.duration
+        off, stop = self.judge.off_at(along.at, time), along.at(np.array([time]))[0]
+        return Step(name, time, least._replace(time=0.0), along.at, along.ways, stop, off)
 
-        def at(t: Floats) -> Floats:
-            return clock.states(plan, t, 1)[:, 0]
-
-        off, time = self.judge.off_at(at, clock.duration), clock.duration
-        return Step(name, time, least._replace(time=0.0), at, lambda: clock.ways(plan), end, off)
-
-    def _search(self, r: Floats, begin: float) -> Ways:
+    def search(self, r: Floats, begin: float) -> Ways:
         """Steps, the name of their way, and why there are none."""
-        places = self.places(r)
-        if not np.isfinite(places).all():
+        left, goal = self.judge.left, r.copy()
+        goal[left] = self.places(r)[left]  # lost ones stay
+        if not np.isfinite(goal).all():
             return [], "", "there is no ground to land on: add [[obstacles]] with kind = 'ground'"
         reasons, off = [], 0.0
         # Levels are tried again with as much more between them as vehicles were off their ways.
-        own = (self._straight, self._by_levels, self._by_levels)
-        for make in (self._straight_to_any,) if self.to == "any" else own:
-            way, stops = make(r, places, off)
+        own = "straight to their own", "by levels", "by levels"
+        for way in ("to any place",) if self.to == "any" else own:
             steps: list[Step] = []
             problem, t = "", begin
-            for name, a, b in stops:
+            for name, a, b in self._stops(way, r, goal, off):
                 step = self.judge.straight(name, a, b, lands=name == "down")
-                steps.append(step)
-                if step.duration > 0.0 and not problem:
-                    problem = self.judge.obstruction(step, t)
-                t += step.duration
+                if step.duration > 0.0:
+                    steps.append(step)
+                    problem = problem or self.judge.obstruction(step, t)
+                    t += step.duration
             if not problem:
-                return [x for x in steps if x.duration > 0.0], way, ""
+                return steps, way, ""
             off = max(step.off for step in steps)
             reasons.append(f"{way}: {problem}")
         return [], "", "; ".join(reasons)
+
+    def _stops(self, way: str, r: Floats, goal: Floats, off: float) -> list[Stop]:
+        """The straight ways from places to others (N, 3) [m] on the ground, if vehicles are off theirs [m].
+
+        By levels, they go apart, across and down. Who is above another one stays above it.
+        """
+        judge, left, stops = self.judge, self.judge.left, []
+        p, q = r[left], goal[left]
+        if way == "to any place":
+            metric, goal = downwash_metric(_UP, judge.below / judge.apart), goal.copy()
+            goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
+        if way == "by levels":
+            height = _levels(judge.apart + off, p, q) * (judge.below + off)
+            height += max(q[:, 2].max() + FINAL, p[:, 2].mean() - 0.5 * height.max())
+            one, two = r.copy(), goal.copy()
+            one[left, 2] = two[left, 2] = height
+            stops, r = [("apart", r, one), ("across", one, two)], two
+        # No higher than the lowest of them.
+        rise = max(0.0, min(FINAL, float((r[left, 2] - goal[left, 2]).min())))
+        above = goal + rise * _UP
+        return [*stops, ("over the places", r, above), ("down", above, goal)]
 
     def places(self, r: Floats) -> Floats:
         """Landing places (N, 3) [m] of the vehicles' centres.
@@ -501,47 +518,17 @@ class Homes:
         z = self.mission.height_at(*xy.T) + ABOVE + self.mission.fleet.radius
         return np.column_stack([xy, z])
 
-    def _above(self, r: Floats, places: Floats) -> Floats:
-        """Where vehicles begin to come straight down: above their places, no higher than the lowest of them."""
-        left = self.judge.left
-        rise = max(0.0, min(FINAL, float((r[left, 2] - places[left, 2]).min())))
-        return places + rise * _UP
 
-    def _down(self, r: Floats, places: Floats) -> list[Stop]:
-        above = self._above(r, places)
-        return [("over the places", r, above), ("down", above, places)]
+def _itself(curve: Piecewise) -> Piecewise:
+    return curve
 
-    def _straight_to_any(self, r: Floats, places: Floats, _: float) -> tuple[str, list[Stop]]:
-        left, judge = self.judge.left, self.judge
-        metric = downwash_metric(_UP, judge.below / judge.apart)
-        order = assign_slots(r[left], places[left], turn=np.eye(3), metric=metric).order
-        goal = r.copy()
-        goal[left] = places[left][order]
-        return "to any place", self._down(r, goal)
 
-    def _straight(self, r: Floats, places: Floats, _: float) -> tuple[str, list[Stop]]:
-        return "straight to their own", self._down(r, self._own(r, places))
-
-    def _own(self, r: Floats, places: Floats) -> Floats:
-        """The places of those left; lost ones stay."""
-        goal = r.copy()
-        goal[self.judge.left] = places[self.judge.left]
-        return goal
-
-    def _by_levels(self, r: Floats, places: Floats, off: float) -> tuple[str, list[Stop]]:
-        """Apart to levels, across, and down to their own places. Who is above another one stays above it."""
-        judge, left = self.judge, self.judge.left
-        p, q = r[left], places[left]
-        level = _levels(judge.apart + off, p, q)
-        height = level * (judge.below + off)
-        low = float(q[:, 2].max()) + FINAL
-        span = float(height.max())
-        height += max(low, float(p[:, 2].mean()) - 0.5 * span)
-        one, two = self._own(r, places), self._own(r, places)
-        one[left] = np.column_stack([p[:, :2], height])
-        two[left] = np.column_stack([q[:, :2], height])
-        stops = [("apart", r, one), ("across", one, two)]
-        return "by levels", stops + self._down(two, self._own(r, places))
+def _in_a_row(curves: Sequence[Piecewise]) -> Piecewise:
+    """Curves from 0 [s], one after the other, with 8 powers."""
+    ends = np.cumsum([0.0, *(float(x.time[-1]) for x in curves)])
+    times = [x.time[1:] + t for x, t in zip(curves, ends, strict=False)]
+    pieces = [pad(x.pieces, 8) for x in curves]
+    return Piecewise(np.concatenate([[0.0], *times]), np.concatenate(pieces))
 
 
 def _levels(distance: float, p: Floats, q: Floats) -> Ints:
@@ -583,125 +570,153 @@ class Aborts:
 
     def at(self, ordered: float) -> Abort:
         """What follows from an order at a time [s]."""
+        return self._leaving(ordered) if self.options.agents else self.of_all(ordered)
+
+    @cached_property
+    def _alone(self) -> Aborts:
+        """The aborts of those that leave, who land where the plan leads them, if it lands."""
+        stay = np.ones(self.mission.n_agents, dtype=np.bool_)
+        stay[np.array(self.options.agents) - 1] = False
+        alone = Aborts(self.mission, self.plan.legs, stay)
+        if self.plan.lands:
+            alone.homes.start = self.plan.states(np.array([self.plan.end]), 1)[0, 0]
+        return alone
+
+    @cached_property
+    def _on(self) -> Piecewise:
+        """The plan of all vehicles as one curve of mission time, which ends at rest."""
+        end = self.plan.end
+        on = Along(self.plan, _clock(0.0, (1.0, 1.0, end))).ways()
+        last = np.array([max(0.0, end - _TOUCHING), end])
+        states = on.states(last, 4)
+        states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
+        return _in_a_row([on.between(0.0, last[0]), Piecewise.hermite(last - last[0], states)])
+
+    def _leaving(self, ordered: float) -> Abort:
+        """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
+        begins, end = ordered + self.options.reaction, self.plan.end
+        left, who, judge = self.judge.left, np.array(self.options.agents) - 1, self.judge
+        order = np.concatenate([np.intersect1d(left, who), np.setdiff1d(left, who)])
+        problem, on = "there is no time left", self._on.between(begins, end).later(-begins)
+        for waits in np.arange(0.0, end - begins, self.options.step).tolist():
+            alone = self._alone.of_all(ordered + waits)
+            if alone.reason:
+                problem = alone.reason
+                continue
+            before = [on.between(0.0, waits)] if waits else []
+            own = _in_a_row([*before, *(step.ways() for step in alone.steps)])
+            each = [own if i in who else on for i in range(self.mission.n_agents)]
+            curve = join([Piecewise(x.time, x.pieces[:, i]) for i, x in enumerate(each)])
+            among = curve.pieces[:, order]
+            proved = of_ways(curve.time, among, judge.radius[order], len(who))
+            i, j = (int(order[k]) for k in proved.agents)
+            least = self.plan.least(begins, end, judge.lost)._replace(time=0.0)
+            least = min(Nearest(proved.separation, proved.time, (i, j)), least)
+            duration, last = float(curve.time[-1]), curve.at(curve.time[-1:])[0]
+            off = judge.off_at(curve.at, duration)
+            if proved.separation - off >= max(judge.need, 1e-6):
+                way = f"{agent_names(who.tolist())} {'leaves' if len(who) == 1 else 'leave'}"
+                way += f" after {waits:g} s" if waits else ""
+                ways = partial(_itself, curve)
+                step = Step("leave", duration, least, curve.at, ways, last, off)
+                number, (slow, *home) = round(ordered / self.options.step), alone.steps
+                return Abort(
+                    ordered, begins, (step,), way, "", number, tuple(home), waits, slow.duration
+                )
+            problem = f"{agent_names((i, j))} come within {max(proved.separation - off, 0.0):.2f} m"
+        return Abort(ordered, begins, (), "", problem)
+
+    def of_all(self, ordered: float) -> Abort:
+        """What follows for all at once."""
         begins = ordered + self.options.reaction
         plan, judge = self.plan, self.judge
         untracked = [x.phase for x in plan.legs if x.end > begins and x.phase.control != "tracking"]
         if untracked and untracked[0] is plan.legs[plan.number_at(np.array([begins]))[0]].phase:
             reason = f"only tracked slots can slow down, and '{untracked[0].name}' tracks none"
             return Abort(ordered, begins, (), "", reason)
-        clock, problem = self._slowing(begins)
-        if begins + 0.5 * clock.duration >= plan.end and plan.lands:
-            go_on = Clock(_path_time(begins, [(1.0, 1.0, max(plan.end - begins, _SHORTEST))]))
-            return Abort(
-                ordered,
-                begins,
-                (self.homes.along("to its end", go_on, begins, plan.end),),
-                "lands as planned",
-            )
-        path = begins + 0.5 * clock.duration
-        step = self.homes.along("slow down", clock, begins, path)
+        time, problem = self._slowing(begins)
+        path = begins + 0.5 * time
+        if path >= plan.end and plan.lands:
+            on = _clock(begins, (1.0, 1.0, max(plan.end - begins, _SHORTEST)))
+            step = self.homes.along("to its end", on, plan.end)
+            return Abort(ordered, begins, (step,), "lands as planned")
+        step = self.homes.along("slow down", _clock(begins, (1.0, 0.0, time)), path)
         if not problem and step.least.separation < max(judge.need, 1e-6):
             who, least = agent_names(step.least.agents), step.least.separation
             problem = f"the plan itself leads {who} within {max(least, 0.0):.2f} m of each other"
         if problem := problem or judge.obstruction(step, begins, along=True):
             return Abort(ordered, begins, (step,), "", problem)
-        t = begins + clock.duration
-        number, (steps, way, reason) = self.homes.ways(step.end, t, path)
-        return Abort(ordered, begins, (step, *steps), way, reason, number)
+        number, (steps, way, reason) = self.homes.ways(step.end, begins + time, path)
+        return Abort(ordered, begins, (step, *steps), way, reason, number, tuple(steps), 0.0, time)
 
     @cached_property
-    def _flown(self) -> tuple[Floats, Floats]:
+    def _samples_of_plan(self) -> tuple[Floats, Floats]:
         """Times (K,) of the whole plan [s], and the places (K, N, 3) [m] in it."""
-        time = np.arange(0.0, self.plan.end + _SAMPLED, _SAMPLED)
-        return time, self.plan.states(np.minimum(time, self.plan.end), 1)[:, 0]
+        least, most, each = _SAMPLED
+        step = min(max(least, each * self.mission.n_agents), most)
+        time = np.arange(0.0, self.plan.end, step)
+        return time, self.plan.states(time, 1)[:, 0]
 
-    def unheard(self, abort: Abort) -> tuple[Nearest, Floats]:
-        """How near a vehicle that does not hear the order and flies on comes to others, until these rest.
+    def if_not_heard(self, abort: Abort) -> list[Nearest]:
+        """How near each vehicle comes to others if it does not hear the order and flies on, until these rest.
 
-        The nearest, of which the first agent is the one that flies on; and of each vehicle (N,), at samples [m].
+        At samples; the first of the agents is the one that flies on.
         """
-        left = self.judge.left
-        each = np.full(self.mission.n_agents, math.inf)
-        if len(left) < 2 or not abort.steps:
-            return _APART_FOR_EVER, each
-        time, places = self._flown
-        some = (time > abort.begins) & (time < min(abort.end, self.plan.end))
-        time, on, others = time[some], places[some][:, left], abort.at(time[some])[:, left]
-        far = _nearest_others(on, others, self.judge.radius[left])
-        best = _APART_FOR_EVER
-        each[left] = far.min(axis=0, initial=math.inf)
-        for k in np.argsort(far.min(axis=1, initial=math.inf))[:_LOOKED_AT]:
-            i = int(far[k].argmin())
-            fine = time[k] + _SAMPLED * np.linspace(-1.0, 1.0, 2 * _FINE + 1)
-            fine = np.clip(fine, abort.begins, min(abort.end, self.plan.end))
-            r = self.plan.states(fine, 1)[:, 0, left[i]]
-            near = np.linalg.norm(abort.at(fine)[:, left] - r[:, None], axis=2)
-            near -= self.judge.radius[left] + self.judge.radius[left[i]]
-            near[:, i] = math.inf
-            n, j = np.unravel_index(int(near.argmin()), near.shape)
-            best = min(best, Nearest(float(near[n, j]), float(fine[n]), (int(left[i]), int(left[j]))))  # fmt: skip
-        return best, each
+        from scipy.spatial import KDTree
 
-    def _slowing(self, begins: float) -> tuple[Clock, str]:
-        """The clock that slows down in the least time that keeps the limits, and what breaks them if none does.
+        left, (time, places) = self.judge.left, self._samples_of_plan
+        some = (time > abort.begins) & (time < abort.end)
+        if len(left) < 2 or not abort.steps or not some.any():
+            return []
+        time, on, others = time[some], places[some][:, left], abort.at(time[some])[:, left]
+        nearest = [KDTree(b).query(a, 2) for a, b in zip(on, others, strict=True)]
+        far, whom = np.array([x for x, _ in nearest]), np.array([x for _, x in nearest])
+        itself = whom[..., 0] == np.arange(len(left))
+        far, whom = (np.where(itself, x[..., 1], x[..., 0]) for x in (far, whom))
+        far = far - self.judge.radius[left] - self.judge.radius[left[whom]]
+        return [
+            Nearest(float(far[k, i]), float(time[k]), (int(left[i]), int(left[whom[k, i]])))
+            for i, k in enumerate(far.argmin(axis=0))
+        ]
+
+    def _slowing(self, begins: float) -> tuple[float, str]:
+        """The least time of slowing down that keeps the limits [s], and what breaks them if none does.
 
         Where the plan itself is beyond a limit, that counts as the limit.
         """
-        plan, judge = self.plan, self.judge
-        speed = float(np.linalg.norm(plan.states(np.array([begins]), 2)[0, 1, judge.left], axis=1).max())  # fmt: skip
-        time = max(_SHORTEST, _STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
-        x = np.linspace(0.0, 1.0, _LOOKS)
-        limits, over, allowed = judge.limits, np.zeros(0), np.zeros(0)
-        for _ in range(_TRIES):
-            clock = Clock.slowing(begins, time)
-            over = judge.shares(limits, clock.states(plan, time * x, 5))
-            allowed = judge.shares(limits, plan.states(begins + 0.5 * time * x, 5))
-            if not len(over) or (over / np.maximum(allowed, 1.0)).max() <= _KEPT:
-                return clock, ""
-            time *= _LONGER
-        q = limits[int((over / np.maximum(allowed, 1.0)).argmax())].of
-        return Clock.slowing(begins, time), f"slowing down would break the limit of {q.name_in_words}"  # fmt: skip
+        plan, judge, x = self.plan, self.judge, np.linspace(0.0, 1.0, _LOOKS)
+
+        def excess(time: float) -> Floats:
+            slowing = Along(plan, _clock(begins, (1.0, 0.0, time)))
+            allowed = judge.shares(judge.limits, plan.states(begins + 0.5 * time * x, 4))
+            return judge.shares(judge.limits, slowing.states(time * x)) / np.maximum(allowed, 1.0)
+
+        v = plan.states(np.array([begins]), 2)[0, 1, judge.left]
+        speed = float(np.linalg.norm(v, axis=1).max())
+        first = max(_STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
+        time, over = judge.least_time(first, excess)
+        if over.max(initial=0.0) <= _KEPT:
+            return time, ""
+        q = judge.limits[int(over.argmax())].of
+        return time, f"slowing down would break the limit of {q.name_in_words}"
 
 
-def _nearest_others(on: Floats, others: Floats, radius: Floats) -> Floats:
-    """Distance (K, N) [m] of each vehicle that flies on (K, N, 3) from the nearest of the others (K, N, 3)."""
-    from scipy.spatial import KDTree
-
-    itself, far = np.arange(on.shape[1]), np.empty(on.shape[:2])
-    for k, (a, b) in enumerate(zip(on, others, strict=True)):
-        near, whom = KDTree(b).query(a, 2)
-        far[k] = np.where(whom[:, 0] == itself, near[:, 1], near[:, 0])
-    return far - 2.0 * float(radius.max())
-
-
-def phases_of(mission: Mission, abort: Abort) -> list[Phase]:
-    """The phases that fly an abort: each vehicle follows its ways, and at the end it comes straight down."""
+def phases_of(mission: Mission, steps: Sequence[Step], what: str) -> list[Phase]:
+    """The phases that fly steps: each vehicle follows its ways, and at the end it comes straight down."""
     phases: list[Phase] = []
-    for step in abort.steps:
-        name = f"{step.name} (abort)"
+    for step in steps:
+        name, time = f"{what}: {step.name}", step.duration
         if step.lands:
             everyone = tuple(range(1, mission.n_agents + 1))
-            phases.append(Land(kind="land", name=name, agents=everyone, duration=step.duration))
+            phases.append(Land(kind="land", name=name, agents=everyone, duration=time))
             continue
         knots, pieces = step.ways()
-        powers = pieces.shape[-1]
+        level = np.zeros_like(pieces[:, :, :1])  # whose yaw follows [yaw]
         rows = tuple(
-            tuple(
-                map(
-                    tuple,
-                    curve_to_rows(
-                        Piecewise(
-                            knots,
-                            np.concatenate(
-                                [pieces[:, i], np.zeros((len(pieces), 1, powers))], axis=1
-                            ),
-                        )
-                    ),
-                )
-            )
-            for i in range(mission.n_agents)
+            tuple(map(tuple, curve_to_rows(Piecewise(knots, one))))
+            for one in np.concatenate([pieces, level], axis=2).swapaxes(0, 1)
         )
-        phases.append(Follow(kind="follow", name=name, trajectories=rows, duration=step.duration))
+        phases.append(Follow(kind="follow", name=name, trajectories=rows, duration=time))
     return phases
 
 

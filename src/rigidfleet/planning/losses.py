@@ -71,7 +71,7 @@ def answer_to(mission: Mission, now: PhaseState, plan: Sequence[Leg]) -> Answer:
     reaction = mission.aborting.reaction
     abort = Aborts(mission, plan, now.lost).at(now.t - reaction)
     now = state_to_leave(plan[Plan(plan).number_at(np.array([now.t]))[0]], now, now.t)
-    return Answer(legs_from(mission, now, phases_of(mission, abort)), abort.reason)
+    return Answer(legs_from(mission, now, phases_of(mission, abort.steps, "abort")), abort.reason)
 
 
 def after_loss(mission: Mission, now: PhaseState) -> list[Leg]:
