@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
+from rigidfleet.mission.describe import landings_in_words
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import complete_times
@@ -94,6 +95,8 @@ def check(
         *waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
+    if planned and (words := landings_in_words(mission, planned[-1].position[-1])):
+        preflight.remarks.append(Remark("note", "landing", words))
     if not known:
         why = "later positions depend on distances alone and are known only in flight"
         if len(planned) < len(mission.phases) and samples_per_phase(mission) < FEWEST_SAMPLES:
