@@ -144,7 +144,7 @@ def test_noise_is_shown_by_samples(kind: str, tau: float) -> None:
 def test_noise_that_looks_like_motion_is_not_told(kind: str) -> None:
     """Slow noise, and that of an estimator, is not estimated: the verdict is undecided and asks for --noise."""
     _, verdict = judge_log(
-        noisy(kind, np.random.default_rng(7)), None, Doubts(None), separation=0.3
+        noisy(kind, np.random.default_rng(7)), None, Doubts("data"), separation=0.3
     )
     assert verdict.word == "undecided"
     assert "--noise" in verdict.summary
@@ -197,7 +197,7 @@ def test_hovering_tells_no_clock() -> None:
     random, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.05)
     still = lambda _i, t: (np.ones((len(t), 3)), np.zeros((len(t), 3)))  # noqa: E731
     logs = [(t, 1.0 + 1e-4 * random.standard_normal((len(t), 3)))]
-    found = align(logs, still, (0.0, 20.0), search=False).to_dict()
+    found = align(logs, still, (0.0, 20.0), "recorded").to_dict()
     assert found["offset_s"] is None
     assert found["turn_deg"] is None
 

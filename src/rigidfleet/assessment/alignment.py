@@ -66,20 +66,28 @@ class Alignment(NamedTuple):
         }  # fmt: skip
 
 
-def align(logs: Logs, plan: PlanStates, span: tuple[float, float], *, search: bool) -> Alignment:
+def align(logs: Logs, plan: PlanStates, span: tuple[float, float], clock: str) -> Alignment:
     """The clock and the set-up of logs against a plan from when to when [s].
 
-    ``search`` : whether the clock may be far from that of the plan
+    ``clock``: "recorded", near that of the plan; "offset", anywhere; or "own", each log anywhere for itself
     """
     logs = [(t[:: -(-len(t) // _MANY)], x[:: -(-len(t) // _MANY)]) for t, x in logs]
     start = np.zeros(6)
-    start[0] = _nearest_offset(logs, plan, span) if search else 0.0
+    apart = np.zeros(len(logs))
+    if clock == "own":
+        for i, log in enumerate(logs):
+            apart[i] = _nearest_offset([log], lambda _, t, i=i: plan(i, t), span)
+        logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
+    start[0] = _nearest_offset(logs, plan, span) if clock == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
     whole, errors, left = _fit(logs, plan, span, start, every)
     own = np.empty((2, len(logs)))
     for i, log in enumerate(logs):
         alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, _OF_ONE)
         own[:, i] = np.where(np.isfinite(error[0]), [alone[0], error[0]], np.nan)
+    own[0] += apart
+    errors[0] = errors[0] if np.ptp(apart) == 0.0 else np.nan  # all have none in common
+    whole[0] += apart[0]
     fit = np.where(np.isfinite(errors), [whole, errors], np.nan)
     return Alignment(fit, own, _fit(logs, plan, span, start, ~every)[2], left)
 

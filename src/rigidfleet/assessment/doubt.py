@@ -93,6 +93,13 @@ class DrawnWays:
             return float(_lengths(shifts[:, 0, k, i] - shifts[:, 0, k, j]).max(initial=0.0))
         if _is_of_pairs(name):
             return 2.0 * most
+        if (
+            name == "people"
+        ):  # where a vehicle falls depends on its velocity, for the time of a fall
+            fall = math.sqrt(
+                2.0 * float(np.ptp(self.result.position[..., 2])) / self.result.mission.gravity
+            )
+            return most + fall * float(_lengths(shifts[:, 1]).max(initial=0.0))
         values = -self.measurements.close.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
             values = self.measurements.samples_of(name).rank
@@ -235,7 +242,13 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
         return
     explained = facts["alignment"]
     applied = _APPLIED[facts["clock"]]
-    if explained["offset_s"] is None:
+    if facts["clock"] == "own":
+        own = (
+            _lateness(*x["offset_s"]) if np.isfinite(x["offset_s"][0]) else "?"
+            for x in facts["vehicles"]
+        )
+        yield f"against the plan, clocks of vehicles are {', '.join(own)}; {applied}"
+    elif explained["offset_s"] is None:
         yield f"the offset of the clock cannot be told, as the plan hardly moves; {applied}"
     else:
         late = _lateness(*explained["offset_s"])

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
 _LIMITS = f"Further limits, KEY=VALUE, may be repeated: {', '.join(LIMITS_OF_CURVES)}."
 #: Options that say how files are read.
-_READ = ("interpolation", "spans", "gaps", "units", "axes")
+_READ = ("interpolation", "spans", "gaps", "units", "axes", "topic", "origin")
 
 
 def assess(
@@ -42,6 +42,8 @@ def assess(
     axes: str | None = None,
     noise: str | None = None,
     clock: Literal["recorded", "offset", "own"] | None = None,
+    topic: list[str] | None = None,
+    origin: tuple[float, float, float] | None = None,
     explain: bool = False,
     out: Path | None = None,
     figures: Literal["few", "all"] = "few",
@@ -54,9 +56,9 @@ def assess(
     ----------
     files : Path
         A result (NAME.nc), or trajectories: setpoints (CSV with columns time, x, y, z and, for several vehicles,
-        agent), Crazyswarm2's polynomials (CSV, one a vehicle), a Skybrush show (.skyc), ROS 2 poses (.mcap), or folders
-        of these. If the first is a mission (its name, or a .toml), or the result of one, the others are logs of what
-        flew it: they are judged against it, with doubt.
+        agent), Crazyswarm2's polynomials (CSV, one a vehicle), a Skybrush show (.skyc), a recording of ROS 2 (.mcap,
+        .db3), a log of an autopilot (.ulg, .tlog, .bin), or folders of these. If the first is a mission (its name, or a
+        .toml), or the result of one, the others are logs of what flew it: they are judged against it, with doubt.
     mission : str
         Judge trajectories by this mission's radii, limits and obstacles.
     separation : float
@@ -84,10 +86,17 @@ def assess(
     axes : str
         Where x, y and z of a table point: enu (east, north, up), ned, or three others of e, n, u, w, s and d. Default:
         enu.
+    topic : list
+        Topic or message of a log that has positions, such as XKF1 or '/cf*/pose'; may be repeated. Default: chosen, and
+        named in a note.
+    origin : str
+        Origin of positions of a log: latitude and longitude [deg], and height above mean sea level [m]. Default: the
+        mission's, that of the estimator, or the first place.
     noise : str
         Of measured positions: its standard deviation in a coordinate [m], and its correlation time [s] if it is known,
-        such as 0.003 or 0.003,0.2; or data: as the samples show it. What is judged then has an interval, and may be
-        undecided. Default: trajectories are exact; logs against a plan show their noise.
+        such as 0.003 or 0.003,0.2; log: as the log says; or data: as the samples show it. What is judged then has an
+        interval, and may be undecided. Default: trajectories are exact; of logs against a plan, log if it says it, or
+        data.
     clock : str
         Of logs against a plan: recorded (that of the plan), offset (one for all, which is estimated), or
         own (each vehicle has one; separation is then not judged). Default: recorded.
@@ -109,7 +118,7 @@ def assess(
     options: dict[str, Any] = {
         "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
         "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
-        "units": units, "axes": axes,
+        "units": units, "axes": axes, "topic": topic, "origin": origin,
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
     plan = len(files) > 1 and _is_plan(files[0])
@@ -125,6 +134,7 @@ def assess(
         verdict = judge(result)
     else:
         from rigidfleet.foreign.files import read_trajectories
+        from rigidfleet.mission import as_mission
 
         own = [key for key in _OWN if key in chosen]
         if (mission is not None or plan) and own:
@@ -138,12 +148,17 @@ def assess(
                 "--clock: needs a plan to compare clocks with; give a mission before the logs"
             )
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        read = read_trajectories(
-            files[plan:], **{key: options[key] for key in _READ if key in chosen}
-        )
+        place = mission if mission is not None else files[0] if plan else None
+        if origin is None and place is not None and Path(place).suffix != ".nc":
+            place = as_mission(str(place)).geodetic_origin
+            options["origin"] = place and (place.latitude_deg, place.longitude_deg, place.altitude)
+        own = {key: options[key] for key in _READ if options[key] is not None}
+        read = read_trajectories(files[plan:], **own)
+        if origin is not None and not any("origin" in part for part in read.read):
+            raise RigidfleetError("--origin: no file says where on the Earth it is; remove it")
         judged: dict[str, Any] = {} if plan else {
             "mission": mission, "separation": separation, "limits": _limits(limits or []) | higher,
-            "radius": radius or 0.0, "ground": ground, "name": _name(files[0]),
+            "radius": radius or 0.0, "ground": ground, "name": flight_name(files[0]),
         }  # fmt: skip
         doubts = _doubts(noise, clock) if noise or plan else None
         result, verdict = _judge(read, files[0] if plan else None, doubts, judged)
@@ -152,7 +167,7 @@ def assess(
         made.claim(replace=force)
     for part in verdict.read if explain and not json else ():
         for key, value in part.items():
-            words = ", ".join(value) if isinstance(value, list) else f"{value}"
+            words = ", ".join(map(str, value)) if isinstance(value, list) else f"{value}"
             line = f"{key.replace('_', ' ')}: {words}"
             console.out().print(line, highlight=False, markup=False, soft_wrap=True)
     console.show_verdict(verdict, json=json)
@@ -213,8 +228,8 @@ def _doubts(noise: str | None, clock: Literal["recorded", "offset", "own"] | Non
     """
     from rigidfleet.simulation.as_logged import Doubts
 
-    if noise is None or noise == "data":
-        return Doubts(None, None, clock or "recorded")
+    if noise in (None, "data", "log"):
+        return Doubts(noise or "", None, clock or "recorded")
     try:
         size, *more = (float(part) for part in noise.split(","))
     except ValueError:
@@ -222,9 +237,9 @@ def _doubts(noise: str | None, clock: Literal["recorded", "offset", "own"] | Non
     if not 0.0 < size < 1e3 or len(more) > 1 or not all(0.0 <= tau < 1e3 for tau in more):
         raise RigidfleetError(
             f"--noise {noise}: give a standard deviation [m], such as 0.003, with a correlation time [s] if it is"
-            " known: 0.003,0.2; or data"
+            " known: 0.003,0.2; or log, or data"
         )
-    return Doubts(size, *(more or [None]), clock or "recorded")
+    return Doubts(size, more[0] if more else None, clock or "recorded")
 
 
 def _limits(limits: list[str]) -> dict[str, float]:
@@ -248,7 +263,7 @@ def _limits(limits: list[str]) -> dict[str, float]:
     return by_key
 
 
-def _name(file: Path) -> str:
+def flight_name(file: Path) -> str:
     """The name of a flight after its file: files may have any characters, and names of missions only plain ones."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", file.resolve().stem).strip("._-")
     return plain or "trajectories"

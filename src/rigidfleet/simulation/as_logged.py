@@ -64,9 +64,9 @@ WORDS = "a smoothing spline, with doubt"
 
 
 class Doubts(NamedTuple):
-    """What a user states: noise [m] and its correlation time [s], None if samples are to show it; and the clock."""
+    """What is stated: the noise [m] or who tells it ("": the log, or else data), its correlation time [s], the clock."""
 
-    noise: float | None
+    noise: float | Literal["log", "data", ""]
     tau: float | None = None
     clock: Clock = "recorded"
 
@@ -92,6 +92,25 @@ def judge_log(
         words = f"has {plan.n_agents} agents, and the log {len(read.names)} vehicles"
         raise TrajectoryError(f"the plan {plan.mission.name!r} {words}. Give the log of each.")
     logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
+    told = [
+        x.deviation for x in read.measured if x.deviation is not None and (x.deviation > 0.0).all()
+    ]
+    if doubts.noise == "log" and len(told) < len(logs):
+        raise TrajectoryError(
+            f"{read.names[0]}: the log does not say its noise. State it: --noise."
+        )
+    if doubts.noise in ("log", "") and len(told) == len(logs):
+        # The least of a log is the unit.
+        least = float(min(x.min() for x in told))
+        doubts = doubts._replace(noise=least)
+        sizes = (np.sqrt((x**2).mean(axis=1)) / least for x in told)
+        logs = [log._replace(scale=size) for log, size in zip(logs, sizes, strict=True)]
+    if read.own_clocks:
+        if plan is None:
+            raise TrajectoryError(
+                "each vehicle has a clock of its own. Give a plan to compare them with."
+            )
+        doubts = doubts._replace(clock="own")
     step = max(_STEP, *(float(np.median(np.diff(log.time))) for log in logs))
     estimate = _noise_of_logs(logs, doubts, step)
     noise = estimate.noise or PositionNoise(math.nan)
@@ -99,7 +118,7 @@ def judge_log(
     alignment, offsets = None, np.zeros(len(logs))
     if planned is not None:
         smoothed = _smooth_all(logs, noise, step)
-        alignment = _alignment(smoothed, logs, planned, search=doubts.clock != "recorded")
+        alignment = _alignment(smoothed, logs, planned, doubts.clock)
         offsets = _offsets(alignment, doubts.clock)
         logs = [log._replace(time=log.time - by) for log, by in zip(logs, offsets, strict=True)]
     smoothed = _smooth_all(logs, noise, step)
@@ -149,10 +168,10 @@ def judge_log(
 def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts, step: float) -> NoiseEstimate:
     """The noise as it is stated, unless samples show more; or as they show it."""
     size, tau = doubts.noise, doubts.tau
-    if size is not None and tau is not None:
+    if not isinstance(size, str) and tau is not None:
         return NoiseEstimate(PositionNoise(size, tau), "stated", "")
     shown = noise_of(logs, None, step)
-    if size is None:
+    if isinstance(size, str):
         return shown
     if shown.noise is None or shown.noise.sigma <= _MORE * size:
         return noise_of(logs, size, step)
@@ -173,7 +192,7 @@ def _planned_ways(plan: Result) -> Piecewise:
 
 
 def _alignment(
-    smoothed: Sequence[Smoothed], logs: Sequence[Positions], planned: Piecewise, *, search: bool
+    smoothed: Sequence[Smoothed], logs: Sequence[Positions], planned: Piecewise, clock: Clock
 ) -> Alignment:
     alone = [Piecewise(planned.time, pieces) for pieces in planned.pieces[:, :, :3].swapaxes(0, 1)]
     places = []
@@ -181,7 +200,7 @@ def _alignment(
         t = np.arange(log.time[0], log.time[-1], _ALIGNED)
         places.append((t, each.way.at(t)))
     states = lambda i, t: tuple(alone[i].states(t, 2))  # noqa: E731
-    return align(places, states, (float(planned.time[0]), float(planned.time[-1])), search=search)
+    return align(places, states, (float(planned.time[0]), float(planned.time[-1])), clock)
 
 
 def _offsets(alignment: Alignment, clock: Clock) -> Floats:
@@ -238,7 +257,7 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
         raise TrajectoryError(f"the log covers {words}. If the clocks differ, say --clock offset.")
     time, at_phase = plan.time[inside], plan.phase[inside]
     begin, end = float(time[0]), float(time[-1])
-    watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, begin)
+    watch = CurveWatch(mission, begin)
     grid = np.arange(begin, end, _NEAR if mission.obstacles else np.inf)
     records = []
     for record in plan.phases[: at_phase[-1] + 1]:
