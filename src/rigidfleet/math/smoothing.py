@@ -107,7 +107,7 @@ def knots_over(time: Floats, zero: float, step: float) -> Floats:
     return zero + step * np.arange(first - 1.0, max(last, first + 1.0) + 2.0)
 
 
-class _Rows(NamedTuple):
+class _WhitenedRows(NamedTuple):
     """Whitened samples: rows of a banded system, (K, 8) from control points (K,) on, and what they give (K, 3)."""
 
     first: Ints
@@ -116,7 +116,7 @@ class _Rows(NamedTuple):
     deviance: float
 
     @classmethod
-    def of(cls, samples: Positions, noise: PositionNoise, knots: Floats) -> _Rows:
+    def of(cls, samples: Positions, noise: PositionNoise, knots: Floats) -> _WhitenedRows:
         h, spans, count = knots[1] - knots[0], len(knots) - 1, len(samples.time)
         span = np.clip(((samples.time - knots[0]) / h).astype(np.int64), 0, spans - 1)
         share = (samples.time - knots[0]) / h - span
@@ -176,7 +176,7 @@ def smooth(
 
     free = np.isnan(noise.sigma)
     unit = PositionNoise(1.0, noise.tau) if free else noise
-    rows, count = _Rows.of(samples, unit, knots), len(knots) + _POINTS - 2
+    rows, count = _WhitenedRows.of(samples, unit, knots), len(knots) + _POINTS - 2
     band, right = rows.normal_equations(count)
     whole, turns = count - 3, _TURNS if calm is None else 0
     calm = np.ones(whole) if calm is None else calm

@@ -64,7 +64,7 @@ WORDS = "a smoothing spline, with doubt"
 
 
 class Doubts(NamedTuple):
-    """What is stated: the noise [m] or who tells it ("": the log, or else data), its correlation time [s], the clock."""
+    """What is stated: the noise [m] or who tells it ("": the log or data), its correlation time [s], the clock."""
 
     noise: float | Literal["log", "data", ""]
     tau: float | None = None
@@ -92,18 +92,18 @@ def judge_log(
         words = f"has {plan.n_agents} agents, and the log {len(read.names)} vehicles"
         raise TrajectoryError(f"the plan {plan.mission.name!r} {words}. Give the log of each.")
     logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
-    told = [
+    own_sizes = [
         x.deviation for x in read.measured if x.deviation is not None and (x.deviation > 0.0).all()
     ]
-    if doubts.noise == "log" and len(told) < len(logs):
+    if doubts.noise == "log" and len(own_sizes) < len(logs):
         raise TrajectoryError(
             f"{read.names[0]}: the log does not say its noise. State it: --noise."
         )
-    if doubts.noise in ("log", "") and len(told) == len(logs):
+    if doubts.noise in ("log", "") and len(own_sizes) == len(logs):
         # The least of a log is the unit.
-        least = float(min(x.min() for x in told))
+        least = float(min(x.min() for x in own_sizes))
         doubts = doubts._replace(noise=least)
-        sizes = (np.sqrt((x**2).mean(axis=1)) / least for x in told)
+        sizes = (np.sqrt((x**2).mean(axis=1)) / least for x in own_sizes)
         logs = [log._replace(scale=size) for log, size in zip(logs, sizes, strict=True)]
     if read.own_clocks:
         if plan is None:
