@@ -12,6 +12,7 @@ from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
+from rigidfleet.kernel.control import local_law
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
     CONSTRAINT_FORCE,
@@ -31,9 +32,12 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
-from rigidfleet.kernel.problem import TRACKING
+from rigidfleet.kernel.neighbours import estimate_acceleration, hold_edges, solve_own_edges
+from rigidfleet.kernel.network import PULL, SATURATED, A, R, U, V, receive, send
+from rigidfleet.kernel.problem import SHAPE, TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
 from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
     mean_axes,
@@ -66,7 +70,7 @@ def path_at(k, i, q, tables):
 
 @jit
 def measure(k, flight, state):
-    """Measured states of all vehicles at tick k, into ``state.seen`` and, if vehicles are linked, ``state.heard``.
+    """Measured states of all vehicles at tick k, into ``state.seen``.
 
     States are kept as what they differ from a path by. A state that is old when it is used is then added to the path of
     now, not of then: a measurement that carries its time.
@@ -87,26 +91,6 @@ def measure(k, flight, state):
                 r, v = state.history[then, i, q], state.history[then, i, 3 + q]
                 state.seen[i, q] = r + (tables.noise_r[u, i, q] if noisy else 0.0)
                 state.seen[i, 3 + q] = v + (tables.noise_v[u, i, q] if noisy else 0.0)
-    if sensing.linked:
-        listen(k, flight, state)
-
-
-@jit
-def listen(k, flight, state):
-    """Messages that arrive at tick k: what vehicle i knows of the others, into ``state.heard[i]``."""
-    sensing, tables, depth = flight.sensing, flight.tables, state.sent.shape[0]
-    n, now = state.S.shape[0], k % depth
-    heard, u = k % sensing.link_every == 0, row_of(k, sensing.link_every, tables.first)
-    for j in range(n):
-        for q in range(6):
-            state.sent[now, j, q] = state.heard[j, j, q] = state.seen[j, q]
-    for i in range(n):
-        for j in range(n):
-            if not heard or i == j or (tables.unheard.shape[0] > 0 and tables.unheard[u, i, j]):
-                continue
-            then = (k - sensing.link_delay[i, j]) % depth
-            for q in range(6):
-                state.heard[i, j, q] = state.sent[then, j, q]
 
 
 # -- the formation law ---------------------------------------------------------------------------------
@@ -195,19 +179,68 @@ def worse(i, kind, value, t, state):
 
 
 @jit
-def presume(k, w, flight, state):
-    """Let vehicles without a link take each other to be as far off their slots at tick k as they are themselves.
+def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
+    """Desired force of each vehicle from its own measured state, the plan and its neighbours' messages.
 
-    States that are measured about the slots differ by nothing else; otherwise the slots are those last evaluated.
+    ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
     """
-    pairs, heard, about = flight.sensing.parted, state.heard, flight.tables.path.shape[0] > 0
-    for row in range(pairs.shape[0]):
-        for side in range(2):
-            i, j = pairs[row, side], pairs[row, 1 - side]
+    net, mail, tick = flight.network, state.mail, flight.steps * flight.h
+    state.work.law_time[0] = t
+    known_states(k, w, flight, state)
+    if p.reference.kind == SHAPE or p.control.kind == TRACKING:
+        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    if p.control.kind == TRACKING:
+        local_law(t, p, w)
+    else:
+        for i in range(state.S.shape[0]):
             for q in range(3):
-                r = 0.0 if about else w.r_ref[j, q] - w.r_ref[i, q]
-                v = 0.0 if about else w.v_ref[j, q] - w.v_ref[i, q]
-                heard[i, j, q], heard[i, j, 3 + q] = heard[i, i, q] + r, heard[i, i, 3 + q] + v
+                w.f_u[i, q] = p.control.force[i, q]
+    distance_references(
+        t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
+    )
+    state.integral[:] = 0.0
+    last = mail.multiplier.shape[1] - 1
+    for i in range(state.S.shape[0]):
+        if flight.vehicles.lost[i]:
+            continue
+        estimate_acceleration(i, dt, w.v[i], net, mail)
+        hold_edges(i, k, flight.every, net, mail)
+        solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
+        take_force(k, i, dt, p, w, flight, state)
+        for q in range(3):
+            mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
+        mail.commanded[i, 2] -= p.vehicles.g
+        for l in range(net.first[i], net.first[i + 1]):
+            if mail.edge[l] >= 0:
+                state.integral[mail.edge[l]] += 0.5 * mail.multiplier[l, last]
+
+
+@jit
+def known_states(k, w, flight, state):
+    """Measured states of vehicles at tick k, each of its own, into w.r and w.v."""
+    for i in range(state.S.shape[0]):
+        for q in range(3):
+            w.r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
+            w.v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+
+
+@jit
+def post(k, p, w, flight, state):
+    """Have ready what each vehicle could send at tick k: what it knows of itself, and what it does."""
+    mail, row = state.mail, k % state.mail.due.shape[1]
+    known_states(k, w, flight, state)
+    for i in range(state.S.shape[0]):
+        message, m = mail.post[row, i], p.vehicles.inverse[i]
+        for q in range(3):
+            message[R + q], message[V + q] = w.r[i, q], w.v[i, q]
+            message[A + q] = mail.commanded[i, q] + mail.estimate[i, 3 + q]
+            message[U + q] = m * state.f_u[i, q]
+        message[SATURATED] = 1.0 if state.saturated[i] else 0.0
+        for q in range(mail.pull.shape[1]):
+            message[PULL + q] = mail.pull[i, q]
+    for l in range(mail.multiplier.shape[0]):
+        for q in range(mail.multiplier.shape[1]):
+            mail.posted[row, l, q] = mail.multiplier[l, q]
 
 
 @jit
@@ -215,18 +248,13 @@ def desire(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if there are none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
-    linked = flight.sensing.linked
-    if flight.sensing.parted.shape[0] > 0 and flight.tables.path.shape[0] == 0:  # slots of now
-        evaluate_law(k, t, state.seen, state.integral[0], p, w, flight, state, call)
-    presume(k, w, flight, state)
-    for i in range(n if linked else 1):
-        known = state.heard[i] if linked else state.seen
-        integral = state.integral[i]
-        evaluate_law(k, t, known, integral, p, w, flight, state, call)
-        integrate_constraints(dt, integral, p, w, state)
-        for j in range(n):
-            if j == i or not linked:
-                take_force(k, j, dt, p, w, flight, state)
+    if flight.network.every > 0:
+        evaluate_by_neighbours(k, t, dt, p, w, flight, state)
+    else:
+        evaluate_law(k, t, state.seen, state.integral, p, w, flight, state, call)
+        integrate_constraints(dt, state.integral, p, w, state)
+        for i in range(n):
+            take_force(k, i, dt, p, w, flight, state)
     if p.has_frame:
         for i in range(n):
             for q in range(3):
@@ -262,6 +290,8 @@ def advance_frame(t, p, state):
 def tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     measure(k, flight, state)
+    if flight.network.every > 0:
+        receive(k, flight.network, state.mail)
     due = flight.commands.kind == FORCE and k % flight.every == 0
     if due and not desire(k, t, p, w, flight, state, call):
         return False
@@ -269,6 +299,10 @@ def tick(k, t, p, w, flight, state, call):
         state.saturated[i] = steer(k, i, flight, state)
         if state.saturated[i]:
             state.saturations[i] += 1
+    if flight.network.every > 0:
+        post(k, p, w, flight, state)
+        if k % flight.network.every == 0:
+            send(k, state.S, flight.vehicles.lost, flight.network, state.mail)
     return True
 
 
@@ -342,8 +376,8 @@ def write_samples(t, h, p, flight, state, call):
             call.saturated[c, i] = state.saturated[i]
             call.layers[c, i] = state.layers[i]
         write_derivatives(c, t + x, p, flight, state, call)
-        for k in range(state.integral.shape[1]):
-            call.integral[c, k] = state.integral[0, k]
+        for k in range(state.integral.shape[0]):
+            call.integral[c, k] = state.integral[k]
         for q in range(4):
             call.frame[c, q] = (
                 state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]

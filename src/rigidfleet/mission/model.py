@@ -529,8 +529,7 @@ class Mission(Contents, Shown):
     @cached_property
     def links_lost(self) -> tuple[Ints, Floats]:
         """The links that are lost: pairs (L, 2) of agents from 0, i < j, and times (L,) [s]."""
-        d = self.disturbances
-        lost = d.links.lost if d is not None and d.links is not None else ()
+        lost = self.network.lost if self.network is not None else ()
         pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
         return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
 

@@ -55,6 +55,7 @@ from rigidfleet.mission.values import (
     Rate,
     Rest,
     RotorSpeeds,
+    Seconds,
     Seed,
     Share,
     Size,
@@ -671,21 +672,59 @@ class LostLink(Part):
     time: Time = Field(description="mission time of the loss [s], > 0")
 
 
-class Links(Part):
-    """What vehicles know of each other: states sent at a fixed rate, which arrive late or not at all."""
+class Outage(Part):
+    """A time without messages: between two vehicles, from and to one, or everywhere."""
 
-    delay: Delay = Field(0.0, description="age of a state when it arrives [s]")
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
-        50.0, description="states sent per second [Hz], at most 1000"
+    between: tuple[Whole, ...] = Field(
+        (), description="one or two agents, counted from 1; default: all", max_length=2
     )
-    dropped: Share = Field(0.0, description="share of the states that are lost, 0 to 0.95")
+    start: Seconds = Field(description="mission time from which no message is sent [s]")
+    end: Time = Field(description="mission time from which messages are sent again [s]")
+
+
+class Network(Part):
+    """How vehicles know each other: each computes its force from its own state and its neighbours' messages."""
+
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
+        50.0, description="broadcasts of each vehicle a second [Hz], at most 1000"
+    )
+    delay: Delay = Field(0.0, description="time from a broadcast to its arrival [s]")
+    jitter: Delay = Field(
+        0.0,
+        description="greatest time by which a message is later than that [s]: each is by a share of its own, so that "
+        "messages may overtake each other",
+    )
+    loss: Share = Field(0.0, description="share of the messages that a link loses, 0 to 0.95")
+    burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = Field(
+        None,
+        description="mean number of messages lost one after the other; default: losses are independent",
+    )
+    range: Length | None = Field(
+        None, description="distance beyond which no message is heard [m]; default: none"
+    )
+    budget: Annotated[float, Strict(), Field(gt=0)] | None = Field(
+        None,
+        description="broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
+        "no limit",
+    )
+    silence: Time = Field(
+        0.5, description="time without a message after which a vehicle lets go of an edge [s]"
+    )
     seed: Seed = Field(
-        0, description="seed of the random numbers; the same seed loses the same states"
+        0, description="seed of the random numbers; the same seed loses the same messages"
+    )
+    outages: tuple[Outage, ...] = Field(
+        (),
+        description="times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`",
     )
     lost: tuple[LostLink, ...] = Field(
         (),
         description="links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`",
     )
+
+    def sent_rate(self, n: int) -> float:
+        """Broadcasts of each of n vehicles a second [Hz] that the medium carries."""
+        return self.rate if self.budget is None else min(self.rate, self.budget / n)
 
 
 class Lost(Part):
@@ -714,11 +753,6 @@ class Disturbances(Part):
     )
     gusts: Gusts | None = Field(None, description="gusts: [disturbances.gusts]")
     noise: Noise | None = Field(None, description="measurement noise: [disturbances.noise]")
-    links: Links | None = Field(
-        None,
-        description="links between vehicles, only with [vehicles]: [disturbances.links]; default: each knows the "
-        "others as they know themselves",
-    )
     downwash: Flag = Field(
         False,
         description="true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]",
@@ -863,6 +897,10 @@ class Contents(MissionHeader):
     )
     geodetic_origin: GeodeticOrigin | None = Field(
         None, description="place of the origin on the Earth, for exports: [geodetic_origin]"
+    )
+    network: Network | None = Field(
+        None,
+        description="messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
     )
     disturbances: Disturbances | None = Field(
         None, description="wind, gusts, noise, mass errors, lost vehicles: [disturbances]"

@@ -114,12 +114,11 @@ def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGai
     c = mission.constraint
     k1, k2 = mission.tracking_gains
     on = float(c.stabilisation == "pid")
-    d = mission.disturbances
-    links = None if d is None else d.links
+    net = mission.network
     return LoopGains(
         ki=mission.tracking.integral,
         # A state waits for half a period on average until it is sent.
-        link=0.0 if links is None else links.delay + 0.5 / links.rate,
+        link=0.0 if net is None else net.delay + 0.5 / net.sent_rate(mission.n_agents),
         alpha=on * c.alpha,
         beta=on * c.beta,
         gamma=on * c.gamma,

@@ -12,12 +12,12 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.problem import TRACKING, Problem
+from rigidfleet.kernel.network import assign_edges
+from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
-from rigidfleet.planning.reference import ByEdge
 from rigidfleet.planning.vehicles import TickTables, YawTurn, first_yaw, sampled_flight, turn_from
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
@@ -52,7 +52,6 @@ class FleetState:
         yaw = float(self.yaw[0])
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
-        self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
         self.output_step = mission.output_step
         self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
@@ -94,35 +93,28 @@ class SampledPhase(Stepper):
         phase.state = phase.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
         lost = self.flight.vehicles._replace(lost=phase.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
-        if phase.parted.any():
-            parted = np.ascontiguousarray(plan.links_lost[0][phase.parted])
-            sensing = self.flight.sensing._replace(parted=parted)
-            self.flight = self.flight._replace(sensing=sensing)
-            phase.evaluate()  # the slots by which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], fleet_state.state
-        begun = fleet.begin(self.flight, fleet_state.S, phase.workspace, frame=frame)
+        law = plan.problem.law
+        begun = fleet.begin(
+            self.flight, fleet_state.S, phase.workspace, frame=frame,
+            iterations=law.iterations if law.solver == ITERATED else 1,
+        )  # fmt: skip
         if before is None:
             begun.integral[:] = integral
         else:
             renewed = fleet.under_problem(before, phase.workspace, integral, frame=frame)
-            if phase.parted.any():  # without a link, vehicles do not come to the same integrals
-                own = [
-                    ByEdge().with_values(fleet_state.edges, x).of(plan.edges, integral)
-                    for x in before.integral
-                ]
-                renewed.integral[:] = own
             if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
+        assign_edges(self.flight.network, begun.mail, plan.edges, integral)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
         )
         if fleet_state.avoidance is not None:
             fleet_state.avoidance = avoidance.holding(fleet_state.avoidance, m)
-        fleet_state.edges = plan.edges
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
             self.gone = phase.lost.copy()  # (N,) vehicles that do not fly in this phase
@@ -292,7 +284,7 @@ class SampledPhase(Stepper):
         if planned is not self.tabled and source.compensated:
             moved = source.start_path(planned, tick)
             s = self.sampled
-            for known in (s.seen, s.history, s.sent, s.heard):
+            for known in (s.seen, s.history):
                 np.add(known, moved, out=known)
         # A piece of a reference that is led holds until the next stop
         until = self.phase.plan.t_end
@@ -307,7 +299,7 @@ class SampledPhase(Stepper):
         plan, state, sampled = self.phase.plan, self.phase.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y
         y[: 3 * n], y[3 * n : 6 * n] = sampled.S[:, :3].ravel(), sampled.S[:, 3:6].ravel()
-        y[6 * n : 6 * n + m] = sampled.integral[0]
+        y[6 * n : 6 * n + m] = sampled.integral
         if plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
         state.clock[records.TIME] = sampled.clock[fleet.TIME]

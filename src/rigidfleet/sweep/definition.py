@@ -47,7 +47,7 @@ _LEAST = 2.0**-54
 #: Greatest number of runs.
 _RUNS = 10**8
 #: Tables with seeds of random numbers.
-_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("disturbances", "links"), ("avoidance",)  # fmt: skip
+_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("network",), ("avoidance",)
 #: Keys that stores have since there are any: they are kept where they are not their defaults.
 _LATER = {"random_numbers", "controller", "rate"}
 
@@ -71,7 +71,7 @@ class SweepHeader(Part):
     )
     random_numbers: Literal["shared", "own"] = Field(
         "shared",
-        description="of noise, gusts and links: shared: every run has the seeds of the mission, so that runs differ "
+        description="of noise, gusts and network: shared: every run has the seeds of the mission, so that runs differ "
         "only in what varies; own: each run has a seed of its own",
     )
     controller: str = Field(
@@ -237,7 +237,7 @@ class Sweep:
 
     @property
     def random(self) -> bool:
-        """Whether the first run has random numbers: of noise, gusts, links or sensing."""
+        """Whether the first run has random numbers: of noise, gusts, network or sensing."""
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.varied(0), keys) for keys in tables)
 
