@@ -119,7 +119,9 @@ def send(k, S, silent, net, mail):
             continue
         late = int(chance(net.seed, _WAITS, net.links[l], k) * (net.jitter + 1))
         slot = (k + net.delay + late) % mail.due.shape[1]
-        mail.due[l, slot] = max(mail.due[l, slot], k)
+        if mail.due[l, slot] != _NEVER:  # an older one that arrives at the same tick
+            mail.count[HEARD, l] += 1
+        mail.due[l, slot] = k
 
 
 @jit
