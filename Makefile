@@ -8,12 +8,12 @@ BIN := .venv/bin
 export UV_PYTHON_DOWNLOADS := never
 INSTALL := $(BIN)/uv pip install --quiet --python $(BIN)/python \
 	--constraints constraints.txt --build-constraints constraints.txt --editable .
-# The wheel is built from the sdist, which so proves to be whole.
+# The wheel is built from the sdist, which so proves to be whole. Its machine code takes some minutes.
 BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test door bench peers robustness avoidance exports replays docs package lint format constraints clean
+.PHONY: help setup demo test versions door bench peers robustness avoidance exports replays docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -26,6 +26,9 @@ demo: .venv/.core  ## Fly the paper's narrow passage
 test: .venv/.dev  ## Run the tests (MARK= runs the long ones, too)
 	@$(BIN)/python -m pytest -n $(JOBS) -m "$(MARK)"
 
+versions: .venv/.uv  ## Fly with the lowest versions and the newest, on every Python found
+	@$(BIN)/python tests/versions.py
+
 door: .venv/.dev  ## Give 2,000 mutants of known flights to `assess`
 	@$(BIN)/python tests/door.py
 
@@ -33,6 +36,7 @@ bench: .venv/.vehicles  ## Measure the speed, as ratios
 	@$(BIN)/python benchmarks/run.py
 	@$(BIN)/python benchmarks/many.py
 	@$(BIN)/python benchmarks/vehicles.py
+	@$(BIN)/python benchmarks/wheel.py
 
 peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH)
 	@$(BIN)/python benchmarks/compare.py
@@ -74,10 +78,12 @@ format: .venv/.dev  ## Rewrite the code in the project's style
 	@$(BIN)/ruff check --fix
 	@$(BIN)/ruff format
 
-constraints: .venv/.dev  ## Choose newer versions of all packages
+constraints: .venv/.dev  ## Choose newer versions of all packages, and the lowest that are declared
 	@$(BIN)/uv pip compile --quiet --universal --upgrade --no-header --no-annotate \
 		--all-extras --group dev --group peers --group crowds --group vehicles --group interchange --group oracles --group docs --group build \
 		pyproject.toml --output-file constraints.txt
+	@$(BIN)/uv pip compile --quiet --python-version 3.11 --resolution lowest-direct --upgrade --no-header --no-annotate \
+		--all-extras pyproject.toml --output-file constraints-lowest.txt
 
 clean:  ## Remove .venv, caches and builds
 	@rm -rf .venv .pytest_cache .ruff_cache .import_linter_cache build dist site

@@ -29,6 +29,8 @@ from scipy_peer import Literal, Peer, constant, squared
 
 from rigidfleet.assessment import assess
 from rigidfleet.formation import distance_geometry
+from rigidfleet.formation.shapes import slots
+from rigidfleet.interchange import FormatName, export
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.tracer import Code, Trace
@@ -37,7 +39,9 @@ from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
+from rigidfleet.preflight.check import check
 from rigidfleet.result import Result
+from rigidfleet.rigidity.design import design
 from rigidfleet.simulation.ensemble import establish
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.sweep import Sweep, fly
@@ -49,6 +53,14 @@ DURATION, SAMPLES = 20.0, 200
 FLIGHTS, SCIPYS = 1000, 5
 RTOL, ATOL = 1e-6, 1e-8
 SPREAD = 0.25
+#: Missions whose runs of a sweep take long, with the time of one that is asked for [s], and the number of their rounds.
+OTHER_MISSIONS = {
+    "passage-quadrotors": 0.15,
+    "cube-passage-quadrotors": 0.22,
+    "moving-obstacles": 0.8,
+    "narrow-passage-found": 0.012,
+}
+OTHER_ROUNDS = 3
 #: Flights in wind of a round, and the number of these rounds; runs of a sweep in another one, whole groups of eight.
 WINDY, WINDY_ROUNDS, RUNS = 10_000, 3, 96
 #: Missions flown, and their agents.
@@ -331,6 +343,22 @@ def missions(rounds: int) -> list[Row]:
     def of_sweep(k: int) -> float:
         return seconds(lambda: fly_runs(sweep, range(RUNS * k, RUNS * (k + 1)))) / RUNS
 
+    others = {
+        other: Sweep.of(other, vary=[gain], runs=8 * (OTHER_ROUNDS + 1), seed=1)
+        for other in OTHER_MISSIONS
+    }
+
+    def of_other(other: str, k: int) -> float:
+        if k == 0:
+            fly_runs(others[other], range(8 * OTHER_ROUNDS, 8 * (OTHER_ROUNDS + 1)))
+        return seconds(lambda: fly_runs(others[other], range(8 * k, 8 * k + 8))) / 8
+
+    large, sphere = simulate("show-1000"), slots("sphere", [4.0], 30)
+
+    def of_export(kind: FormatName, k: int) -> float:
+        with tempfile.TemporaryDirectory() as folder:
+            return seconds(lambda: export(large, Path(folder, "show"), kind))
+
     def judged(results: list[Result]) -> float:
         return seconds(lambda: [assess(result) for result in results], 0.1) / len(results)
 
@@ -340,12 +368,25 @@ def missions(rounds: int) -> list[Row]:
                 f"{name}, {lasts:.0f} s, a run of a sweep", of_sweep, lasts, 10_000.0,
                 "against the time that it lasts, on one core: plan, flight, record, verdict, metrics",
             ),
+            *(
+                Goal(f"{other}, a run of a sweep", partial(of_other, other), most, 1.0, rounds=OTHER_ROUNDS)
+                for other, most in OTHER_MISSIONS.items()
+            ),
             Goal(f"simulate() of {name}", lambda k: seconds(lambda: simulate(name), 0.1), lasts, None),
             Goal(
                 f"assess() of {name}", lambda k: judged(flown), 2e-3, 1.0,
                 "two flights by turns, so that none takes over what was just computed of its own numbers",
             ),
             Goal("  right after its flight", lambda k: judged(flown[:1]), 2e-3, 1.0),
+            Goal(
+                "check of cube-passage-quadrotors",
+                lambda k: seconds(lambda: check("cube-passage-quadrotors")), 1.0, 1.0,
+            ),
+            Goal("design of a sphere of 30", lambda k: seconds(lambda: design(sphere)), 1.5, 1.0),
+            *(
+                Goal(f"export of show-1000, {kind}", partial(of_export, kind), 5.0, 1.0, rounds=WINDY_ROUNDS)
+                for kind in ("skyc", "polynomial")
+            ),
             Goal(
                 f"{WINDY:,} flights of windy-passage", windy, 60.0, 1.0,
                 "seeds and masses varied, kept in the store, all cores; the whole command, from its process' start"

@@ -1,10 +1,11 @@
 """Faults put into the code that carries the guarantee and the verdict, and whether the tests notice them.
 
-`python tests/mutants.py` draws 100 mutants by a seed, over guard, barriers, monitor and checks in proportion to their
-lines of code. Each is put into a copy of the package, and the tests that concern it run until one fails. It writes a
-line of JSON for each, and lists the survivors at the end; each calls for a test, or for the proof that nothing
-changes. Two processes take about half an hour. `--count`, `--seed` and `--jobs` are as they say, `--only 3 7` takes
-some of those drawn, `--list` runs none.
+`python tests/mutants.py --into FILE` draws 100 mutants by a seed, over guard, barriers, monitor and checks in
+proportion to their lines of code, and tests each. It writes a line of JSON for each into the file, goes on there if it
+was stopped, tests survivors again, and lists those that are left. Each calls for a test, or for an entry in
+`mutants.toml` with the proof that nothing changes. `--count`, `--seed` and `--jobs` are as they say, a mutant on which
+the tests have spent `--most` seconds survives, `--only 3 7` takes some of those drawn, `--list` runs none, and
+`--as-is` tells which tests pass without a fault, and how long they take.
 
 The operators:
 
@@ -19,8 +20,11 @@ The operators:
 - refuse: a condition of `if` or `while` is negated;
 - drop: a statement that changes something goes: a call, `+=` and the like, `continue`, an assignment to an element.
 
-Mutants of the kernel are not compiled. Flights are flown by the machine code of the code without faults, and call the
-mutated functions as plain Python, on their own arrays (`use_plain_functions`).
+How it is done: a process collects the tests that concern a file, and runs each once to learn which of its functions it
+calls. For a mutant, it forks, puts the code of the changed function in the place of the old one, and runs the tests
+that call it, the quickest first, until one fails. Nothing is compiled: flights are flown by the machine code of the
+code without faults, and call the functions under test as plain Python, on their own arrays (`fly_with`). Tests that
+fail or take too long in this way without a fault are left out. Time is that of the processor.
 """
 
 from __future__ import annotations
@@ -29,17 +33,21 @@ import argparse
 import ast
 import copy
 import ctypes
+import hashlib
+import importlib
 import json
 import os
-import shutil
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+import tomllib
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,32 +55,43 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "rigidfleet"
-#: Time after which a test run counts as one that fails [s]: a mutant that does not end is noticed.
-LIMIT = 240.0
-#: Variable that says which code plain functions fly with.
-_PLAIN = "RIGIDFLEET_PLAIN_FUNCTIONS"
+#: Processor time from which on a test is left out [s].
+LONGEST = 3.0
+#: Processor time after which a test with a fault counts as one that does not end: so many times its own, and more [s].
+TIMES, MORE = 4.0, 3.0
+#: Examples that property tests try.
+EXAMPLES = 20
+#: Variable with what a process that tests mutants is to do.
+_TASK = "RIGIDFLEET_MUTANTS"
 
 
 class Target(NamedTuple):
-    """A file to mutate, the tests that concern it, and whether they fly with its functions as plain Python."""
+    """A file to mutate, the tests that concern it, and which functions flights call as plain Python."""
 
     file: str
     tests: tuple[str, ...]
-    plain: bool
+    plain: str
 
 
-_GUARD = ("tests/test_avoidance.py", "tests/test_moving.py")
-_MONITOR = ("tests/test_extremes.py", "tests/test_between.py")
+_GUARD = ("test_guard.py", "test_avoidance.py", "test_moving.py")
+_MONITOR = ("test_monitor.py", "test_between.py", "test_trajectories.py")
 TARGETS = (
-    Target("kernel/guard.py", _GUARD, True),
-    Target("kernel/barriers.py", _GUARD, True),
-    Target("kernel/monitor.py", _MONITOR, True),
-    Target("assessment/checks.py", ("tests/test_assess.py", *_MONITOR[1:]), False),
+    Target("kernel/guard.py", _GUARD, "guard"),
+    Target("kernel/barriers.py", _GUARD, "guard"),
+    Target("kernel/monitor.py", _MONITOR, "monitor"),
+    Target(
+        "assessment/checks.py",
+        (
+            "test_assess.py",
+            "test_assess_files.py",
+            "test_losses.py",
+            "test_quantities.py",
+            "test_spans.py",
+            *_MONITOR[1:],
+        ),
+        "",
+    ),
 )
-#: Tests that start processes of their own, which would compile the mutant, or that take too long uncompiled.
-NOT_PLAIN = "not large and not side_by_side and not ball and not one_obstacle and not brake_in_time and not same_seed"
-#: Tests that come last, since they take longest, and examples that property tests then try.
-_LAST, _EXAMPLES = "nobody_collides", 20
 
 _EDGE = {
     ast.Lt: ast.LtE,
@@ -100,13 +119,6 @@ class Site(NamedTuple):
     node: int
     operator: str
     line: int
-
-
-class Mutant(NamedTuple):
-    """A fault in a file."""
-
-    target: Target
-    site: Site
 
 
 # -- faults ------------------------------------------------------------------------------------------
@@ -209,130 +221,238 @@ def mutated(tree: ast.Module, site: Site) -> ast.Module:
     return ast.fix_missing_locations(tree)
 
 
+class Mutant(NamedTuple):
+    """A fault in a file: its number among those drawn, the function, and its statement without and with the fault."""
+
+    number: int
+    target: Target
+    site: Site
+    function: str
+    before: str
+    after: str
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What it is, wherever it stands."""
+        return self.target.file, self.function, self.before, self.after
+
+    def to_dict(self) -> dict[str, Any]:
+        """A mutant, to read."""
+        file, function, before, after = self.key
+        return {
+            "number": self.number, "file": file, "line": self.site.line, "function": function,
+            "operator": self.site.operator, "from": before, "to": after,
+        }  # fmt: skip
+
+
 def code_lines(tree: ast.Module) -> int:
     """Lines on which code of functions stands."""
     return len({site.line for site in sites_of(tree)})
 
 
+@cache
 def draw(count: int, seed: int) -> list[Mutant]:
     """Mutants drawn by a seed, in proportion to the lines of code of each file; no place and operator twice."""
     rng = np.random.default_rng(seed)
     trees = [ast.parse((PACKAGE / target.file).read_text()) for target in TARGETS]
     lines = np.array([code_lines(tree) for tree in trees])
     bounds = np.round(np.concatenate([[0], np.cumsum(lines)]) / lines.sum() * count).astype(int)
-    mutants = []
+    mutants: list[Mutant] = []
     for target, tree, number in zip(TARGETS, trees, np.diff(bounds), strict=True):
         sites = sites_of(tree)
-        mutants += [Mutant(target, sites[k]) for k in rng.permutation(len(sites))[:number]]
+        for k in rng.permutation(len(sites))[:number]:
+            changed = mutated(tree, sites[k])
+            function = function_at(tree, sites[k].line).name
+            texts = [ast.unparse(named(x, function)).splitlines() for x in (tree, changed)]
+            pairs = [(a.strip(), b.strip()) for a, b in zip(*texts, strict=False) if a != b]
+            mutants.append(
+                Mutant(len(mutants), target, sites[k], function, *(pairs or [("", "")])[0])
+            )
     return mutants
 
 
-def change(mutant: Mutant) -> tuple[str, str]:
-    """The statement of a fault, without and with it."""
-    tree = ast.parse((PACKAGE / mutant.target.file).read_text())
-    lines = [ast.unparse(x).splitlines() for x in (tree, mutated(tree, mutant.site))]
-    pairs = [(a.strip(), b.strip()) for a, b in zip(*lines, strict=False) if a != b]
-    return pairs[0] if pairs else ("", "")
+def function_at(tree: ast.Module, line: int) -> ast.FunctionDef:
+    """The function of a module that a line is in."""
+    return next(
+        x
+        for x in tree.body
+        if isinstance(x, ast.FunctionDef) and x.lineno <= line <= (x.end_lineno or 0)
+    )
 
 
-# -- a mutant among the tests ------------------------------------------------------------------------
+def named(tree: ast.Module, name: str) -> ast.FunctionDef:
+    """The function of a module with a name."""
+    return next(x for x in tree.body if isinstance(x, ast.FunctionDef) and x.name == name)
 
 
-def copy_to(folder: Path) -> None:
-    """A copy of the package with its tests."""
-    for name in ("src", "tests", "benchmarks", "examples"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    shutil.copy(ROOT / "pyproject.toml", folder)
+def proved() -> dict[tuple[str, str, str, str], str]:
+    """Mutants that change nothing, each with the reason."""
+    table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
+    return {(x["file"], x["function"], x["from"], x["to"]): x["reason"] for x in table["equal"]}
 
 
-def test(mutant: Mutant | None, target: Target, folder: Path) -> dict[str, Any]:
-    """Run the tests that concern a mutant in a copy of the package; without a mutant, those of the code as it is."""
-    file = folder / "src" / "rigidfleet" / target.file
-    source = (PACKAGE / target.file).read_text()
-    if mutant is not None:
-        file.write_text(ast.unparse(mutated(ast.parse(source), mutant.site)))
-    path = os.pathsep.join([str(folder / "src"), str(folder / "tests")])
-    env = os.environ | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
-    options = ["-q", "-x", "-p", "no:cacheprovider", *target.tests]
-    if target.plain:
-        env |= {"NUMBA_DISABLE_JIT": "1", _PLAIN: digest()}
-        options += ["-p", "mutants", "-k", NOT_PLAIN]
-    begun = time.monotonic()
-    try:
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", *options],
-            cwd=folder, env=env, capture_output=True, text=True, timeout=LIMIT, check=False,
-        )  # fmt: skip
-        code, words = done.returncode, done.stdout.splitlines()
-    except subprocess.TimeoutExpired:
-        code, words = -1, []
-    finally:
-        file.write_text(source)
-    failed = [line for line in words if line.startswith(("FAILED", "ERROR"))] or words[-1:]
-    return {
-        "killed": code != 0,
-        "by": failed[0] if failed else "",
-        "s": round(time.monotonic() - begun),
-    }
+def put_in(mutant: Mutant) -> None:
+    """Put the code of a function with a fault in the place of its own."""
+    path = PACKAGE / mutant.target.file
+    tree = mutated(ast.parse(path.read_text()), mutant.site)
+    every = compile(tree, str(path), "exec").co_consts
+    code = next(x for x in every if getattr(x, "co_name", None) == mutant.function)
+    name = "rigidfleet." + mutant.target.file.removesuffix(".py").replace("/", ".")
+    getattr(importlib.import_module(name), mutant.function).__code__ = code
 
 
-def run(mutants: list[tuple[int, Mutant]], jobs: int) -> list[tuple[int, Mutant]]:
-    """Test mutants, so many at a time; write what came of each, and return the survivors."""
-    folders: SimpleQueue[Path] = SimpleQueue()
-    survivors = []
-    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as pool:
-        for job in range(jobs):
-            copy_to(Path(name, str(job)))
-            folders.put(Path(name, str(job)))
-
-        def one(numbered: tuple[int, Mutant]) -> None:
-            number, mutant = numbered
-            folder = folders.get()
-            try:
-                outcome = test(mutant, mutant.target, folder)
-            finally:
-                folders.put(folder)
-            print(json.dumps(described(number, mutant) | outcome), flush=True)
-            if not outcome["killed"]:
-                survivors.append(numbered)
-
-        list(pool.map(one, mutants))
-    return sorted(survivors, key=lambda numbered: numbered[0])
+# -- tests in processes of their own -----------------------------------------------------------------
 
 
-def described(number: int, mutant: Mutant) -> dict[str, Any]:
-    """A mutant, to read."""
-    before, after = change(mutant)
-    place = f"{mutant.target.file}:{mutant.site.line}"
-    return {
-        "number": number,
-        "at": place,
-        "operator": mutant.site.operator,
-        "from": before,
-        "to": after,
-    }
+def forked(tasks: list[Any], work: Callable[[Any, Path], None], jobs: int) -> Iterator[Any]:
+    """Do work on each task in a process of its own; what it wrote of it (None: nothing), and its time [s]."""
+    running: dict[int, tuple[Any, Path]] = {}
+    waiting = list(tasks)
+    with tempfile.TemporaryDirectory() as folder:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                task, out = waiting.pop(0), Path(folder, str(len(waiting)))
+                sys.stdout.flush()
+                if (pid := os.fork()) == 0:
+                    null = os.open(os.devnull, os.O_WRONLY)
+                    for stream in (1, 2):
+                        os.dup2(null, stream)
+                    try:
+                        work(task, out)
+                    finally:
+                        os._exit(0)
+                running[pid] = task, out
+            pid, _, used = os.wait4(-1, 0)
+            task, out = running.pop(pid)
+            wrote = json.loads(out.read_text()) if out.exists() else None
+            yield task, wrote, round(used.ru_utime + used.ru_stime, 2)
+
+
+def passes(session: pytest.Session, item: pytest.Item) -> bool:
+    """Whether a test passes; one that is skipped does."""
+    failed = session.testsfailed
+    item.config.hook.pytest_runtest_protocol(item=item, nextitem=None)
+    return session.testsfailed == failed
+
+
+def limit_time(seconds: float, out: Path, words: str) -> None:
+    """End this process after so much of its time [s], with these words; machine code that hangs a little later."""
+
+    def end(*_: Any) -> None:
+        out.write_text(words)
+        os._exit(0)
+
+    signal.signal(signal.SIGPROF, end)
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    most = int(used.ru_utime + used.ru_stime + seconds) + 5
+    resource.setrlimit(resource.RLIMIT_CPU, (most, resource.getrlimit(resource.RLIMIT_CPU)[1]))
+
+
+def reach_of(
+    session: pytest.Session, files: list[str], jobs: int, kept: Path | None
+) -> dict[str, Any]:
+    """Of each test: whether it passes, how long it takes [s], and the functions of files that it calls."""
+    sources = hashlib.sha256(b"".join(x.read_bytes() for x in sorted(PACKAGE.rglob("*.py"))))
+
+    def name_of(item: pytest.Item) -> str:
+        """Name of a test with the code that it was known for: that of the package and of its file."""
+        digest = sources.copy()
+        digest.update(item.path.read_bytes())
+        return f"{digest.hexdigest()[:16]} {item.nodeid}"
+
+    known = json.loads(kept.read_text()) if kept and kept.exists() else {}
+    reach = {item.nodeid: known[name_of(item)] for item in session.items if name_of(item) in known}
+    paths = {str(PACKAGE / file): file for file in files}
+
+    def learn(item: pytest.Item, out: Path) -> None:
+        functions: set[tuple[str, str]] = set()
+
+        def trace(frame: Any, event: str, _: Any) -> None:
+            if frame.f_code.co_filename in paths:
+                functions.add((paths[frame.f_code.co_filename], frame.f_code.co_name))
+
+        limit_time(LONGEST, out, json.dumps({"passes": False, "why": "too long"}))
+        threading.settrace(trace)
+        sys.settrace(trace)
+        begun = time.process_time()
+        done = passes(session, item)
+        sys.settrace(None)
+        wrote = {"passes": done, "why": "" if done else "fails", "reaches": sorted(functions)}
+        out.write_text(json.dumps(wrote | {"s": time.process_time() - begun}))
+
+    missing = [item for item in session.items if item.nodeid not in reach]
+    for item, wrote, took in forked(missing, learn, jobs):
+        reach[item.nodeid] = {"passes": False, "why": "died", "s": took, "reaches": []} | (
+            wrote or {}
+        )
+        known[name_of(item)] = reach[item.nodeid]
+    if kept:
+        kept.write_text(json.dumps(known))
+    return reach
+
+
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """Instead of running the tests once, run those that reach a mutant with it, for each mutant."""
+    if _TASK not in os.environ:
+        return None
+    task = json.loads(os.environ[_TASK])
+    targets = [TARGETS[k] for k in task["targets"]]
+    into = Path(task["into"]) if task["into"] else None
+    kept = into and into.with_suffix(f".{targets[0].plain or 'checks'}.reach")
+    reach = reach_of(session, [x.file for x in targets], task["jobs"], kept)
+    if task["as_is"]:
+        for name, of in reach.items():
+            print(
+                f"{'passes' if of['passes'] else of['why']:8} {of.get('s', 0.0):6.2f} s {name}",
+                flush=True,
+            )
+        return True
+    items = {item.nodeid: item for item in session.items}
+
+    def test(mutant: Mutant, out: Path) -> None:
+        here = [mutant.target.file, mutant.function]
+        names = [
+            name for name, of in reach.items() if of["passes"] and here in map(list, of["reaches"])
+        ]
+        put_in(mutant)
+        by, begun = "", time.process_time()
+        for name in sorted(names, key=lambda x: reach[x]["s"]):
+            if time.process_time() - begun > task["most"]:
+                break
+            words = json.dumps({"killed": True, "by": f"time: {name}", "tests": len(names)})
+            limit_time(TIMES * reach[name]["s"] + MORE, out, words)
+            if not passes(session, items[name]):
+                by = name
+                break
+        out.write_text(json.dumps({"killed": by != "", "by": by, "tests": len(names)}))
+
+    chosen = [x for x in draw(task["count"], task["seed"]) if x.number in task["numbers"]]
+    for mutant, wrote, took in forked(chosen, test, task["jobs"]):
+        outcome = wrote or {"killed": True, "by": "died", "tests": 0}
+        line = json.dumps(mutant.to_dict() | outcome | {"s": took})
+        print(line, flush=True)
+        if into:
+            with into.open("a") as stream:
+                stream.write(line + "\n")
+    return True
 
 
 # -- functions as plain Python -----------------------------------------------------------------------
 
 
-def digest() -> str:
-    """That of the kernel's sources as they are, by which its machine code is kept."""
-    from rigidfleet.kernel.compiler import cache
-    from rigidfleet.kernel.engine import native
+def fly_with(plain: str) -> None:
+    """Fly with machine code, but with guard or monitor as plain Python."""
+    from rigidfleet.kernel.compiler import jit
 
-    native.sampled_library()  # it and what it needs is in the cache from now on
-    return cache._digest()
+    compiler: Any = jit
 
+    def copied(function: Any, name: str, **instead: Any) -> Any:
+        return jit._copy(function, name, instead)
 
-def use_plain_functions(digest: str) -> None:
-    """Fly with the machine code of the sources with this digest, but with guard and monitor as plain Python."""
-    from rigidfleet.kernel import guard, monitor
-    from rigidfleet.kernel.compiler import cache
+    compiler.compiled_copy = copied
+    from rigidfleet.kernel import guard, monitor, obstacles
     from rigidfleet.kernel.engine import native, packing, sampled
-
-    sources: Any = cache
-    sources._digest = lambda: digest
 
     def record(_: int, p: Any, w: Any, segment: int, out: int) -> None:
         of = packing.pack(p).address, packing.pack(w).address
@@ -343,6 +463,12 @@ def use_plain_functions(digest: str) -> None:
 
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_distances(first, end, problem, state, watch.monitor)
+
+    def clearances(watch: Any, problem: Any, state: Any, first: int, end: int, s: Any) -> None:
+        for step in range(first, end):
+            row = monitor.row_of(step, state)
+            t, h = state.trail.clock[row]
+            obstacles.watch_step(state.trail.points[row], t, h, problem, s, watch.monitor)
 
     def forces(watch: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         monitor.watch_forces(int(last), problem, work, state, watch.monitor)
@@ -355,14 +481,18 @@ def use_plain_functions(digest: str) -> None:
         with np.errstate(all="ignore"):
             return int(guard.avoid(problem, work, flight, state, avoidance))
 
-    monitor.call_recorder = record
-    for function in (bound_moves, distances, forces):
-        setattr(native.Watch, function.__name__, function)
-    word = ctypes.c_int64
-    call = ctypes.CFUNCTYPE(word, *(word,) * 4)(avoid)
-    address = ctypes.cast(call, ctypes.c_void_p).value
-    library = native.Library(avoid=call, addresses={"avoid": address}, unkept=None)
-    native._loaded["avoidance"] = library
+    watching: Any = native.Watch
+    watching.clearances = clearances
+    if plain == "monitor":
+        monitor.call_recorder = record
+        for function in (bound_moves, distances, forces):
+            setattr(native.Watch, function.__name__, function)
+    else:
+        word = ctypes.c_int64
+        call = ctypes.CFUNCTYPE(word, *(word,) * 4)(avoid)
+        address = ctypes.cast(call, ctypes.c_void_p).value
+        library = native.Library(avoid=call, addresses={"avoid": address}, unkept=None)
+        native._loaded["avoidance"] = library
 
 
 @pytest.hookimpl(trylast=True)
@@ -370,18 +500,40 @@ def pytest_configure() -> None:
     """Have the tests of a mutant of the kernel fly with its functions; one example that fails is enough."""
     from hypothesis import Phase, settings
 
-    if kept := os.environ.get(_PLAIN):
-        use_plain_functions(kept)
+    if _TASK in os.environ:
+        if plain := TARGETS[json.loads(os.environ[_TASK])["targets"][0]].plain:
+            fly_with(plain)
         phases = Phase.explicit, Phase.generate
-        settings.register_profile(
-            "mutants", settings.default, max_examples=_EXAMPLES, phases=phases
-        )
+        settings.register_profile("mutants", settings.default, max_examples=EXAMPLES, phases=phases)
         settings.load_profile("mutants")
 
 
-def pytest_collection_modifyitems(items: list[Any]) -> None:
-    """Run the tests that take longest at the end: few mutants come so far."""
-    items.sort(key=lambda item: _LAST in item.name)
+def test_in_processes(numbers: set[int], given: argparse.Namespace) -> None:
+    """Test the mutants with these numbers; targets with the same tests share a process."""
+    for plain in dict.fromkeys(target.plain for target in TARGETS):
+        targets = [k for k, target in enumerate(TARGETS) if target.plain == plain]
+        of_them = {TARGETS[k].file for k in targets}
+        mine = [
+            x.number
+            for x in draw(given.count, given.seed)
+            if x.number in numbers and x.target.file in of_them
+        ]
+        if not mine:
+            continue
+        task = vars(given) | {"targets": targets, "numbers": mine}
+        env = os.environ | {
+            "PYTHONPATH": str(ROOT / "tests"), "OPENBLAS_NUM_THREADS": "1", _TASK: json.dumps(task),
+        }  # fmt: skip
+        if plain:
+            # What flies must be in the cache already: this process cannot compile.
+            build = "from rigidfleet.kernel.engine import native as n; n.sampled_library(); n.avoidance_library()"
+            subprocess.run([sys.executable, "-c", build], check=True)
+            env["NUMBA_DISABLE_JIT"] = "1"
+        files = dict.fromkeys(f"tests/{name}" for k in targets for name in TARGETS[k].tests)
+        options = ["-q", "-q", "-s", "-p", "mutants", "-p", "no:cacheprovider", "-p", "no:xdist"]
+        subprocess.run(
+            [sys.executable, "-m", "pytest", *options, *files], cwd=ROOT, env=env, check=False
+        )
 
 
 def main() -> None:
@@ -391,28 +543,39 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", type=int, nargs="*")
+    parser.add_argument("--into", help="file of results, which are kept")
+    parser.add_argument("--most", type=float, default=30.0, help="processor time of a mutant [s]")
     parser.add_argument("--list", action="store_true")
     parser.add_argument("--as-is", action="store_true", help="run the tests without a fault")
     given = parser.parse_args()
-    if given.as_is:
-        with tempfile.TemporaryDirectory() as name:
-            copy_to(Path(name))
-            for target in TARGETS:
-                print(
-                    json.dumps({"file": target.file} | test(None, target, Path(name))), flush=True
-                )
-        return
-    mutants = [
-        x for x in enumerate(draw(given.count, given.seed)) if not given.only or x[0] in given.only
-    ]
+    mutants = [x for x in draw(given.count, given.seed) if not given.only or x.number in given.only]
     if given.list:
-        for numbered in mutants:
-            print(json.dumps(described(*numbered)))
+        for mutant in mutants:
+            print(json.dumps(mutant.to_dict()))
         return
-    survivors = run(mutants, given.jobs)
-    print(f"{len(mutants) - len(survivors)} of {len(mutants)} killed; survivors:")
-    for numbered in survivors:
-        print(json.dumps(described(*numbered)))
+    into = Path(given.into or Path(tempfile.mkdtemp(), "mutants.jsonl")).resolve()
+    given.into = str(into)
+    equal = proved()
+    rows = [json.loads(line) for line in into.read_text().splitlines()] if into.exists() else []
+    done = {(x["number"], x["file"], x["function"], x["from"], x["to"]): x for x in rows}
+    killed = {name for name, row in done.items() if row["killed"]}  # survivors are tested again
+    left = {x.number for x in mutants if x.key not in equal and (x.number, *x.key) not in killed}
+    test_in_processes(left, given)
+    if given.as_is:
+        return
+    rows = [json.loads(line) for line in into.read_text().splitlines()] if into.exists() else []
+    done = {(x["number"], x["file"], x["function"], x["from"], x["to"]): x for x in rows}
+    judged = [done[x.number, *x.key] for x in mutants if (x.number, *x.key) in done]
+    same = sum(x.key in equal for x in mutants)
+    killed = sum(x["killed"] for x in judged)
+    slow = sum(x["by"].startswith("time") for x in judged)
+    print(
+        f"{killed} of {len(mutants) - same} killed ({slow} by time), {same} change nothing,"
+        f" {sum(x['s'] for x in judged):.0f} s of processor time; survivors:"
+    )
+    for x in judged:
+        if not x["killed"]:
+            print(json.dumps(x))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from rigidfleet.math import rigid_body
 from rigidfleet.math.proximity import clearance, separation
 from rigidfleet.mission import Mission
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
+from rigidfleet.simulation.flight import simulate
 
 TRIANGLE = {"triangle": {"shape": "triangle", "size": 4.0}}
 LINE = {"line": {"shape": "line", "size": 4.0}}
@@ -554,6 +555,57 @@ def test_below_ground_level_is_noted_where_there_is_no_ground():
     ground = assess(flown(a_mission(TRIANGLE, 3, obstacles=[{"kind": "ground"}]), path))
     assert other_notes(ground) == []
     assert failures(ground) == {"clearance"}
+
+
+@pytest.mark.parametrize("height", [0.26, 0.24])
+def test_an_obstacle_may_have_a_comma_in_its_name(height):
+    """It is told whole, hit or not."""
+    named = {"kind": "box", "name": "roof, north, old", "min": [-50, -50, -9], "max": [50, 50, 0]}
+    mission = a_mission(TRIANGLE, 3, obstacles=[named])
+    s = slots(mission, "triangle")
+    finding = found(
+        assess(flown(mission, [s + HEIGHT, s + [0, 0, height], s + HEIGHT])), "clearance"
+    )
+    assert finding.who == "agent 1, roof, north, old"
+    words = (
+        "deepest in 'roof, north, old'"
+        if height < 0.25
+        else "agent 1 comes within 0.01 m of 'roof, north, old'"
+    )
+    assert words in finding.message
+
+
+def test_who_starts_on_an_obstacle_with_a_comma_in_its_name_stands_on_it():
+    """The name is told whole there, too."""
+    roof = {"kind": "box", "name": "roof, north", "min": [-9, -9, -9], "max": [9, 9, 0]}
+    one = {"mass": 1.0, "radius": 0.25, "position": [[0.0, 0.0, 0.25]]}
+    up = [{"kind": "fly", "position": [0, 0, 3], "duration": 4.0}]
+    finding = found(
+        assess(simulate(a_mission({}, 1, up, agents=one, obstacles=[roof]))), "clearance_start"
+    )
+    assert finding.who == "agent 1, roof, north"
+    assert "agent 1 stands in contact with 'roof, north'" in finding.message
+
+
+def test_a_record_says_how_many_contradictions_it_has():
+    """The first one is told, and how many others there are."""
+    mission = a_mission(TRIANGLE, 3)
+    one = flown(mission, slots(mission, "triangle") + HEIGHT)
+    one.separation[:] += 1.0
+    message = found(assess(one), "record").message
+    assert "more like that" not in message
+    one.distance[:] += 1.0
+    assert "and 1 more like that" in found(assess(one), "record").message
+
+
+def test_losses_are_told_by_whom_and_when():
+    """Agents count from 1; phases that a loss ended, and those never begun, are listed."""
+    agents = {"mass": 1.0, "position": [[0, 0, 9], [5, 0, 9], [0, 5, 9]]}
+    phases = [{"kind": "hold", "control": "open", "name": x, "duration": 1.0} for x in "abc"]
+    lost = {"lost": [{"agent": 3, "time": 0.25}, {"agent": 1, "time": 0.5}]}
+    mission = a_mission({}, 3, phases, agents=agents, disturbances=lost)
+    finding = found(assess(simulate(mission)), "lost")
+    assert "lost: agent 1 at 0.50 s, agent 3 at 0.25 s" in finding.message
 
 
 # -- the flight as a whole

@@ -23,7 +23,7 @@ HEAD = "time_s,x_m,y_m,z_m"
 def judged(files, interpolation="cubic", **given):
     """The verdict on files, and the result."""
     read = read_trajectories(files, interpolation)
-    result = of_curves(read.curves, read.assumed, names=read.names, **given)
+    result = of_curves(read._replace(away=False), **given)
     return rf.assess(result), result
 
 
@@ -141,7 +141,7 @@ def test_a_drone_that_takes_off_later_stays_until_then(tmp_path):
     path = show(tmp_path / "late.skyc", [first, first], **{"drones/1.json": late})
     read = read_trajectories(path)
     assert read.curves[1].time.tolist() == [3.0, 5.0]
-    result = of_curves(read.curves, read.assumed)
+    result = of_curves(read._replace(away=False))
     assert result.time[-1] == 5.0
     assert not result.position[result.time < 2.9][:, 1].any()
     assert "stays at its first and last place" in read.notes[0]
@@ -510,3 +510,17 @@ def test_a_file_may_have_any_name(name, tmp_path, monkeypatch, capsys):
     assert "Passed: the only check holds." in capsys.readouterr().out
     assert len(list(Path("made").glob("*.nc"))) == 1
     assert main(["assess", "."]) == PASSED
+
+
+def test_no_table_of_an_earlier_flight_stays_beside_a_result(tmp_path):
+    """`assess --out` refuses to write where one stands, as `run` does; with --force, it goes."""
+    out = tmp_path / "made"
+    out.mkdir()
+    (out / "flight.csv").write_text("of an earlier flight\n")
+    table(tmp_path / "flight.csv", [[0, 0, 0, 1], [1, 1, 0, 1]])
+    options = ["assess", str(tmp_path / "flight.csv"), "--out", str(out)]
+    assert main(options) == BAD_INPUT
+    assert [path.name for path in out.iterdir()] == ["flight.csv"]
+    assert main([*options, "--force"]) == PASSED
+    assert (out / "flight.nc").exists()
+    assert not (out / "flight.csv").exists()

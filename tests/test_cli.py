@@ -4,6 +4,7 @@ import os
 import pty
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -124,6 +125,28 @@ def test_help_is_light():
         "--no-figures",
     ):
         assert words in " ".join(done.stdout.split())
+
+
+def test_completion(tmp_path):
+    """What is installed for bash completes every verb, and the options of a verb, in a home that has nothing yet."""
+    if (bash := shutil.which("bash")) is None:
+        pytest.skip("no bash here")
+    home = {"HOME": str(tmp_path), "PATH": os.environ["PATH"]}
+    done = command("--install-completion", "--shell", "bash", **home)
+    assert done.returncode == 0, done.stderr
+    script = r"""
+    source ~/.bashrc
+    call=$(complete -p rigidfleet | sed 's/.*-F \([^ ]*\).*/\1/')
+    COMP_WORDS=(rigidfleet ""); COMP_CWORD=1; $call; echo "${COMPREPLY[@]}"
+    COMP_WORDS=(rigidfleet sweep --w); COMP_CWORD=2; $call; echo "${COMPREPLY[@]}"
+    """
+    done = subprocess.run(
+        [bash, "-c", script], env=home, capture_output=True, text=True, check=False
+    )
+    verbs, options = done.stdout.splitlines()
+    table = Path(__file__).parents[1].joinpath("README.md").read_text("utf-8")
+    assert {*re.findall(r"^\| `rigidfleet (\w+)", table, re.MULTILINE)} <= {*verbs.split()}
+    assert options.split() == ["--workers"]
 
 
 def test_module_is_the_command():

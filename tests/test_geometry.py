@@ -13,9 +13,7 @@ from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.math import attitude, constraint_jacobian, proximity, rigid_body
-from rigidfleet.mission import Box, Ground, Sphere
-from rigidfleet.solids import distance
-from rigidfleet.solids.distance import from_box
+from rigidfleet.mission import Box, Ground
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -122,52 +120,6 @@ def test_clearance_names_the_nearest_of_several_obstacles():
     np.testing.assert_allclose(least, [0.6, 0.0, -0.4], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(agent, [0, 0, 1])
     np.testing.assert_array_equal(obstacle, [0, 1, 0])
-
-
-@settings(max_examples=30)
-@given(seed=seeds, n=st.integers(1, 4), K=st.sampled_from([1, 9, 511, 513, 1100]))
-def test_the_compiled_nearest_box_is_that_of_arrays(seed, n, K):
-    """The same bits inside, outside and on faces of boxes and the ground; of equals, the first; none without place."""
-    rng = np.random.default_rng(seed)
-    low = rng.integers(-3, 3, (rng.integers(1, 6), 3)).astype(float)
-    boxes = np.hstack([low, low + rng.integers(1, 4, low.shape)])
-    boxes[0, :5] = [-np.inf] * 3 + [np.inf] * 2
-    boxes = rng.permutation(np.vstack([boxes, boxes[:2]]))  # some twice
-    r, radius = rng.normal(size=(K, n, 3)) * 3, rng.uniform(0.1, 1.0, n)
-    on_grid = rng.random((K, n)) < 0.5
-    r[on_grid] = r[on_grid].round()
-    r[rng.random((K, n)) < 0.1] = np.nan
-    r[rng.random((K, n, 3)) < 0.05] = np.nan
-    least, nearest = native.nearest_boxes(r, radius, boxes)
-    each = np.array([from_box(*r.T, box) for box in boxes]) - radius[:, None]
-    each = np.where(np.isnan(each), np.inf, each)
-    assert least.tobytes() == each.min(axis=0).tobytes()
-    first = np.where(np.isfinite(each).any(axis=0), each.argmin(axis=0), -1)
-    np.testing.assert_array_equal(nearest, first)
-
-
-def test_boxes_that_move_or_are_turned_are_not_compiled_ones(monkeypatch):
-    """The compiled pass gets boxes at rest that are always there, and gives the same bits; other solids do not."""
-    native._code()
-    keys: dict[str, Any] = BOX.model_dump()
-    others: tuple[dict[str, Any], ...] = (
-        {"yaw_deg": 30.0},
-        {"velocity": (1.0, 0.0, 0.0)},
-        {"vanishes": 2.0},
-    )
-    ball = Sphere(kind="sphere", name="ball", centre=(1.0, 2.0, 3.0), radius=1.0)
-    r, t = np.random.default_rng(1).normal(size=(7, 2, 3)) * 5, np.arange(7.0)
-    asked: list[Any] = []
-    compiled = [lambda *x: asked.append(x) or native.nearest_boxes(*x)]
-    monkeypatch.setattr(distance, "_compiled", compiled)
-    found = proximity.obstacle_clearances(r, 0.2, [BOX], t)
-    assert len(asked) == 1
-    for other in (*(Box(**keys | x) for x in others), ball):
-        proximity.obstacle_clearances(r, 0.2, [BOX, other], t)
-    assert len(asked) == 1
-    monkeypatch.setattr(distance, "_compiled", [])
-    for a, b in zip(found, proximity.obstacle_clearances(r, 0.2, [BOX], t), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_no_obstacle_is_clear():
@@ -417,25 +369,23 @@ def test_smallest_singular_value_is_the_last_above_the_rank(name):
     assert np.linalg.matrix_rank(jacobian(r, edges), 1e-9) == rank
     found = constraint_jacobian.smallest_singular_value(r[None], edges)
     assert found[0] == pytest.approx(values[rank - 1], rel=1e-9)
-    recorded = native.least_singular_values(r[None].copy(), edges)
-    assert recorded[0] == pytest.approx(values[rank - 1], rel=1e-9)
 
 
 @settings(max_examples=20)
 @given(seed=seeds, n=st.integers(2, 9))
-def test_recorded_singular_values_are_numpys(seed, n):
+def test_singular_values_of_many_samples_are_those_of_each(seed, n):
     """At random places, of any number of edges, on the smaller and the larger side of J."""
     rng = np.random.default_rng(seed)
     edges = rng.permutation(graphs.complete_graph(n))[: rng.integers(1, 4 * n)]
     r = rng.normal(size=(4, n, 3)) * 3
-    found = native.least_singular_values(r, edges)
+    found = constraint_jacobian.smallest_singular_value(r, edges)
     for k in range(4):
         values = np.linalg.svd(jacobian(r[k], edges), compute_uv=False)
         least = values[values > 1e-6 * values[0]].min()
         assert found[k] == pytest.approx(least, rel=1e-7)
 
 
-def test_singular_values_of_triangles_are_numpys_however_flat():
+def test_singular_values_of_triangles_are_right_however_flat():
     """The least eigenvalue is exact to rounding; at each sample alone it is the same, and two agents in one place spoil
     no other sample."""
     rng = np.random.default_rng(3)
@@ -443,12 +393,12 @@ def test_singular_values_of_triangles_are_numpys_however_flat():
     r[:, :, 1:] *= np.logspace(-6, 0, 21)[:, None, None]
     r[5, 1] = r[5, 0]
     edges = graphs.complete_graph(3)
-    found = native.least_singular_values(r, edges)
+    found = constraint_jacobian.smallest_singular_value(r, edges)
     assert np.isnan(found).tolist() == [k == 5 for k in range(21)]
     for k in set(range(21)) - {5}:
         values = np.linalg.svd(jacobian(r[k], edges), compute_uv=False)
         assert found[k] ** 2 == pytest.approx(values[values > 1e-7].min() ** 2, rel=0, abs=5e-15)
-        assert native.least_singular_values(r[[k]], edges)[0] == found[k]
+        assert constraint_jacobian.smallest_singular_value(r[[k]], edges)[0] == found[k]
 
 
 def test_weighted_singular_values_are_those_of_the_law():

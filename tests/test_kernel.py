@@ -652,6 +652,22 @@ def test_gains_are_interpolated_over_the_time_to_go():
     np.testing.assert_array_equal(out, -1.0)
 
 
+def test_edges_that_meet_give_the_products_of_the_constraint_jacobian():
+    """Pairs and weights of a graph make J M^-1 J^T, also of edges that share both agents, either way round."""
+    rng = np.random.default_rng(4)
+    edges = np.array([[0, 1], [1, 2], [3, 2], [1, 0], [0, 1], [4, 3]])
+    m, r = rng.uniform(0.5, 3.0, 5), rng.normal(size=(5, 3))
+    g = kernel_graph(edges, m)
+    u = r[edges[:, 0]] - r[edges[:, 1]]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    A = np.diag(g.diagonal)
+    for (k, l), weight in zip(g.pairs.tolist(), g.weight, strict=True):
+        A[k, l] = A[l, k] = weight * (u[k] @ u[l])
+    J = jacobian(r, edges)
+    np.testing.assert_allclose(A, J / np.repeat(m, 3) @ J.T, atol=1e-14)
+    assert (g.pairs[:, 0] > g.pairs[:, 1]).all()
+
+
 # -- the integrator --------------------------------------------------------------------------------
 
 

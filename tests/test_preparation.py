@@ -11,7 +11,6 @@ from rigidfleet import assess, simulate
 from rigidfleet._common.kept import kept
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
-from rigidfleet.kernel.measured import nearest_of
 from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import pid, proximity
 from rigidfleet.mission import Mission, load_mission
@@ -87,12 +86,10 @@ def examples() -> list:
     return [
         workspace(3, 3), state, records.recorder(7, 3, 3), packing.examples()[0],
         records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)),
-        native.spectrum_of(rng.normal(size=(4, 3, 3)), np.array([[0, 1], [1, 2]])),
-        nearest_of(rng.normal(size=(4, 3, 3)), np.ones(3), np.ones((2, 6))),
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("k", range(7))
+@pytest.mark.parametrize("k", range(5))
 def test_words_are_those_of_a_walk_through_the_tuple(k):
     """Compiled code finds the addresses, shapes and numbers that Python finds one by one."""
     native._code()

@@ -232,15 +232,30 @@ def test_a_store_of_an_earlier_version_is_read_and_goes_on(tmp_path):
         RunRecord(k, True, "", "", codes[k], {name: float(k + 1) for name in METRICS}, 0.1)
         for k in (0, 1)
     ]
-    with Store(tmp_path, sweep) as store:
+    with Store(tmp_path, sweep, "", replace=False) as store:
         store.add(rows[:1])
     with closing(sqlite3.connect(tmp_path / FILE)) as db:
         db.execute("ALTER TABLE runs DROP COLUMN vertical_jerk")
     table = read(tmp_path)
     assert np.isnan(table.metrics["vertical_jerk"]).tolist() == [True]
     assert table.metrics["speed"].tolist() == [1.0]
-    with Store(tmp_path, sweep) as store:
+    with Store(tmp_path, sweep, "", replace=False) as store:
         store.add(rows[1:])
     table = read(tmp_path)
     np.testing.assert_array_equal(table.metrics["vertical_jerk"], [np.nan, 2.0])
     assert table.metrics["steps"].tolist() == [1.0, 2.0]
+
+
+def test_the_safety_table_measures_no_distances_again(monkeypatch):
+    """What the verdict has measured between vehicles is not measured a second time for the table."""
+    flight = rf.simulate("narrow-passage")
+    verdict = rf.assess(flight)
+    rows = {row.quantity: row for row in safety(flight, verdict)}
+    monkeypatch.setattr("rigidfleet.math.proximity.closeness", None)
+    again = {row.quantity: row for row in safety(flight, verdict)}
+    assert again == rows
+    z = flight.position[..., 2]
+    assert rows["lowest"].worst is not None
+    assert rows["lowest"].worst.value == pytest.approx(z.min(), abs=1e-4)
+    assert rows["lowest"].worst.value <= z.min()
+    assert verdict.by_name["clearance"].limit == rows["clearance"].limit == 0.0

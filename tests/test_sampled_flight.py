@@ -423,7 +423,7 @@ def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
     code = native._read("sampled")
     assert code is not None
     others = {part: x for part, x in native._loaded.items() if part != "sampled"}
-    made = native._link("sampled", code, code)
+    made = native._link("sampled", *native._of_objects(code), code)
     monkeypatch.setattr(native, "_loaded", others | {"sampled": made})
     given = native.bequeath()
     monkeypatch.setattr(native, "_loaded", others)

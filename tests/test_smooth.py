@@ -68,6 +68,38 @@ def test_slots_have_the_kernels_position_velocity_and_acceleration(t):
     np.testing.assert_allclose(found[:3], flown(reference, motion, t), rtol=1e-12, atol=1e-11)
 
 
+def still(motion: Motion) -> Motion:
+    """The same motion of a body that does not turn."""
+    pieces = motion.coefficients.copy()
+    pieces[:, 3:] = 0.0
+    return motion._replace(coefficients=pieces)
+
+
+def test_slots_of_a_body_that_does_not_turn_are_the_kernels():
+    """At many times at once, before, in and after a blend that turns the slots, and one that does not."""
+    reference, motion = a_reference()
+    time = np.linspace(0.1, 4.9, 25)
+    for turn in (reference.turn, np.zeros(3)):
+        of = reference._replace(turn=turn)
+        many = d.slot_derivatives(of, still(motion), time)[:, :3]
+        own = [flown(of, still(motion), t) for t in time]
+        np.testing.assert_allclose(many, own, rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("turns", [True, False])
+def test_fewer_orders_are_the_first_of_all_bit_for_bit(turns):
+    """Who needs positions alone gets the numbers of who needs snap, also of slots on ways of their own."""
+    blend, motion = a_reference()
+    ways = blend._replace(knots=np.array([0.5, 2.0, 3.0]), ways=random(5, 2, 4, 3, 8))
+    time = np.linspace(0.1, 4.9, 25)
+    for reference in (blend, ways):
+        of = reference, motion if turns else still(motion), time
+        for orders in range(1, d.ORDERS):
+            assert np.array_equal(
+                d.slot_derivatives(*of, orders), d.slot_derivatives(*of)[:, :orders]
+            )
+
+
 @pytest.mark.parametrize("t", [0.3, 0.9, 2.2, 3.5])
 def test_jerk_and_snap_are_differences_of_the_kernels_acceleration(t):
     """Eighth-order differences of what the compiled kernel flies."""

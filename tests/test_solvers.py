@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from rigidfleet.formation import graphs, shapes
+from rigidfleet.kernel import block_cholesky
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.large import block_cholesky, elimination
+from rigidfleet.kernel.large import ordering
 from rigidfleet.kernel.large.solver import LargeSolver, Setup
 from rigidfleet.kernel.problem import EXACT, ITERATED, ConstraintLaw, Vehicles, workspace
 from rigidfleet.mission import Mission
@@ -46,9 +47,9 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     order = None
     if eliminated:
         steps = solvers.elimination_steps(len(p), edges)
-        order = None if steps is None else elimination.order(steps, edges)
+        order = None if steps is None else ordering.order(steps, edges)
     setup = Setup(order, solvers.Dissection(p, edges), tolerance)
-    return LargeSolver(vehicles, edges, law, work, setup)
+    return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
 
 def solved(solver, b) -> np.ndarray:
@@ -202,7 +203,7 @@ def test_factor_is_that_of_the_matrix(rng):
     """L L^T is K, block by block, in the order of the dissection."""
     p = lattice(4)
     edges, masses = graphs.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
-    found = block_cholesky.pattern(64, edges, solvers.dissection(p, edges), 1e9)
+    found = ordering.pattern(64, edges, solvers.dissection(p, edges), 1e9)
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
     block_cholesky.assemble(

@@ -40,7 +40,7 @@ def line(start, velocity):
 
 def judged(path, spans="refuse", gaps="refuse", interpolation="cubic", **limits):
     read = read_trajectories(path, interpolation, spans=spans, gaps=gaps)
-    result = of_curves(read.curves, read.assumed, names=read.names, away=read.away, **limits)
+    result = of_curves(read, **limits)
     result.statistics["notes"] = list(read.notes)
     return rf.assess(result)
 
@@ -169,7 +169,7 @@ def test_a_result_keeps_who_was_there(tmp_path):
         },
     )
     read = read_trajectories(path, spans="away")
-    result = of_curves(read.curves, read.assumed, away=True, separation=1.0)
+    result = of_curves(read._replace(away=True), separation=1.0)
     result.save(tmp_path / "r.nc")
     again = rf.Result.load(tmp_path / "r.nc")
     assert again.left.sum(axis=0)[0] > again.left.sum(axis=0)[1]

@@ -2,16 +2,20 @@
 
 import io
 import json
+import logging
 import math
 import os
 import random
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -27,14 +31,16 @@ from rigidfleet.assessment import assess
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import MissionError, ResultError, RigidfleetError, SweepError
-from rigidfleet.mission import Mission
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.timing import complete_times, expand_mission, matters_to_plan
 from rigidfleet.result import Extremum
-from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, read
+from rigidfleet.sweep import METRICS, Sweep, Table, fly, load, merge, read
 from rigidfleet.sweep.figures import map_over_two, plot
 from rigidfleet.sweep.final_states import start_states
 from rigidfleet.sweep.metrics import measure
 from rigidfleet.sweep.run import GROUP, fly_runs
 from rigidfleet.sweep.runner import SweepProgress
+from rigidfleet.sweep.shards import own_runs
 from rigidfleet.sweep.summary import Example, drivers, rate, summarise
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "gain_study.toml"
@@ -295,6 +301,82 @@ def test_metrics_are_those_of_the_verdict(tmp_path):
     assert math.isnan(row.metrics["clearance"])
 
 
+FOUND = "narrow-passage-found"  # searches its way through a gap
+
+
+@pytest.mark.parametrize(
+    ("line", "searches"),
+    [("constraint.alpha = grid(0.4, 0.6)", 1), ("obstacles.3.min.1 += grid(0, 0.4)", 2)],
+)
+def test_a_way_is_searched_once_where_nothing_that_varies_matters_to_it(
+    monkeypatch, line, searches
+):
+    """A gain leaves the way, a wall may move it: rows are those of missions that search for themselves, to the bit."""
+    from rigidfleet.planning import ways
+    from rigidfleet.simulation.together import simulate_together
+
+    count, search = [0], ways._Search.mission_with_way
+
+    def counted(self: Any) -> Mission:
+        count[0] += 1
+        return search(self)
+
+    monkeypatch.setattr(ways._Search, "mission_with_way", counted)
+    varied = Sweep.of(FOUND, [line])
+    rows = fly_runs(varied, range(2))
+    assert count[0] == searches
+    alone = simulate_together([Mission.from_dict(varied.varied(k)) for k in range(2)])
+    assert count[0] == searches + 2
+    for row, result in zip(rows, alone, strict=True):
+        own = measure(result, assess(result))
+        assert row.passed
+        assert np.array_equal([*row.metrics.values()], [*own.values()], equal_nan=True)
+
+
+def test_what_matters_in_flight_alone_changes_no_way():
+    """Phases that are found are the same for other tolerances, air, noise and gains; all else counts as a change."""
+    written = load_mission(FOUND)
+    noise = {"position": 0.02, "velocity": 0.05, "rate": 20.0, "seed": 3}
+    gusts = {"model": "dryden", "altitude": 20.0, "correlation_length": 20.0, "seed": 1}
+    air = {"wind": [3.0, 1.0, 0.0], "drag": 0.4, "mass_error": 0.1, "gusts": gusts, "noise": noise}
+    other = {"integrator": {"rtol": 1e-5}, "constraint": {"alpha": 0.6}, "disturbances": air}
+    for keys in [
+        ("integrator", "rtol"),
+        ("constraint", "alpha"),
+        *(("disturbances", k) for k in air),
+    ]:
+        assert not matters_to_plan(written, keys)
+    assert written.to_dict().keys().isdisjoint(other)
+    changed = Mission.from_dict(written.to_dict() | other)
+    phases = [expand_mission(mission).to_dict()["phases"] for mission in (written, changed)]
+    assert phases[0] == phases[1]
+    assert len(phases[0]) > len(written.phases)
+    for path in (
+        "agents.position.1",
+        "agents.mass",
+        "obstacles.2",
+        "tracking.Q",
+        "disturbances.lost",
+    ):
+        assert matters_to_plan(written, tuple(path.split(".")))
+    settling = [{**PAIR["phases"][0], "settle": {}}]
+    del settling[0]["until"]
+    assert matters_to_plan(Mission.from_dict(PAIR | {"phases": settling}), ("constraint", "alpha"))
+    assert matters_to_plan(load_mission("passage-quadrotors"), ("constraint", "alpha"))
+
+
+def test_a_sweep_without_a_way_says_so_in_each_row():
+    """Where no way is found, each run is refused, with the reason that its mission alone has."""
+    tables = load_mission(FOUND).to_dict()
+    tables["phases"][-2]["position"] = [38.0, 70.0, 10.0]  # inside a wall
+    blocked = Sweep.of(Mission.from_dict(tables), ["constraint.alpha = grid(0.4, 0.6)"])
+    rows = fly_runs(blocked, range(2))
+    with pytest.raises(MissionError, match="its goal leaves agent") as caught:
+        complete_times(blocked.mission)
+    assert [row.reason for row in rows] == ["mission"] * 2
+    assert all(caught.value.findings[0].problem in row.detail for row in rows)
+
+
 def test_a_failed_run_is_a_row_with_its_reason(tmp_path):
     """A mission that cannot be, and one that does not pass, end no sweep."""
     table = fly(sweep("agents.mass = grid(1, -1, 2)", runs=None), tmp_path, workers=1)
@@ -382,12 +464,14 @@ def test_a_group_is_never_split():
     from rigidfleet.sweep.runner import _Sweeping
 
     class Gaps:
+        path = Path("gaps/sweep.db")
+
         def finished_runs(self):
             there = np.ones(100, dtype=bool)
             there[[3, 4, 40, 97]] = False
             return there
 
-    under_way = _Sweeping(sweep(runs=100), Gaps(), None)  # ty: ignore[invalid-argument-type]
+    under_way = _Sweeping(sweep(runs=100), Gaps(), None, np.ones(100, bool))  # ty: ignore[invalid-argument-type]
     under_way.pace = 1e-6
     taken = [under_way.take(1) for _ in range(2)]
     assert taken == [[*range(8), *range(40, 48)], [96, 97, 98, 99]]
@@ -536,6 +620,212 @@ def test_the_command_evaluates_final_states(capsys, tmp_path, monkeypatch):
     assert "definition cannot change" in capsys.readouterr().err
 
 
+# -- shards ------------------------------------------------------------------------------------------
+
+
+def parts(folder: Path, *shards: str, asked: Sweep | None = None) -> None:
+    for shard in shards:
+        fly(asked or sweep(), folder, workers=1, shard=shard)
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_shards_are_merged_to_the_rows_of_one_run(flown, tmp_path, count):
+    """Bit for bit, in any order, with shards that have nothing to fly; merged again, and with more runs later."""
+    parts(tmp_path, *[f"{k}/{count}" for k in range(count, 0, -1)], asked=sweep(runs=12))
+    first = merge(tmp_path)
+    assert first.complete
+    assert numbers(first) == numbers(fly(sweep(runs=12), tmp_path / "whole", workers=1))
+    parts(tmp_path, *[f"{k}/{count}" for k in range(1, count + 1)])
+    assert numbers(merge(tmp_path)) == numbers(merge(tmp_path)) == numbers(flown)
+
+
+def test_shards_share_all_runs():
+    """Each run is in one shard, with the others of its group of eight, however many shards there are."""
+    for count in (1, 3, 40):
+        masks = np.array([own_runs(f"{k}/{count}", 1003) for k in range(1, count + 1)])
+        assert (masks.sum(axis=0) == 1).all()
+        assert all(len({*np.flatnonzero(x[:1000]) // 8}) * 8 == x[:1000].sum() for x in masks)
+        assert np.ptp(masks.sum(axis=1)) <= 8
+
+
+def test_a_shard_that_is_missing_or_partly_flown_is_named(tmp_path):
+    """Merging says which, how far, and the command that flies it, and writes nothing; a shard goes on where it was."""
+
+    def stop(progress: SweepProgress) -> None:
+        assert not Path(
+            tmp_path, "shards/1-of-3/sweep.db-wal"
+        ).exists()  # a network's disk has none
+        if progress.flown:
+            raise KeyboardInterrupt
+
+    with pytest.raises(ResultError, match="shards: contains no sweep"):
+        merge(tmp_path)
+    asked = sweep(runs=60)
+    with pytest.raises(KeyboardInterrupt):
+        fly(asked, tmp_path, workers=1, shard="1/3", progress=stop)
+    parts(tmp_path, "2/3", asked=asked)
+    with pytest.raises(ResultError) as caught:
+        merge(tmp_path)
+    words = str(caught.value)
+    assert "of 3 shards, these are missing or partly flown: 1 (has 8 of 24 runs), 3." in words
+    assert f"`rigidfleet sweep {tmp_path} --shard 1/3`" in words
+    assert not (tmp_path / "sweep.db").exists()
+    seen: list[SweepProgress] = []
+    fly(asked, tmp_path, workers=1, shard="1/3", progress=seen.append)
+    assert (seen[0].done, seen[-1].done, seen[-1].runs, seen[-1].flown) == (8, 24, 24, 16)
+    parts(tmp_path, "3/3", asked=asked)
+    assert merge(tmp_path).complete
+
+
+def change(folder: Path, words: str) -> None:
+    with closing(sqlite3.connect(folder / "sweep.db")) as db, db:
+        db.execute(words)
+
+
+def test_shards_that_do_not_fit_are_refused(tmp_path, monkeypatch):
+    """What differs is named: seed, runs, number of shards, mission, version."""
+    odd = Mission.from_dict(PAIR | {"output_step": 0.05})
+    for k, (shard, asked, words) in enumerate(
+        (
+            ("2/2", sweep(seed=4), "seed"),
+            ("2/2", sweep(runs=19), "number of runs"),
+            ("2/3", sweep(), "number of shards"),
+            ("2/2", sweep(mission=odd), "mission"),
+            ("2/2", sweep(), "version"),
+        )
+    ):
+        here = tmp_path / str(k)
+        parts(here, "1/2")
+        with monkeypatch.context() as other:
+            if words == "version":
+                other.setattr("rigidfleet.sweep.definition.__version__", "0.0.0")
+            parts(here, shard, asked=asked)
+        with pytest.raises(
+            ResultError, match=rf"does not fit .*1-of-2; it differs in: {words}\. Move"
+        ):
+            merge(here)
+
+
+def test_a_shard_may_come_twice(flown, tmp_path):
+    """The same rows are taken once, whenever and wherever they were flown; rows that differ are named and refused."""
+    parts(tmp_path, "1/2", "2/2")
+    again = tmp_path / "shards" / "from another machine"
+    shutil.copytree(tmp_path / "shards" / "2-of-2", again)
+    change(again, "UPDATE runs SET wall = wall + 1, level = 'another'")
+    assert numbers(merge(tmp_path)) == numbers(flown)
+    change(again, "UPDATE runs SET thrust = thrust * (1 + 1e-15) WHERE run = 9")
+    with pytest.raises(ResultError, match=r"from another machine: run 9 is not as in .*2-of-2\."):
+        merge(tmp_path)
+
+
+def test_levels_of_machine_code_are_kept(tmp_path):
+    """Rows say which level flew them; a sweep of two levels is merged, and its summary says so."""
+    parts(tmp_path, "1/2", "2/2")
+    (level,) = merge(tmp_path).levels
+    assert "Levels" not in shown(read(tmp_path), 200)
+    change(tmp_path / "shards" / "2-of-2", "UPDATE runs SET level = 'another'")
+    assert merge(tmp_path).levels == {level: 12, "another": 8}
+    assert f"last bits differ: 12 by {level}, 8 by another" in shown(read(tmp_path), 200)
+    change(tmp_path, "UPDATE runs SET level = NULL")  # as an earlier version wrote it
+    assert read(tmp_path).levels == {}
+
+
+# -- executors ---------------------------------------------------------------------------------------
+
+
+class Dying(ThreadPoolExecutor):
+    """An executor that breaks when it has taken two chunks."""
+
+    def submit(self, *job: Any, **more: Any) -> Any:
+        self.count = getattr(self, "count", 0) + 1
+        if self.count > 2:
+            raise BrokenProcessPool("a process died")
+        return super().submit(*job, **more)
+
+
+def test_any_executor_flies_a_sweep(tmp_path):
+    """Threads that take turns all the time give the rows of one process, bit for bit, and are left open."""
+    asked = Sweep.of("narrow-passage", ["agents.mass.* *= normal(1, 0.05)"], runs=48)
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(3) as pool:
+            table = fly(asked, tmp_path / "pool", pool=pool, workers=3)
+            assert pool.submit(int, "3").result() == 3
+    finally:
+        sys.setswitchinterval(before)
+    assert table.passed.all()
+    with pytest.raises(TypeError, match="an Executor of concurrent"):
+        fly(asked, tmp_path, pool=lambda: ThreadPoolExecutor(1))  # ty: ignore[invalid-argument-type]
+    assert numbers(table) == numbers(fly(asked, tmp_path / "alone", workers=1))
+
+
+def test_an_executor_that_dies_is_a_sentence(flown, tmp_path, monkeypatch, capsys, caplog):
+    """What happened, what is saved and how to go on; a program that does not listen hears nothing else."""
+    asked = sweep()
+    listening = caplog.at_level(logging.INFO, "rigidfleet.sweep")
+    with listening, Dying(1) as pool, pytest.raises(RigidfleetError) as caught:
+        fly(asked, tmp_path, pool=pool, workers=1)
+    done = len(read(tmp_path).run)
+    assert str(caught.value) == (
+        "workers died in the middle of runs. If memory is short, use fewer of them."
+        f" {tmp_path}: {done} of 20 runs are saved; the same command goes on."
+    )
+    warned = [r.message for r in caplog.records if r.levelno == logging.WARNING]
+    assert 0 < len(warned) <= 2
+    assert all("lost in flight: 8, from" in words for words in warned)
+    caplog.clear()
+    monkeypatch.setattr(logging.root, "handlers", [])
+    with ThreadPoolExecutor(1) as pool:
+        assert numbers(fly(asked, tmp_path, pool=pool, workers=1)) == numbers(flown)
+    with Dying(1) as pool, pytest.raises(RigidfleetError):
+        fly(asked, tmp_path / "again", pool=pool, workers=1)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch, caplog):
+    """The chunk that a broken pool does not take is flown by the next one; the log says what progress says."""
+    from contextlib import contextmanager
+
+    @contextmanager
+    def processes(count: int) -> Generator[Any]:
+        with kinds.pop(0)(count) as pool:
+            yield pool
+
+    kinds = [Dying, ThreadPoolExecutor]
+
+    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.workers.processes", processes)
+    monkeypatch.setattr("rigidfleet.sweep.runner._CHUNK", 0.0)
+    asked = sweep(runs=60)
+    with caplog.at_level(logging.INFO, "rigidfleet.sweep"):
+        table = fly(asked, tmp_path, workers=2)
+    assert numbers(table) == numbers(fly(asked, tmp_path / "alone", workers=1))
+    said = [record.message for record in caplog.records]
+    failed = 60 - int(table.passed.sum())
+    assert said[0] == f"{tmp_path}: 0 of 60 runs; begun"
+    assert said[-2:] == [
+        f"{tmp_path}: 60 of 60 runs, {failed} of 60 flown failed",
+        f"{tmp_path}: 60 of 60 runs; done",
+    ]
+
+
+@pytest.mark.long
+def test_loky_flies_a_sweep(flown, tmp_path):
+    """Processes of loky give the rows of one process, and one that is killed is a sentence."""
+    loky = pytest.importorskip("loky")
+
+    def kill(progress: SweepProgress) -> None:
+        if progress.flown:
+            os.kill(pids.pop(), signal.SIGKILL)
+
+    with loky.ProcessPoolExecutor(2) as pool:
+        assert numbers(fly(sweep(), tmp_path / "whole", pool=pool, workers=2)) == numbers(flown)
+        pids = {pool.submit(os.getpid).result() for _ in range(20)}
+        with pytest.raises(RigidfleetError, match=r"workers died.* of 4000 runs are saved"):
+            fly(sweep(runs=4000), tmp_path / "killed", pool=pool, workers=2, progress=kill)
+
+
 # -- killed ------------------------------------------------------------------------------------------
 
 
@@ -612,7 +902,7 @@ if __name__ == "__main__":
     mark = "changed"
     if sys.argv[1] == "threads":
         threading.Thread(target=threading.Event().wait, daemon=True).start()
-    with workers.processes(2) as (pool, _):
+    with workers.processes(2) as pool:
         print(pool.submit(of_a_fork).result())
 """
 
@@ -658,29 +948,33 @@ def started(arguments: list[str]) -> subprocess.Popen[bytes]:
 
 
 @pytest.fixture
-def dask(tmp_path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and two workers as the manual starts them, each a process: address, and the workers."""
+def dask(tmp_path, request) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """A scheduler and workers as the manual starts them, each a process: address, and all of these.
+
+    There are two workers, without nannies, unless options of each are the parameter.
+    """
     pytest.importorskip("distributed")
     place = tmp_path / "scheduler.json"
     here = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(place)]
     processes = [started(here)]
     try:
-        until(place.exists, processes[0])
+        until(lambda: place.exists() and place.stat().st_size > 0, processes[0])
         address = json.loads(place.read_text())["address"]
-        for k in range(2):
+        for k, more in enumerate(getattr(request, "param", [["--no-nanny"]] * 2)):
             local = ["--local-directory", str(tmp_path / f"worker-{k}")]
-            processes.append(started(["worker", address, "--nthreads", "1", "--no-nanny", *local]))
-        yield address, processes[1:]
+            processes.append(started(["worker", address, "--nthreads", "1", *more, *local]))
+        yield address, processes
     finally:
         for process in reversed(processes):
-            process.kill()
+            process.terminate()  # a nanny ends its worker
             process.wait()
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("dask", [[["--no-nanny"]] * 2, [["--nanny"]] * 2], indirect=True)
 def test_a_cluster_loses_a_worker(dask, tmp_path):
-    """Of two Dask workers one is killed in mid-run: all rows come, the same bit for bit."""
-    address, workers = dask
+    """Of two Dask workers one, or its nanny, is killed in mid-run: all rows come, the same bit for bit."""
+    address, (_, *workers) = dask
     mission = "single-waypoint"
     asked = Sweep.of(mission, SCATTER, runs=200, seed=2)
     alone = fly(asked, tmp_path / "alone", workers=1)
@@ -695,6 +989,56 @@ def test_a_cluster_loses_a_worker(dask, tmp_path):
     assert killed
     assert killed[0] < 200
     assert numbers(table) == numbers(alone)
+
+
+@pytest.mark.long
+def test_a_cluster_loses_its_scheduler(dask, tmp_path, capfd):
+    """One sentence says what is saved, and nothing else is printed; the sweep then goes on without a cluster."""
+    address, (scheduler, *_) = dask
+    asked = Sweep.of("single-waypoint", SCATTER, runs=400, seed=2)
+
+    def kill(progress: SweepProgress) -> None:
+        if progress.flown >= 32:
+            scheduler.kill()
+
+    with pytest.raises(RigidfleetError) as caught:
+        fly(asked, tmp_path / "cluster", cluster=address, progress=kill)
+    done = len(read(tmp_path / "cluster").run)
+    assert 32 <= done < 400
+    assert str(caught.value) == (
+        "the scheduler of the cluster ended, or the connection to it."
+        f" {tmp_path / 'cluster'}: {done} of 400 runs are saved; the same command goes on."
+    )
+    assert capfd.readouterr() == ("", "")
+    whole = fly(asked, tmp_path / "whole", workers=1)
+    assert numbers(fly(asked, tmp_path / "cluster", workers=1)) == numbers(whole)
+
+
+@pytest.fixture
+def deadly(tmp_path, monkeypatch) -> None:
+    """A module with a controller that ends the process, where processes that start later find it."""
+    (tmp_path / "deadly.py").write_text("import os\ndef law(seen):\n    os._exit(1)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dask", [[["--nanny"]]], indirect=True)
+def test_a_chunk_that_kills_its_workers(deadly, dask, tmp_path):
+    """More deaths than Dask allows are one sentence."""
+    address, _ = dask
+    asked = Sweep.of(MISSION, SCATTER, runs=8, controller="deadly:law")
+    with pytest.raises(RigidfleetError, match=r"workers died .* 0 of 8 runs are saved"):
+        fly(asked, tmp_path / "cluster", cluster=address)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dask", [[]], indirect=True)
+def test_a_cluster_without_workers(dask, tmp_path, monkeypatch):
+    """A scheduler that no worker joins in time is one sentence."""
+    monkeypatch.setattr("rigidfleet.sweep.runner._ALONE", 2.0)
+    with pytest.raises(RigidfleetError, match=r"no worker came for 2 s.* 0 of 20 runs are saved"):
+        fly(sweep(), tmp_path / "cluster", cluster=dask[0])
 
 
 @pytest.mark.long
@@ -970,6 +1314,32 @@ def test_command(folder, capsys):
     assert cli.main(["sweep", "sweeps/pair", "--seed", "3"]) == codes.BAD_INPUT
     assert cli.main(["sweep", "pair.toml", "--runs", "4"]) == codes.BAD_INPUT
     assert cli.main([*line, "--workers", "0"]) == codes.BAD_INPUT
+
+
+def test_the_command_flies_shards(folder, capsys):
+    """Shards by the line of the sweep or by its folder; merged, they are a sweep like any other."""
+    line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--runs", "20", "--seed", "3", "--quiet"]
+    whole = fly(sweep(SCATTER[1]), folder / "whole", workers=1)
+    assert cli.main([*line, "--shard", "2/2"]) == codes.PASSED
+    assert not Path("sweeps/pair/shards/2-of-2/figures").exists()
+    wrong = {
+        "--shard 0/2": ["sweep", "sweeps/pair", "--shard", "0/2"],
+        "with K from 1 to N, such as 3/40": ["sweep", "sweeps/pair", "--shard", "2"],
+        "partly flown: 1. Fly each": ["sweep", "sweeps/pair", "--merge"],
+        "exclude each other": ["sweep", "sweeps/pair", "--merge", "--shard", "1/2"],
+        "Go on by `rigidfleet sweep sweeps/pair --shard 2/2`": [
+            "sweep",
+            "sweeps/pair/shards/2-of-2",
+        ],
+    }
+    for words, tokens in wrong.items():
+        assert cli.main(tokens) == codes.BAD_INPUT
+        assert words in capsys.readouterr().err
+    assert cli.main(["sweep", "sweeps/pair", "--shard", "1/2", "--quiet"]) == codes.PASSED
+    assert cli.main(["sweep", "sweeps/pair", "--merge", "--json"]) == codes.PASSED
+    assert json.loads(capsys.readouterr().out)["success"]["of"] == 20
+    assert numbers(read("sweeps/pair")) == numbers(whole)
+    assert Path("sweeps/pair/figures/outcome.png").exists()
 
 
 def test_progress_words():

@@ -10,6 +10,8 @@ from sample_missions import three_quadrotors
 
 import rigidfleet as rf
 from rigidfleet._common.text import percent
+from rigidfleet.kernel import control, references
+from rigidfleet.kernel.problem import workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.vehicles import TickTables, YawTurn, sampled_flight
@@ -345,6 +347,30 @@ def test_a_record_of_rotors_that_lies_is_found():
     assert not found["rotor_force"].passed
     assert found["rotor_force"].worst == pytest.approx(7.0)
     assert not found["record"].passed
+
+
+def test_points_have_a_path_in_tables_and_no_attitude():
+    """States are measured about the slots that the kernel flies; nothing is made that only an attitude reads."""
+    mission = load_mission("moving-obstacles")
+    flight = rf.Flight(mission)
+    while flight.begin() and flight.plan.phase.kind != "fly":
+        flight.advance()
+    problem, first = flight.plan.problem, round(flight.t * mission.autopilot.rate)
+    sampled = sampled_flight(mission)
+    tables, turn = TickTables(mission, sampled), YawTurn(flight.t, np.zeros(8), np.zeros(8))
+    tables.start_path(problem, first, sampled.tables)
+    made = tables.tables_for(first, first + 600, problem, turn)
+    assert not any(map(len, (made.yaw, made.jerk, made.snap)))
+    w = workspace(8, 0)
+    for row in (0, 250, 599):
+        t = (first + row) / mission.autopilot.rate
+        references.blend_slots(t, problem.reference, w.p, w.p_dot, w.p_ddot)
+        control.reference_motion(t, problem.motion, w)
+        control.desired_agents(w)
+        np.testing.assert_allclose(made.path[row], np.hstack([w.r_ref, w.v_ref]), atol=1e-9)
+    assert np.ptp(made.path[:, :, 0], axis=0).min() > 0.1  # they move
+    before = tables.start_path(problem, first + 250, made)
+    assert np.array_equal(before, made.path[250])
 
 
 def test_yaw_along_the_way_goes_on_from_table_to_table():

@@ -13,113 +13,37 @@ from importlib import import_module
 
 from rigidfleet._version import __version__ as __version__
 
-TYPE_CHECKING = False  # for the command, which has to take over Ctrl-C before it loads `typing`
-if TYPE_CHECKING:
-    from rigidfleet.assessment import Verdict, assess
-    from rigidfleet.errors import (
-        FlightError,
-        MissionError,
-        ResultError,
-        RigidfleetError,
-        SweepError,
-    )
-    from rigidfleet.interchange import Export, export
-    from rigidfleet.mission import Mission, load_mission, mission_names
-    from rigidfleet.plotting import plot
-    from rigidfleet.preflight.check import Preflight, check
-    from rigidfleet.reporting import report
-    from rigidfleet.result import Result
-    from rigidfleet.rigidity.design import design
-    from rigidfleet.simulation.ensemble import Ensemble, establish
-    from rigidfleet.simulation.flight import (
-        AttitudeCommand,
-        Flight,
-        FlightInterrupted,
-        Observation,
-        Progress,
-        RotorCommand,
-        simulate,
-    )
-    from rigidfleet.simulation.trajectories import trajectories
-    from rigidfleet.sweep import Sweep
-    from rigidfleet.tuning import Tuned, tune
-    from rigidfleet.web.live import live
-    from rigidfleet.web.replay import replay
-
-
-__all__ = [
-    "AttitudeCommand",
-    "Ensemble",
-    "Export",
-    "Flight",
-    "FlightError",
-    "FlightInterrupted",
-    "Mission",
-    "MissionError",
-    "Observation",
-    "Preflight",
-    "Progress",
-    "Result",
-    "ResultError",
-    "RigidfleetError",
-    "RotorCommand",
-    "Sweep",
-    "SweepError",
-    "Tuned",
-    "Verdict",
-    "__version__",
-    "assess",
-    "check",
-    "design",
-    "establish",
-    "export",
-    "live",
-    "load_mission",
-    "mission_names",
-    "plot",
-    "replay",
-    "report",
-    "simulate",
-    "trajectories",
-    "tune",
-]
-
-#: The module of each public name.
-_HOME = {
-    "AttitudeCommand": "simulation.flight",
-    "Ensemble": "simulation.ensemble",
-    "Export": "interchange",
-    "Flight": "simulation.flight",
-    "FlightError": "errors",
-    "FlightInterrupted": "simulation.flight",
-    "Mission": "mission",
-    "MissionError": "errors",
-    "Observation": "simulation.flight",
-    "Preflight": "preflight.check",
-    "Progress": "simulation.flight",
-    "Result": "result",
-    "ResultError": "errors",
-    "RigidfleetError": "errors",
-    "RotorCommand": "simulation.flight",
-    "Sweep": "sweep",
-    "SweepError": "errors",
-    "Tuned": "tuning",
-    "Verdict": "assessment",
-    "assess": "assessment",
-    "check": "preflight.check",
-    "design": "rigidity.design",
-    "establish": "simulation.ensemble",
-    "export": "interchange",
-    "live": "web.live",
-    "load_mission": "mission",
-    "mission_names": "mission",
-    "plot": "plotting",
-    "replay": "web.replay",
-    "report": "reporting",
-    "simulate": "simulation.flight",
-    "trajectories": "simulation.trajectories",
-    "tune": "tuning",
+#: The public names of each module; `__init__.pyi` has them for type checkers.
+_NAMES = {
+    "assessment": ("Verdict", "assess"),
+    "errors": ("FlightError", "MissionError", "ResultError", "RigidfleetError", "SweepError"),
+    "interchange": ("Export", "export"),
+    "mission": ("Mission", "load_mission", "mission_names"),
+    "plotting": ("plot",),
+    "preflight.check": ("Preflight", "check"),
+    "reporting": ("report",),
+    "result": ("Result",),
+    "rigidity.design": ("design",),
+    "simulation.ensemble": ("Ensemble", "establish"),
+    "simulation.flight": (
+        "AttitudeCommand",
+        "Flight",
+        "FlightInterrupted",
+        "Observation",
+        "Progress",
+        "RotorCommand",
+        "simulate",
+    ),
+    "simulation.trajectories": ("trajectories",),
+    "sweep": ("Sweep",),
+    "tuning": ("Tuned", "tune"),
+    "web.live": ("live",),
+    "web.replay": ("replay",),
 }
+#: The module of each public name.
+_HOME = {name: module for module, names in _NAMES.items() for name in names}
+
+__all__ = sorted([*_HOME, "__version__"])  # noqa: PLE0605
 
 
 def __getattr__(name: str) -> object:

@@ -96,15 +96,15 @@ def at_times(samples: Setpoints, wanted: Floats) -> Setpoints:
         return samples
     x = np.empty((count, 4, n, 4))
     for i in range(n):
-        x[:, :, i] = curve_of(samples, i).states(wanted, 4).swapaxes(0, 1)
+        x[:, :, [i]] = ways_of(samples, slice(i, i + 1)).states(wanted, 4).swapaxes(0, 1)
     return Setpoints(wanted, x[..., :3], x[:, 0, :, 3], x[:, 1, :, 3])
 
 
-def curve_of(samples: Setpoints, agent: int) -> Piecewise:
-    """The way of an agent, from 0: pieces (k, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
+def ways_of(samples: Setpoints, agents: slice) -> Piecewise:
+    """The ways of n agents: pieces (k, n, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
     first, knots = intervals(samples.time)
-    state = samples.state[:, :, agent].swapaxes(0, 1)
-    yaw = np.stack([samples.yaw[:, agent], samples.yaw_rate[:, agent]])[..., None]
+    state = samples.state[:, :, agents].swapaxes(0, 1)
+    yaw = np.stack([samples.yaw[:, agents], samples.yaw_rate[:, agents]])[..., None]
     position, turned = (
         Piecewise.of_ends(knots, x[:, first], x[:, first + 1]) for x in (state, yaw)
     )

@@ -61,9 +61,8 @@ def attribute(file: h5py.File, name: str, kind: Any) -> Any:
     if name not in file.attrs:
         raise DamagedError(f"attribute {name} is missing")
     value = file.attrs[name]
-    if (
-        isinstance(value, np.ndarray) and value.size == 1
-    ):  # other tools write a scalar as an array of one element
+    # Other tools write a scalar as an array of one element.
+    if isinstance(value, np.ndarray) and value.size == 1:
         value = value.reshape(-1)[0]
     if kind is int:
         if not isinstance(value, int | np.integer) or isinstance(value, bool):

@@ -128,7 +128,7 @@ def _sample_checks(measured: Measurements) -> Iterator[CheckResult]:
                 continue
             away, due = math.inf, min(t, p.t_end)
             if i in measured.flown:
-                away = abs(result.time.item(measured.nearest(due, i)) - due)
+                away = abs(result.time.item(measured.nearest_sample(due, i)) - due)
             if away > _UNSEEN:
                 nearest = f"the nearest sample is {away:.2g} s away"
                 nearest = nearest if i in measured.flown else "the phase has no sample"
@@ -153,7 +153,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         shaping = KINDS[p.kind].shapes or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:
             continue
-        last = measured.samples[i].stop - 1
+        last = measured.parts[i].stop - 1
         edges, _ = measured.edges(p.formation, last)
         held = False
         if p.distances is not None:
@@ -258,7 +258,7 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
     for i, p in enumerate(phases):
         if not (p.finished and KINDS[p.kind].lands):
             continue
-        k = measured.samples[i].stop - 1
+        k = measured.parts[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
         who = np.flatnonzero(measured.left[k] & (measured.close.each[k] <= PAD))
         who = who[measured.standing(np.full(len(who), k), who).any(axis=0)]
@@ -366,14 +366,14 @@ def _clearance_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResu
             who, what = first.who.split(", ", 1)
             depth = f"by {value(abs(e.value), 'm')} at {e.when:.2f} s"
             words = f"{who} hits '{what}', first at {first.when:.2f} s; {agent} is deepest in '{obstacle}', {depth}"
-        yield limit_check(q, e, 0.0, words, passed=not first, first=first)
+        yield limit_check(q, e, q.limit_of(measured.mission), words, passed=not first, first=first)
     for name, when in (("clearance_start", "since the start"), ("clearance_end", "at the end")):
         if name in apart and not hit:
             e = apart[name]
             agent, obstacle = e.who.split(", ", 1)
             how = "in contact with" if e.value <= _CONTACT else f"{value(e.value, 'm')} above"
             words = f"{agent} stands {how} '{obstacle}' {when} ({e.when:.2f} s)"
-            yield limit_check(quantity(name), e, 0.0, words, passed=True)
+            yield limit_check(quantity(name), e, q.limit_of(measured.mission), words, passed=True)
 
 
 def _loss_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
@@ -388,7 +388,7 @@ def _loss_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
                 words += f"; after that, {first.who} collide, first at {first.when:.2f} s"
             else:
                 words += f"; after that, {_nearness_in_words(e)}"
-        yield limit_check(q, e, 0.0, words, first=first)
+        yield limit_check(q, e, q.limit_of(measured.mission), words, first=first)
     yield from abandonment_check(measured)
 
 
@@ -415,12 +415,12 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
 
 
 def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
-    if q.limit_of(measured.mission) is None or (e := measured.worst(q.name)) is None:
+    if (limit := q.limit_of(measured.mission)) is None or (e := measured.worst(q.name)) is None:
         return
     words = f"{e.who} comes within {value(-e.value, 'm')} of the geofence at {e.when:.2f} s"
     if e.value > 0:
         words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
-    yield limit_check(q, e, 0.0, words)
+    yield limit_check(q, e, limit, words)
 
 
 def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
@@ -428,7 +428,9 @@ def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]
     if (e := measured.worst(q.name)) is None:
         return  # nobody knows what a trajectory from elsewhere needs
     limits, margin = measured.mission.fleet.thrust_limit, QUANTITIES["thrust_margin"]
-    beyond = measured.worst_among(margin.name, Samples(margin, measured.thrust - limits))
+    beyond = measured.worst_among(
+        margin.name, Samples(margin, measured.samples_of("thrust").values - limits)
+    )
     if beyond is None:
         yield limit_check(q, e, None)
         return

@@ -44,28 +44,37 @@ class Measurements:
         self.whole = bool(self.left.all())
         #: Samples of each phase.
         ends = np.searchsorted(result.phase, np.arange(len(result.phases) + 1))
-        self.samples = [slice(*pair) for pair in pairwise(ends.tolist())]
+        self.parts = [slice(*pair) for pair in pairwise(ends.tolist())]
         #: Phases that have samples.
-        self.flown = [k for k, s in enumerate(self.samples) if s.stop > s.start]
+        self.flown = [k for k, s in enumerate(self.parts) if s.stop > s.start]
         #: Quantities of which the record tells what happens between samples.
         self.names_recorded = set[str]().union(*(p.extremes for p in result.phases))
         self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
         self._nearest: dict[tuple[float, int], int] = {}
         self._sampled: dict[str, Samples] = {}
-        #: Distances to each other and to obstacles at samples.
-        self.close = closeness(result)
-        self.measured = {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
-        self.thrust = self.measured["thrust"].values
-        starts = np.array([self.samples[k].start for k in self.flown])
-        ranks = np.full((len(self.measured), len(result.phases)), -np.inf)
-        for row, sampled in zip(ranks, self.measured.values(), strict=True):
+        #: The last sample of each phase flown, and positions (F, N, 3) there.
+        self.last = [self.parts[k].stop - 1 for k in self.flown]
+        self.ends = result.position[self.last]
+
+    @cached_property
+    def close(self) -> proximity.Closeness:
+        """Distances to each other and to obstacles at samples."""
+        return closeness(self.result)
+
+    @cached_property
+    def of_phases(self) -> dict[str, Samples]:
+        """Values at samples of each quantity of which a phase has a worst value."""
+        return {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
+
+    @cached_property
+    def rank(self) -> dict[str, list[float]]:
+        """Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples."""
+        starts = np.array([self.parts[k].start for k in self.flown])
+        ranks = np.full((len(self.of_phases), len(self.parts)), -np.inf)
+        for row, sampled in zip(ranks, self.of_phases.values(), strict=True):
             if places := sampled.rank.shape[1]:
                 row[self.flown] = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts)
-        #: Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples.
-        self.rank = dict(zip(self.measured, ranks.tolist(), strict=True))
-        #: The last sample of each phase flown, and positions (F, N, 3) there.
-        self.last = [self.samples[k].stop - 1 for k in self.flown]
-        self.ends = result.position[self.last]
+        return dict(zip(self.of_phases, ranks.tolist(), strict=True))
 
     def first_time(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -76,14 +85,15 @@ class Measurements:
     def samples_of(self, name: str) -> Samples:
         """Values of a quantity at samples."""
         if name not in self._sampled:
-            self._sampled[name] = samples(self.result, name, self.close)
+            close = self.close if name in ("separation", "clearance") else None
+            self._sampled[name] = samples(self.result, name, close)
         return self._sampled[name]
 
     def worst_sample(
-        self, samples: Samples, part: slice = slice(None), *, alone: bool = False
+        self, sampled: Samples, part: slice = slice(None), *, alone: bool = False
     ) -> Extreme | None:
         """The worst of some values; None if none is finite. ``alone``: nothing is known between them."""
-        rank, values, result = samples.rank[part], samples.values, self.result
+        rank, values, result = sampled.rank[part], sampled.values, self.result
         if not rank.size:
             return None
         k, place = divmod(int(rank.argmax()), rank.shape[1])
@@ -91,7 +101,7 @@ class Measurements:
             return None
         k += part.start or 0
         at = (k,) if values.ndim == 1 else (k, place)
-        who = owner_name(result, samples.quantity, *samples.owner(*at))
+        who = owner_name(result, sampled.quantity, *sampled.owner(*at))
         phase = result.phases[result.phase.item(k)].name
         return Extreme(values.item(at), result.time.item(k), who, phase, alone)
 
@@ -111,14 +121,14 @@ class Measurements:
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
-        if name in self.measured:
+        if quantity(name).by_phase:
             every = [worst[name] for worst in self.worst_by_phase if name in worst]
             rank = QUANTITIES[name].rank
             return max(every, key=lambda e: rank(e.value), default=None)
         return self.worst_among(name, self.samples_of(name) if name in SAMPLED else None)
 
-    def worst_among(self, name: str, samples: Samples | None) -> Extreme | None:
-        """The worst value of a flight among some ``samples``, or between them."""
+    def worst_among(self, name: str, values: Samples | None) -> Extreme | None:
+        """The worst value of a flight among some ``values`` at samples, or between them."""
         rank = quantity(name).rank
         every = {
             k: rank(p.extremes[name].value)
@@ -126,7 +136,7 @@ class Measurements:
             if name in p.extremes
         }
         between = self.recorded_extreme(name, max(every, key=every.__getitem__)) if every else None
-        sampled = None if samples is None else self.worst_sample(samples, alone=between is None)
+        sampled = None if values is None else self.worst_sample(values, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
         return between if rank(between.value) > rank(sampled.value) else sampled
@@ -134,9 +144,9 @@ class Measurements:
     @cached_property
     def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
-        every: list[dict[str, Extreme]] = [{} for _ in self.samples]
-        phases = list(zip(self.result.phases, self.samples, every, strict=True))
-        for name, sampled in self.measured.items():
+        every: list[dict[str, Extreme]] = [{} for _ in self.parts]
+        phases = list(zip(self.result.phases, self.parts, every, strict=True))
+        for name, sampled in self.of_phases.items():
             rank_of, alone = sampled.quantity.rank, name not in self.names_recorded
             for rank, (phase, part, worst) in zip(self.rank[name], phases, strict=True):
                 x = phase.extremes.get(name)
@@ -216,7 +226,7 @@ class Measurements:
                 np.abs(proximity.lengths(r, result.edges).T - result.distance),
                 "m",
             ),
-            "thrust": (self.thrust - result.thrust, "N"),
+            "thrust": (self.samples_of("thrust").values - result.thrust, "N"),
         }
         for name, (off, unit) in stored.items():
             wrong = off > (rounding if unit == "m" else 1e-6)
@@ -228,21 +238,21 @@ class Measurements:
                 )
                 yield words, float(time[k])
         for index, phase in enumerate(result.phases):
-            samples, extremes = self.samples[index], phase.extremes
-            if samples.stop > samples.start and extremes:
+            part, extremes = self.parts[index], phase.extremes
+            if part.stop > part.start and extremes:
                 lacking = (x for x in _DUE if x not in extremes and self.is_due(x, index))
                 if name := next(lacking, ""):
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
-                    yield words, float(time[samples.start])
+                    yield words, float(time[part.start])
             for name, share in _SLACK.items():
                 x, rank = extremes.get(name), self.rank[name][index]
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
-                if rank > self.measured[name].quantity.rank(x.value) + slack or not (
+                if rank > self.of_phases[name].quantity.rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
-                    sampled = self.worst_sample(self.measured[name], samples)
+                    sampled = self.worst_sample(self.of_phases[name], part)
                     assert sampled is not None
                     words = (
                         f"its worst {name.replace('_', ' ')} of phase '{phase.name}' is given as"
@@ -256,7 +266,7 @@ class Measurements:
             case "thrust":
                 return self.rank[name][index] > -math.inf
             case "separation":
-                return bool(np.count_nonzero(self.left[self.samples[index].start]) > 1)
+                return bool(np.count_nonzero(self.left[self.parts[index].start]) > 1)
             case "clearance":
                 phase, every = self.result.phases[index], self.mission.obstacles
                 return any(_meets(*thing.solid.there[0].tolist(), phase) for thing in every)
@@ -266,8 +276,7 @@ class Measurements:
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
-        result, samples = self.result, self.samples[index]
-        flown = samples.stop > samples.start
+        result, flown = self.result, index in self.flown
         finished = flown and (result.complete or index < len(result.phases) - 1)
         finished = finished and not record.abandoned
         fit = self.fits.get(index)
@@ -348,7 +357,7 @@ class Measurements:
                 continue
             one = index, end, slots, None
             if not self.whole:
-                left = np.flatnonzero(self.left[self.samples[index].stop - 1])
+                left = np.flatnonzero(self.left[self.parts[index].stop - 1])
                 one = index, end[left], slots[left], left
             if len(one[1]) > 1:
                 alike.setdefault(len(one[1]), []).append(one)
@@ -370,7 +379,7 @@ class Measurements:
         if not flat:
             return {}
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        last = [self.samples[k].stop - 1 for k in flat]
+        last = [self.parts[k].stop - 1 for k in flat]
         q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
         axes = np.array([fit.axis for fit in flat.values()])
         aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
@@ -386,12 +395,12 @@ class Measurements:
                 angle_by_phase[k] = angle
         return angle_by_phase
 
-    def nearest(self, t: float, index: int) -> int:
+    def nearest_sample(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
-        known, time, samples = self._nearest.get((t, index)), self.result.time, self.samples[index]
+        known, time, part = self._nearest.get((t, index)), self.result.time, self.parts[index]
         if known is None:
-            after = bisect_left(time, t, samples.start, samples.stop - 1)
-            before = max(after - 1, samples.start)
+            after = bisect_left(time, t, part.start, part.stop - 1)
+            before = max(after - 1, part.start)
             known = after if abs(time[after] - t) < abs(time[before] - t) else before
             self._nearest[t, index] = known
         return known
@@ -412,7 +421,7 @@ class Measurements:
         ]
         if not targets:
             return {}
-        at = [self.nearest(target["time"], k) for (_, k), target in targets]
+        at = [self.nearest_sample(target["time"], k) for (_, k), target in targets]
         miss: dict[str, dict[int, float]] = {}
         for name, values in (
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
@@ -448,11 +457,11 @@ class Measurements:
 
     def misses_on_way(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""
-        result, samples = self.result, self.samples[index]
+        result, part = self.result, self.parts[index]
         for point in (result.phases[index].target or {}).get("through", ()):
-            if samples.stop == samples.start or result.time[samples.stop - 1] < point["time"]:
+            if part.stop == part.start or result.time[part.stop - 1] < point["time"]:
                 continue
-            k = self.nearest(point["time"], index)
+            k = self.nearest_sample(point["time"], index)
             miss, v = math.dist(result.cm[k].tolist(), point["position"]), point.get("velocity")
             off = None if v is None else math.dist(result.cm_velocity[k].tolist(), v)
             yield Waypoint(float(result.time[k]), miss, off, None, None)

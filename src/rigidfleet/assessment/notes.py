@@ -31,7 +31,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             yield f"the link {i}-{j} is lost at {t:.2f} s: after that, no edge joins agents {i} and {j}"
     agents = measured.mission.agents
     if agents.saturate:
-        full = measured.thrust >= np.array(agents.thrust_limit) * (1 - 1e-6)
+        full = measured.samples_of("thrust").values >= np.array(agents.thrust_limit) * (1 - 1e-6)
         if full.any():
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first_time(full.max(axis=1))

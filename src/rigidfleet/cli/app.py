@@ -67,6 +67,7 @@ _COMMANDS = (
 )  # fmt: skip
 for _key, _command in enumerate(_COMMANDS, start=1):
     app.command(_command, sort_key=_key)
+app.register_install_completion_command(help="Complete words with Tab in this user's shell.")
 
 
 def main(tokens: Sequence[str] | None = None) -> int:

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from rigidfleet._common.quantities import LIMITS_OF_CURVES
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.outputs import Files, keep_existing
+from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
 
 #: Options that a mission replaces.
@@ -86,7 +86,6 @@ def assess(
     json : bool
         Print the verdict as JSON.
     """
-    from rigidfleet._common.files import make_folder, write_file
     from rigidfleet.assessment import assess as judge
 
     if not files:
@@ -115,41 +114,29 @@ def assess(
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
         read = read_trajectories(files, **{key: options[key] for key in _READ if key in chosen})
         result = of_curves(
-            read.curves, read.assumed, names=read.names, away=read.away, since=read.since, mission=mission,
-            separation=separation, limits=_limits(limits or []) | higher, radius=radius or 0.0, ground=ground,
-            name=_name(files[0]),
+            read, mission=mission, separation=separation, limits=_limits(limits or []) | higher,
+            radius=radius or 0.0, ground=ground, name=_name(files[0]),
         )  # fmt: skip
-        result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
     verdict = judge(result)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
-        made.try_out()
-        written = made.result, made.verdict, made.report, made.replay, *made.figures
-        keep_existing(*written, force=force)
-    if json:
-        console.print_json(verdict.to_dict())
-    else:
-        for part in verdict.read if explain else ():
-            for key, value in part.items():
-                words = ", ".join(value) if isinstance(value, list) else f"{value}"
-                line = f"{key.replace('_', ' ')}: {words}"
-                console.out().print(line, highlight=False, markup=False, soft_wrap=True)
-        console.out().print(verdict)
+        made.claim(replace=force)
+    for part in verdict.read if explain and not json else ():
+        for key, value in part.items():
+            words = ", ".join(value) if isinstance(value, list) else f"{value}"
+            line = f"{key.replace('_', ' ')}: {words}"
+            console.out().print(line, highlight=False, markup=False, soft_wrap=True)
+    console.show_verdict(verdict, json=json)
     if made is not None:
         from rigidfleet.cli.report import write_report
-        from rigidfleet.cli.run import list_files, of_formats, write_figures, write_replay
+        from rigidfleet.cli.run import of_formats, write_figures, write_replay
 
-        make_folder(made.folder)
-        result.save(made.result)
-        for earlier in made.figures:
-            earlier.unlink(missing_ok=True)
-        write_file(made.verdict, (verdict.json() + "\n").encode())
+        made.save(result, verdict)
         write_report([result], [verdict], made.report, quiet=json)
         write_replay(result, made.replay)
         write_figures(result, of_formats(made.figures, figures, None), quiet=json)
         if not json:
-            console.out().print()
-            list_files(made)
+            made.show()
     return PASSED if verdict.passed else FAILED
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from rigidfleet._common.facts import Sheet
+    from rigidfleet.assessment import Verdict
     from rigidfleet.simulation.flight import Progress as FlightProgress
     from rigidfleet.sweep import SweepProgress
 
@@ -69,7 +70,7 @@ def prepare_streams() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by `>&-`
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
         elif isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")  # a character that the terminal lacks becomes "?"
 
@@ -95,6 +96,14 @@ def print_json(data: object) -> None:
     import json
 
     print_exactly(json.dumps(data, ensure_ascii=False, indent=2, default=str) + "\n")
+
+
+def show_verdict(verdict: Verdict, *, json: bool = False, quiet: bool = False) -> None:
+    """Print a verdict, as JSON or in words."""
+    if json:
+        print_json(verdict.to_dict())
+    elif not quiet:
+        out().print(verdict)
 
 
 def complain(error: object) -> None:

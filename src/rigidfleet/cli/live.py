@@ -14,7 +14,7 @@ from rigidfleet.cli.outputs import Files
 if TYPE_CHECKING:
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.run import heeding_interrupts, list_files
+from rigidfleet.cli.run import heeding_interrupts
 
 
 def live(
@@ -45,8 +45,6 @@ def live(
     flown = load_mission(mission)
     if not is_compiled():
         console.err().print(console.COMPILING)
-    from rigidfleet._common.files import write_file
-    from rigidfleet.assessment import assess
     from rigidfleet.web.live import live as fly
 
     place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")
@@ -54,12 +52,8 @@ def live(
 
     def save_flight(result: Result) -> str:
         files = Files(place.folder, result.mission.name).make_new_folder()
-        result.save(files.result)
-        verdict = assess(result)
-        write_file(files.verdict, (verdict.json() + "\n").encode())
-        console.out().print(verdict)
-        console.out().print()
-        list_files(files)
+        console.show_verdict(files.save(result))
+        files.show()
         return f"Saved in {files.result}."
 
     def ready(url: str) -> None:

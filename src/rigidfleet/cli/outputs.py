@@ -5,9 +5,15 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import TYPE_CHECKING
 
-from rigidfleet._common.files import unwritable
+from rigidfleet._common.files import make_folder, unwritable, write_file
+from rigidfleet.cli import console
 from rigidfleet.errors import ResultError
+
+if TYPE_CHECKING:
+    from rigidfleet.assessment import Verdict
+    from rigidfleet.result import Result
 
 
 class Files:
@@ -61,7 +67,9 @@ class Files:
             The folder cannot be written.
         """
         folder = self.folder.absolute()
-        while not os.path.lexists(folder):
+        while (
+            not os.path.lexists(folder) and folder != folder.parent
+        ):  # as on a drive that is not there
             folder = folder.parent
         try:
             TemporaryFile(dir=folder).close()
@@ -89,10 +97,41 @@ class Files:
         except OSError as error:
             raise unwritable(folder, error) from error
 
-    def forget(self) -> None:
-        """Remove all files that are derived from an earlier result."""
+    def save(self, result: Result, verdict: Verdict | None = None) -> Verdict:
+        """Write a result and its verdict, without what is left of an earlier result, and return the verdict.
+
+        Raises
+        ------
+        ResultError
+            A file cannot be written.
+        """
+        from rigidfleet.assessment import assess
+
+        make_folder(self.folder)
+        result.save(self.result)
         for path in self.beside_result:
             path.unlink(missing_ok=True)
+        verdict = assess(result) if verdict is None else verdict
+        self.write_verdict(verdict)
+        return verdict
+
+    def write_verdict(self, verdict: Verdict) -> None:
+        """Write a verdict as JSON."""
+        write_file(self.verdict, (verdict.json() + "\n").encode())
+
+    def show(self) -> None:
+        """Print the paths of the files that are there."""
+        console.out().print()
+        for what, path in (
+            ("Result", self.result), ("Verdict", self.verdict), ("Table", self.table), ("Report", self.report),
+            ("Replay", self.replay),
+        ):  # fmt: skip
+            if path.exists():
+                how = " (open it in a browser)" if path.suffix == ".html" else ""
+                console.out().print(f"{what:8} {path}{how}", soft_wrap=True)
+        if drawn := [path for path in self.figures if path.exists()]:
+            text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
+            console.out().print(text, soft_wrap=True)
 
 
 def keep_existing(

@@ -16,7 +16,6 @@ from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.run import (
     Format,
     check_width,
-    list_files,
     of_formats,
     write_figures,
     write_replay,
@@ -67,7 +66,7 @@ def report(
     quiet : bool
         Print only errors, and JSON with --json.
     """
-    from rigidfleet._common.files import make_folder, write_file
+    from rigidfleet._common.files import make_folder
     from rigidfleet.assessment import assess
     from rigidfleet.result import Result
 
@@ -93,20 +92,18 @@ def report(
         if not (json or quiet):
             console.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
-        if not (json or quiet):
-            console.out().print(verdicts[0])
+        console.show_verdict(verdicts[0], quiet=json or quiet)
         drawn = [] if no_figures else of_formats(files.figures, figures, format)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:
-            write_file(files.verdict, (verdicts[0].json() + "\n").encode())
+            files.write_verdict(verdicts[0])
         left = [path for path in drawn if path not in kept]
         if files.report not in kept:
             write_report(records, verdicts, files.report, quiet=quiet)
         write_figures(records[0], left, quiet=quiet, titles=not no_titles, width=width)
         if not (json or quiet):
-            console.out().print()
-            list_files(files)
+            files.show()
         if kept and not quiet:
             console.err().print(
                 f"{console.count(len(kept), 'existing file')} kept; use --force to overwrite"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager, nullcontext
@@ -92,23 +91,13 @@ def run(
     with watching(None if quiet else console.FlightWatch()) as progress:
         result, interrupted = fly(loaded, progress)
 
-    from rigidfleet._common.files import make_folder, write_file
-    from rigidfleet.assessment import assess
-
-    make_folder(files.folder)
-    result.save(files.result)
-    files.forget()
+    verdict = files.save(result)
     if csv:
         try:
             result.to_csv(files.table, rate=csv_rate, flown=flown)
         except ValueError as error:
             raise RigidfleetError(f"--csv-rate: {error}.") from None
-    verdict = assess(result)
-    write_file(files.verdict, (verdict.json() + "\n").encode())
-    if json:
-        console.print_exactly(verdict.json() + "\n")
-    elif not quiet:
-        console.out().print(verdict)
+    console.show_verdict(verdict, json=json, quiet=quiet)
     so_far = "the flight so far is saved, marked incomplete,"
     what = so_far if interrupted else "the complete flight is saved"
     if not interrupted:
@@ -121,8 +110,7 @@ def run(
         except KeyboardInterrupt:
             interrupted = True
     if not (json or quiet):
-        console.out().print()
-        list_files(files)
+        files.show()
     if interrupted:
         console.err().print(
             f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True
@@ -253,21 +241,3 @@ def write_replay(result: Result, path: Path) -> None:
     from rigidfleet.web.replay import replay as write
 
     write(result, path)
-
-
-def list_files(files: Files) -> None:
-    """Print the paths of the files of a flight."""
-    for what, path in (
-        ("Result", files.result),
-        ("Verdict", files.verdict),
-        ("Table", files.table),
-        ("Report", files.report),
-        ("Replay", files.replay),
-    ):
-        if path.exists():
-            how = " (open it in a browser)" if path.suffix == ".html" else ""
-            console.out().print(f"{what:8} {path}{how}", soft_wrap=True)
-    drawn = [path for path in files.figures if path.exists()]
-    if drawn:
-        text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
-        console.out().print(text, soft_wrap=True)

@@ -33,6 +33,8 @@ def sweep(
     rate: float | None = None,
     workers: Annotated[int | None, Parameter(converter=exact)] = None,
     cluster: str | None = None,
+    shard: str = "",
+    merge: bool = False,
     summary: bool = False,
     map_: Annotated[tuple[str, str] | None, Parameter(name="--map")] = None,
     metric: str = "",
@@ -49,7 +51,7 @@ def sweep(
     Parameters
     ----------
     mission : str
-        A mission, a sweep file, or the folder of a sweep to resume.
+        A mission, a sweep file, or the folder of a sweep to resume, to merge or to summarise.
     vary : str
         A variation "PATH = KIND(NUMBERS)"; += adds to the value in the mission, *= scales it; may be
         repeated. KIND is normal, uniform, log-uniform, choice, grid, linspace or geomspace.
@@ -76,6 +78,10 @@ def sweep(
         Number of processes on this machine. Default: number of cores.
     cluster : str
         Address of a Dask scheduler, whose workers fly the runs.
+    shard : str
+        K/N: fly only part K, from 1, of N, into a store of its own below the folder. For job arrays.
+    merge : bool
+        Fly nothing; make one sweep of all shards in a folder.
     summary : bool
         Fly nothing; summarise and draw the sweep in a folder again.
     map_ : str
@@ -94,34 +100,32 @@ def sweep(
         Print only errors, and JSON with --json.
     """
     check_workers(workers)
+    if merge + summary + bool(shard) > 1:
+        raise RigidfleetError("--shard, --merge and --summary exclude each other: use one of them.")
     from rigidfleet._common.files import write_file
-    from rigidfleet.sweep import figures, fly, store
+    from rigidfleet.sweep import figures, fly, shards, store
     from rigidfleet.sweep.record import UNJUDGED, reason_in_words
     from rigidfleet.sweep.summary import summarise
 
-    if summary:
-        folder = Path(mission)
-        table = store.read(folder)
+    folder = Path(mission)
+    if summary or merge:
+        table = store.read(folder) if summary else shards.merge(folder, replace=force)
     else:
         keys = {
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
             "controller": controller, "rate": rate,
         }  # fmt: skip
-        definition, folder = _sweep_and_folder(mission, vary or [], runs, out, keys)
+        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys)
+        folder = shards.shard_folder(whole, shard)
         try:
             with watching(None if quiet else console.SweepWatch()) as progress:
                 table = fly(
-                    definition,
-                    folder,
-                    workers=workers,
-                    cluster=cluster,
-                    replace=force,
-                    progress=progress,
-                )
+                    definition, whole, workers=workers, cluster=cluster, shard=shard, replace=force, progress=progress,
+                )  # fmt: skip
         except KeyboardInterrupt:
             done = len(store.read(folder).run) if store.is_store(folder) else 0
             words = f"Interrupted: {done} of {definition.runs} runs are saved in {folder}"
-            again = f"To resume: rigidfleet sweep {folder}"
+            again = f"To resume: rigidfleet sweep {whole}{shard and f' --shard {shard}'}"
             console.err().print(f"{words}\n{again}", style="yellow", soft_wrap=True)
             return INTERRUPTED
     outcome = summarise(table)
@@ -130,7 +134,7 @@ def sweep(
         console.print_exactly(outcome.json() + "\n")
     elif not quiet:
         console.show(outcome.facts())
-    drawn = [] if no_figures else figures.plot(
+    drawn = [] if no_figures or shard else figures.plot(
         table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
         titles=not no_titles,
     )  # fmt: skip
@@ -151,22 +155,23 @@ def sweep(
 
 
 def _sweep_and_folder(
-    what: str, vary: list[str], runs: int | None, out: Path | None, keys: dict[str, Any]
+    what: str, vary: list[str], runs: int | None, out: Path | None, shard: str, keys: dict[str, Any]
 ) -> tuple[Sweep, Path]:
     """Sweep of the command line, and its folder."""
     from rigidfleet.mission import mission_names
-    from rigidfleet.sweep import Sweep, store
+    from rigidfleet.sweep import Sweep, shards, store
     from rigidfleet.sweep.definition import is_sweep_file
 
-    if store.is_store(Path(what)):
+    here = Path(what)
+    if stored := [here] * store.is_store(here) or (shards.shard_folders(here) if shard else []):
         if vary or out is not None or any(value is not None for value in keys.values()):
             raise RigidfleetError(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
             )
-        definition = store.read_sweep(Path(what))
+        definition = store.read_sweep(stored[0])
         definition.runs = definition.runs if runs is None else runs
-        return definition, Path(what)
+        return definition, here
     if what not in mission_names() and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
     else:

@@ -12,14 +12,15 @@ import io
 import json
 import zipfile
 import zlib
-from itertools import pairwise
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.tables import fault
+from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.curves import Trajectories, with_headings
 from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.typing import Floats
 
 #: What is between the points of a show.
 BEZIER = "the Bezier curves of the show"
@@ -135,27 +136,29 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     for place, point in zip(where, points, strict=True):
         if not isinstance(point, list) or len(point) < 2:
             raise fault(f"{place}: is not [time, [x, y, z], [control points]]")
-    time = np.array([_floats(p[0], (), w) for p, w in zip(points, where, strict=True)])
-    ends = [_floats(p[1], (3,), w) for p, w in zip(points, where, strict=True)]
+    time = _each_floats([p[0] for p in points], (), where)
+    ends = _each_floats([p[1] for p in points], (3,), where)
     if len(points) == 1:
         points, time = [*points, [0, ends[0], []]], np.append(time, time + 1.0)
-        ends, where = ends * 2, where * 2
+        ends, where = np.repeat(ends, 2, axis=0), where * 2
     late = np.flatnonzero(~(np.diff(time) > 0.0))
     if len(late):
         k = int(late[0])
         why = f"{where[k + 1]}: its time {time[k + 1]:g} s is not after {time[k]:g} s"
         raise fault(why, "Give increasing times")
-    inner = [p[2] if len(p) > 2 and p[2] is not None else [] for p in points[1:]]
-    powers = 2 + max((len(c) if isinstance(c, list) else 0 for c in inner), default=0)
-    if powers > _INNER + 2:
-        more = f"{powers - 2} control points in a segment, more than {_INNER}"
-        raise fault(f"{who}: has {more}")
-    pieces = np.zeros((len(inner), 4, powers))
-    for k, ((begin, end), between) in enumerate(zip(pairwise(ends), inner, strict=True)):
-        middle = _floats(between or np.zeros((0, 3)), (None, 3), where[k + 1])
-        control = np.vstack([begin, middle, end])
-        piece = Piecewise.of_bernstein(time[k : k + 2], control.T[None])
-        pieces[k, :3, : len(control)] = piece.pieces[0]
+    inner = [p[2] if len(p) > 2 and p[2] else [] for p in points[1:]]
+    counts = np.array([len(c) if isinstance(c, list) else 1 for c in inner])
+    if (most := counts.max()) > _INNER:
+        raise fault(f"{who}: has {most} control points in a segment, more than {_INNER}")
+    pieces = np.zeros((len(inner), 4, most + 2))
+    for count in np.unique(counts):
+        k = np.flatnonzero(counts == count)
+        middle = [inner[i] or np.zeros((0, 3)) for i in k]
+        middle = _each_floats(middle, (count, 3), [where[i + 1] for i in k])
+        control = np.concatenate([ends[k, None], middle, ends[k + 1, None]], axis=1)
+        unit = Piecewise.of_bernstein(np.arange(len(k) + 1.0), control.swapaxes(1, 2))
+        h = np.diff(time)[k, None, None]
+        pieces[k, :3, : count + 2] = unit.pieces / h ** np.arange(count + 2)
     curve = Piecewise(time + start, pieces)
     # With automatic yaw, the vehicle turns by itself; no player of Skybrush says how.
     if yaw is None or yaw.get("autoYaw"):
@@ -166,6 +169,14 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     if (np.diff(times) < 0.0).any():
         raise fault(f"{who}: yaw setpoints: times go back", "Give increasing times")
     return with_headings(curve, times, -np.radians(degrees))
+
+
+def _each_floats(values: list[Any], shape: tuple[int, ...], where: list[str]) -> Floats:
+    """Finite numbers (K, ...) of values of one shape, read at once; one by one where one of them is wrong."""
+    if not any(isinstance(value, str | bool) for value in values):
+        with suppress(ContentError):
+            return _floats(values, (None, *shape), "")
+    return np.array([_floats(value, shape, w) for value, w in zip(values, where, strict=True)])
 
 
 def _floats(value: Any, shape: tuple[int | None, ...], where: str) -> Any:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.math.products import product_in_blocks
 from rigidfleet.math.rigid_body import centred, kabsch
 from rigidfleet.typing import Floats, Ints
 
@@ -247,7 +248,7 @@ def order_by_exchanges(p: Floats, q: Floats) -> Ints:
             i = np.arange(first, min(first + _TOGETHER, n))
             while len(i):
                 own = np.einsum("ia,ia->i", p, slots)
-                crossed = np.hstack([p[i], slots[i]]) @ np.hstack([slots, p]).T
+                crossed = product_in_blocks(np.hstack([p[i], slots[i]]), np.hstack([slots, p]).T)
                 xy = own[i, None] + own - crossed
                 j = xy.argmin(axis=1)
                 gain = xy[np.arange(len(i)), j]

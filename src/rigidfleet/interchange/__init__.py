@@ -2,14 +2,14 @@
 
 `export` writes a flight in one of `FORMATS`, reads its own output back, and says how far it is from what was exported.
 Each module of this package writes and reads the formats of one family: a ``write`` function returns the bytes of a
-file of one or all vehicles, and its ``read`` function the ways in them.
+files of one or all vehicles, and its ``read`` function the ways in them.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -42,7 +42,7 @@ class Format(NamedTuple):
 
     Attributes
     ----------
-    write : from the motion in a file and the rate [Hz] or the tolerance [m] to the file's bytes
+    write : from the motion and the rate [Hz] or the tolerance [m] to the bytes of each file
     read : from the bytes of a file to the ways of its vehicles
     suffix : of the files' names
     each : whether each vehicle has a file of its own
@@ -53,7 +53,7 @@ class Format(NamedTuple):
     lights : whether it has the vehicles' lights
     """
 
-    write: Callable[[ExportedMotion, Any], bytes]
+    write: Callable[[ExportedMotion, Any], Iterator[bytes]]
     read: Callable[[bytes], list[Piecewise]]
     suffix: str
     each: bool
@@ -66,9 +66,15 @@ class Format(NamedTuple):
     lights: bool = False
 
 
-def _write_table(motion: ExportedMotion, rate: float | None) -> bytes:
+def _write_table(motion: ExportedMotion, rate: float | None, first: int = 1) -> Iterator[bytes]:
     """The table that `Result.to_csv` writes: a row for each time and vehicle."""
-    return csv_text(motion.at_rate(rate), motion.first + 1).encode()
+    yield csv_text(motion.at_rate(rate), first).encode()
+
+
+def _write_tables(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+    """Such a table for each vehicle."""
+    for i in range(motion.n_agents):
+        yield from _write_table(motion.of_vehicle(i), rate, i + 1)
 
 
 FORMATS: dict[str, Format] = {
@@ -193,7 +199,7 @@ def export(
     result, path = as_result(result), as_path(path)
     chosen = format_of(format)
     if format == "setpoints" and path.suffix != ".csv":
-        chosen = chosen._replace(each=True)
+        chosen = chosen._replace(write=_write_tables, each=True)
     setting = _setting(format, chosen, rate, tolerance)
     if chosen.package and find_spec(chosen.package) is None:
         raise ResultError(
@@ -252,32 +258,33 @@ def _write_and_measure(
     deviations: list[Deviation] = []
     sizes: list[int] = []
 
-    def file_of(part: ExportedMotion) -> bytes:
-        data = chosen.write(part, setting)
+    def files() -> Iterator[bytes]:
         start = motion.start if chosen.own_time else 0.0
-        for i, way in enumerate(chosen.read(data)):
-            until = motion.result.motors_off[part.first + i]
-            deviations.append(deviation(part.curve(i), way.later(start), until))
-        worst = max(x.position for x in deviations)
-        if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
-            raise ResultError(
-                f"the tolerance of {1e3 * setting:g} mm cannot be met: what was written is {1e3 * worst:.2g} mm "
-                f"off, by rounding. Use --tolerance {1.2 * worst:.2g}."
-            )
-        sizes.append(len(data))
-        return data
+        sources = zip(motion.curves(), motion.result.motors_off, strict=True)
+        for data in chosen.write(motion, setting):
+            ways = zip(chosen.read(data), sources, strict=False)
+            own = [deviation(source, way.later(start), until) for way, (source, until) in ways]
+            worst = max(x.position for x in own)
+            if chosen.tolerance is not None and setting is not None and worst > _SLACK * setting:
+                raise ResultError(
+                    f"the tolerance of {1e3 * setting:g} mm cannot be met: what was written is {1e3 * worst:.2g} mm "
+                    f"off, by rounding. Use --tolerance {1.2 * worst:.2g}."
+                )
+            deviations.extend(own)
+            sizes.append(len(data))
+            yield data
 
     if not chosen.each:
-        write_file(path, file_of(motion))
+        write_file(path, next(files()))
     else:
         if path.suffix == f".{chosen.suffix}":
             raise ResultError(f"{path}: each vehicle has a file of its own. Give a folder.")
         width = len(str(motion.n_agents))
         ours = re.compile(rf"agent-\d+\.{chosen.suffix}")
         with replacing_folder(path, ours) as folder:
-            for i in range(motion.n_agents):
-                name = f"agent-{i + 1:0{width}}.{chosen.suffix}"
-                (folder / name).write_bytes(file_of(motion.of_vehicle(i)))
+            for number, data in enumerate(files(), 1):
+                name = f"agent-{number:0{width}}.{chosen.suffix}"
+                (folder / name).write_bytes(data)
     greatest = Deviation(*(float(np.max(x)) for x in zip(*deviations, strict=True)))
     return greatest, sum(sizes), len(sizes)
 

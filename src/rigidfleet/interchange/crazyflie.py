@@ -8,13 +8,13 @@ the piece before).
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import NAMES, curve_to_rows, rows_to_curve
-from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve
+from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curves
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.splines import POWERS
 
@@ -35,29 +35,30 @@ _END = _PIECE.pack(0, 0)
 _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 1000]))
 
 
-def write_polynomial(motion: ExportedMotion, tolerance: float) -> bytes:
-    """A table for one vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
-    rows = curve_to_rows(fit_curve(motion.curve(), tolerance))
-    lines = [",".join(f"{x:.9g}" for x in row) for row in rows]
-    return "\n".join([_HEADER, *lines, ""]).encode()
+def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+    """A table for each vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
+    row = ",".join(["%.9g"] * (1 + len(NAMES) * POWERS))
+    for curve in fit_curves(motion.ways(), tolerance):
+        lines = [row % tuple(numbers) for numbers in curve_to_rows(curve)]
+        yield "\n".join([_HEADER, *lines, ""]).encode()
 
 
-def write_poly4d(motion: ExportedMotion, tolerance: float) -> bytes:
-    """A memory image for one vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
+def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+    """A memory image for each vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
 
     Raises
     ------
     ResultError
         The flight needs more than `PIECES` pieces.
     """
-    way = motion.curve()
-    curve = fit_curve(way, tolerance)
-    if (count := len(curve.pieces)) > PIECES:
-        needed = f"{count} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
-        until = curve.time[PIECES] - curve.time[0]
-        fits = lambda x: len(fit_curve(way, x).pieces) <= PIECES  # noqa: E731
-        raise _error_of_a_long_flight(motion, needed, until, tolerance, fits)
-    return np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
+    for agent, curve in enumerate(fit_curves(motion.ways(), tolerance)):
+        if (count := len(curve.pieces)) > PIECES:
+            needed = f"{count} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
+            until = curve.time[PIECES] - curve.time[0]
+            way = motion.of_vehicle(agent).ways
+            fits = lambda x, way=way: len(next(fit_curves(way(), x)).pieces) <= PIECES  # noqa: E731
+            raise _error_of_a_long_flight(agent, needed, until, tolerance, fits)
+        yield np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
 
 
 def read_poly4d(data: bytes) -> list[Piecewise]:
@@ -66,8 +67,8 @@ def read_poly4d(data: bytes) -> list[Piecewise]:
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
-def write_compressed(motion: ExportedMotion, tolerance: float) -> bytes:
-    """A compressed image for one vehicle: Bernstein coefficients in millimetres and tenths of a degree.
+def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+    """A compressed image for each vehicle: Bernstein coefficients in millimetres and tenths of a degree.
 
     Raises
     ------
@@ -80,24 +81,30 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> bytes:
             f"the tolerance of {1e3 * tolerance:g} mm cannot be met: this format rounds to millimetres. "
             f"Use --tolerance {2 * COMPRESSED_ROUNDING:g} or more."
         )
-    way = motion.curve()
-    way, number = way.on(np.round(way.time / _MS) * _MS), motion.first + 1
-    data, ends = _compressed_image(way, tolerance, number)
-    if len(data) > MEMORY:
-        needed = f"{len(data)} bytes, and the memory has {MEMORY}"
-        room = MEMORY - len(_END)
-        until = max((t for size, t in ends if size <= room), default=ends[0][1])
-        fits = lambda x: len(_compressed_image(way, x, number)[0]) <= MEMORY  # noqa: E731
-        raise _error_of_a_long_flight(motion, needed, until, tolerance, fits)
-    return data
+    for agent, (data, ends) in enumerate(_compressed_images(motion, tolerance)):
+        if len(data) > MEMORY:
+            needed = f"{len(data)} bytes, and the memory has {MEMORY}"
+            room = MEMORY - len(_END)
+            until = max((t for size, t in ends if size <= room), default=ends[0][1])
+            alone = motion.of_vehicle(agent)
+            fits = lambda x, alone=alone: len(next(_compressed_images(alone, x))[0]) <= MEMORY  # noqa: E731
+            raise _error_of_a_long_flight(agent, needed, until, tolerance, fits)
+        yield data
 
 
-def _compressed_image(
-    way: Piecewise, tolerance: float, number: int
-) -> tuple[bytes, list[tuple[int, float]]]:
-    """The image of a way with times in whole milliseconds, and where each piece ends in it [bytes, s]."""
+def _compressed_images(
+    motion: ExportedMotion, tolerance: float
+) -> Iterator[tuple[bytes, list[tuple[int, float]]]]:
+    """The image of each vehicle's way with times in whole milliseconds, and where each piece ends in it [bytes, s]."""
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
-    curve = fit_curve(way, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
+    ways = (way.on(np.round(way.time / _MS) * _MS) for way in motion.ways())
+    curves = fit_curves(ways, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
+    for number, curve in enumerate(curves, 1):
+        yield _compressed_image(curve, number)
+
+
+def _compressed_image(curve: Piecewise, number: int) -> tuple[bytes, list[tuple[int, float]]]:
+    """The image of the curve of a vehicle."""
     duration = np.diff(curve.time)
     position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
     # Yaw is of degree 3, like the reference between samples.
@@ -153,7 +160,7 @@ def read_compressed(data: bytes) -> list[Piecewise]:
 
 
 def _error_of_a_long_flight(
-    motion: ExportedMotion,
+    agent: int,
     needed: str,
     until: float,
     tolerance: float,
@@ -163,6 +170,6 @@ def _error_of_a_long_flight(
     enough = next((x for x in _TRIED if x > tolerance and fits(x)), None)
     remedy = f"--tolerance {enough:g}" if enough else "No tolerance up to 1 m"
     return ResultError(
-        f"the flight of agent {motion.first + 1} needs {needed}. {remedy} makes it fit; at "
+        f"the flight of agent {agent + 1} needs {needed}. {remedy} makes it fit; at "
         f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,16 +10,18 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.math import series
-from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.math.piecewise import Piecewise, hermite_pieces, pad
 from rigidfleet.result import Result
-from rigidfleet.setpoints import Setpoints, at_rate, curve_of
-from rigidfleet.typing import Floats
+from rigidfleet.setpoints import Setpoints, at_rate, ways_of
+from rigidfleet.typing import Floats, Ints
 
 #: Tolerance of yaw [rad] of exported curves. Position does not depend on it.
 YAW_TOLERANCE = np.radians(0.5)
 #: Where in each interval a fit is checked, and an export is compared: shares of the interval.
 _CHECKED = np.array([0.25, 0.5, 0.75, 1.0])
 _COMPARED = np.array([0.02, 0.25, 0.5, 0.75, 0.98])
+#: Number of coefficients of ways that are made at once, 8 MiB: arithmetic on more waits for memory.
+_TOGETHER = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -29,12 +32,10 @@ class ExportedMotion:
     ----------
     result : the flight
     samples : setpoints as recorded, both at a change of phase
-    first : the first of the vehicles, from 0
     """
 
     result: Result
     samples: Setpoints
-    first: int = 0
 
     @property
     def start(self) -> float:
@@ -52,74 +53,104 @@ class ExportedMotion:
         return self.samples.yaw.shape[1]
 
     def of_vehicle(self, agent: int) -> ExportedMotion:
-        """The motion of one of all vehicles alone."""
+        """The motion of one of the vehicles alone."""
         time, state, yaw, yaw_rate = self.samples
         samples = Setpoints(time, state[:, :, [agent]], yaw[:, [agent]], yaw_rate[:, [agent]])
-        return ExportedMotion(self.result, samples, agent)
+        return ExportedMotion(self.result, samples)
 
     def at_rate(self, rate: float | None) -> Setpoints:
         """Setpoints at a rate [Hz]; without one, the samples."""
         return at_rate(self.samples, rate)
 
-    def curve(self, agent: int = 0) -> Piecewise:
-        """The way of one of the vehicles, from 0: degree 7 (yaw: 3) between samples."""
-        return curve_of(self.samples, agent)
+    def ways(self) -> Iterator[Piecewise]:
+        """The ways (K, n, 4, 8) of all vehicles in order, some at a time: degree 7 (yaw: 3) between samples."""
+        n = 1 + _TOGETHER // (32 * len(self.samples.time))
+        for first in range(0, self.n_agents, n):
+            yield ways_of(self.samples, slice(first, first + n))
+
+    def curves(self) -> Iterator[Piecewise]:
+        """The way (K, 4, 8) of each vehicle."""
+        for some in self.ways():
+            for i in range(some.pieces.shape[1]):
+                yield Piecewise(some.time, some.pieces[:, i])
 
 
-def fit_curve(
-    source: Piecewise, tolerance: float, orders: int = 4, yaw_tolerance: float = YAW_TOLERANCE,
+def fit_curves(
+    ways: Iterable[Piecewise], tolerance: float, orders: int = 4, yaw_tolerance: float = YAW_TOLERANCE,
     longest: float = np.inf,
-) -> Piecewise:  # fmt: skip
-    """The fewest pieces that go from knot to knot of a way within a tolerance [m], and one of yaw [rad].
+) -> Iterator[Piecewise]:  # fmt: skip
+    """For each vehicle the fewest pieces that go from knot to knot within a tolerance [m], and one of yaw [rad].
 
     Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3; yaw: always) at the knots they join. Each is as
-    long as the tolerance allows, and not longer than ``longest`` [s].
+    long as the tolerance allows, and not longer than ``longest`` [s]. ``ways`` are those of `ExportedMotion.ways`.
 
     Raises
     ------
     ResultError
         Not even a piece between two samples is within the tolerance.
     """
-    time, n = source.time, len(source.pieces)
-    begin, end = source.ends(4)
-    t = time[:-1, None] + np.diff(time)[:, None] * _CHECKED
-    wanted = source.within(_CHECKED)
+    for some in ways:
+        yield from _fit_together(some, tolerance, orders, yaw_tolerance, longest)
 
-    def piece_over(i: int, j: int) -> tuple[Floats, float]:
-        """The piece over intervals i to j - 1, and its error as a share of what is allowed."""
-        ends = time[[i, j]]
+
+def _fit_together(
+    source: Piecewise, tolerance: float, orders: int, yaw_tolerance: float, longest: float
+) -> Iterator[Piecewise]:
+    """`fit_curves` of ways (K, N, 4, P): in each round, every vehicle tries a piece of its own length."""
+    time, (n, vehicles) = source.time, source.pieces.shape[:2]
+    begin, end = source.ends(orders)
+    t = time[:-1] + np.diff(time) * _CHECKED[:, None]
+    # Points are the last axis: arithmetic on long rows is fast.
+    wanted = source.within(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
+
+    def pieces_over(who: Ints, i: Ints, j: Ints) -> tuple[Floats, Floats]:
+        """Pieces (M, 4, P) of vehicles (M,) over intervals i to j - 1, and errors as shares of what is allowed."""
+        h = time[j] - time[i]
         position, yaw = (
-            Piecewise.of_ends(ends, begin[:m, i : i + 1, axes], end[:m, j - 1 : j, axes])
+            hermite_pieces(h, begin[:m, i, who, axes], end[:m, j - 1, who, axes])
             for m, axes in ((orders, slice(3)), (2, slice(3, 4)))
         )
-        piece = position.beside(yaw)
-        off = piece.at(t[i:j].ravel()) - wanted[i:j].reshape(-1, 4)
-        far = np.sqrt((off[:, :3] ** 2).sum(axis=1).max()) / tolerance
-        far = max(far, (ends[1] - ends[0]) / longest)
-        return piece.pieces, float(max(far, abs(off[:, 3]).max() / yaw_tolerance))
+        pieces = np.concatenate([position, pad(yaw, 2 * orders)], axis=1)
+        ends = np.cumsum(j - i)
+        starts = ends - (j - i)
+        row = np.repeat(np.arange(len(who)), j - i)
+        k = np.arange(ends[-1]) + (i - starts)[row]
+        x, c = t[:, k] - time[i][row], pieces.T[:, :, None, row]
+        off = c[-1] * x
+        for power in c[-2:0:-1]:
+            off += power
+            off *= x
+        off += c[0] - wanted[..., who[row] * n + k]
+        far = np.sqrt((off[:3] ** 2).sum(axis=0).max(axis=0)) / tolerance
+        worst = np.maximum(far, abs(off[3]).max(axis=0) / yaw_tolerance)
+        return pieces, np.maximum(np.maximum.reduceat(worst, starts), h / longest)
 
-    ends, pieces, length = [0], [], 1
-    while ends[-1] < n:
-        i = ends[-1]
-        good, bad = i, n + 1  # the longest piece known to fit, the shortest known not to
-        j = min(i + length, n)
-        while good < n and bad - good > 1:
-            piece, error = piece_over(i, j)
-            if error <= 1.0:
-                good, best = j, piece
-            elif j > i + 1:
-                bad = j
-            else:
-                raise ResultError(
-                    f"the tolerance of {1e3 * tolerance:g} mm cannot be met: a curve of degree {2 * orders - 1} "
-                    f"between the samples at {time[i]:g} and {time[j]:g} s is {error:.2g} times as far "
-                    f"off. Use --tolerance {1.2 * error * tolerance:.2g}, or fly with a shorter output_step."
-                )
-            j = min(2 * good - i, n) if bad > n else (good + bad) // 2
-        ends.append(good)
-        pieces.append(best)
-        length = good - i
-    return Piecewise(time[ends], np.concatenate(pieces))
+    # Of each vehicle's piece: its begin, the longest end known to fit, the shortest known not to, and the next to try.
+    i, good, bad = (np.full(vehicles, k) for k in (0, 0, n + 1))
+    j, length, who = np.minimum(i + 1, n), np.ones(vehicles, dtype=int), np.arange(vehicles)
+    best, fitted = np.zeros((vehicles, 4, 2 * orders)), []
+    while len(who):
+        pieces, errors = pieces_over(who, i[who], j[who])
+        fits = errors <= 1.0
+        if (stuck := ~fits & (j[who] == i[who] + 1)).any():
+            k, error = i[who][stuck][0], errors[stuck][0]
+            raise ResultError(
+                f"the tolerance of {1e3 * tolerance:g} mm cannot be met: a curve of degree {2 * orders - 1} "
+                f"between the samples at {time[k]:g} and {time[k + 1]:g} s is {error:.2g} times as far "
+                f"off. Use --tolerance {1.2 * error * tolerance:.2g}, or fly with a shorter output_step."
+            )
+        better, worse = who[fits], who[~fits]
+        good[better], best[better], bad[worse] = j[better], pieces[fits], j[worse]
+        over = who[(good[who] == n) | (bad[who] - good[who] <= 1)]
+        fitted.append((over, good[over], best[over]))
+        length[over], i[over], bad[over] = good[over] - i[over], good[over], n + 1
+        further = np.minimum(good + np.where(good > i, good - i, length), n)
+        j = np.where(bad > n, further, (good + bad) // 2)
+        who = who[i[who] < n]
+    who, ends, pieces = (np.concatenate(x) for x in zip(*fitted, strict=True))
+    for vehicle in range(vehicles):
+        own = who == vehicle
+        yield Piecewise(time[np.append(0, ends[own])], pieces[own])
 
 
 def heading_lines(curve: Piecewise) -> tuple[Floats, Floats]:
@@ -134,9 +165,9 @@ def heading_lines(curve: Piecewise) -> tuple[Floats, Floats]:
     rate, bend = a + 2.0 * b * step + 3.0 * c * step**2, 2.0 * b + 6.0 * c * step
     lines = step * np.maximum(np.sqrt(bend / (4.0 * YAW_TOLERANCE)), rate / (np.pi / 2))
     counts = np.maximum(1, np.ceil(lines)).astype(int)
-    shares = [np.linspace(0.0, 1.0, count + 1) for count in counts]
     k = np.repeat(np.arange(len(step)), counts + 1)
-    after = np.concatenate(shares) * step[k]
+    along = np.arange(len(k)) - (np.cumsum(counts + 1) - counts - 1)[k]
+    after = along / counts[k] * step[k]
     times, yaws = curve.time[k] + after, series.of_polynomials(yaw[k], after, 1)[0]
     again = np.append(False, np.diff(times) < 1e-9)
     times[again] += 1e-3

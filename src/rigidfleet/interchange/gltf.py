@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.foreign.curves import with_headings
-from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve, heading_lines
+from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curves, heading_lines
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades, has_lights, lights, view
 from rigidfleet.typing import Floats, Ints
@@ -57,7 +58,7 @@ class _File:
         return len(self.accessors) - 1
 
 
-def write_gltf(motion: ExportedMotion, tolerance: float) -> bytes:
+def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One scene: a node for each vehicle, moved along cubic splines; its yaw turns at the same keys, and between.
 
     If the flight has lights, each vehicle shines in its own, seen by a camera in front.
@@ -68,8 +69,10 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> bytes:
         "indices": file.add(_FACES.ravel(), "<u4"),
     }
     nodes, samplers, channels = [], [], []
-    for agent, radius in enumerate(motion.result.mission.fleet.radius.tolist()):
-        curve = fit_curve(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
+    radii = motion.result.mission.fleet.radius.tolist()
+    curves = fit_curves(motion.ways(), tolerance, 2, YAW_TOLERANCE / 2)
+    for agent, (radius, fitted) in enumerate(zip(radii, curves, strict=True)):
+        curve = fitted.later(-motion.start)
         times, yaws = heading_lines(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
@@ -96,7 +99,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> bytes:
     words = json.dumps(scene).encode()
     parts = [(_JSON, words + b" " * (-len(words) % 4)), (_BINARY, bytes(file.data))]
     size = 12 + sum(8 + len(part) for _, part in parts)
-    return struct.pack("<III", _MAGIC, 2, size) + b"".join(
+    yield struct.pack("<III", _MAGIC, 2, size) + b"".join(
         struct.pack("<II", len(part), kind) + part for kind, part in parts
     )
 

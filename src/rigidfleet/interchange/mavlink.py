@@ -7,6 +7,7 @@ checksum CRC-16/MCRF4XX. Local axes are north, east, down: (N, E, D) = (y, x, -z
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -40,18 +41,24 @@ _MARK, _STATION, _SYSTEMS = 0xFE, 255, 255
 _LOCAL_NED, _AUTOPILOT = 1, 1
 
 
-def write_tlog(motion: ExportedMotion, rate: float | None) -> bytes:
-    """A log for one vehicle: at each time a message that asks for position, velocity, acceleration, yaw and yaw rate.
+def write_tlog(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
+    """A log for each vehicle: at each time a message that asks for position, velocity, acceleration, yaw and yaw rate.
 
     Vehicle i is system i (from 256 on, again from 1). Times are whole milliseconds since the start; states are those
     of these times. If the mission has a geodetic origin, the first message sets it. A vehicle that has landed for good
     is disarmed, and gets no more setpoints.
     """
+    for agent in range(motion.n_agents):
+        yield _log(motion.of_vehicle(agent), agent, rate)
+
+
+def _log(motion: ExportedMotion, agent: int, rate: float | None) -> bytes:
+    """The log of one vehicle, which is an agent's."""
     wanted = np.unique(np.round((motion.at_rate(rate).time - motion.start) * 1e3))
     setpoints = at_times(motion.samples, np.minimum(wanted / 1e3 + motion.start, motion.end))
     every = np.round((setpoints.time - motion.start) * 1e3).astype(np.int64)
-    off = 1e3 * (float(motion.result.motors_off[motion.first]) - motion.start)
-    flies, system = every <= off, motion.first % _SYSTEMS + 1
+    off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
+    flies, system = every <= off, agent % _SYSTEMS + 1
     milliseconds = every[flies]
     records: Any = np.zeros(len(milliseconds), dtype=_RECORD)
     records["time"] = 1000 * milliseconds

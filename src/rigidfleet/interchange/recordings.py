@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import struct
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ _CDR = b"\0\1\0\0"
 _BILLION = 1_000_000_000
 
 
-def write_mcap(motion: ExportedMotion, rate: float | None) -> bytes:
+def write_mcap(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One file: topics /agent_i/pose (PoseStamped) and /agent_i/twist (TwistStamped), in world axes, frame "map"."""
     from mcap.writer import Writer
 
@@ -64,7 +65,7 @@ def write_mcap(motion: ExportedMotion, rate: float | None) -> bytes:
             for channel, row in zip(ids, rows.astype("<f8"), strict=True):
                 writer.add_message(channel, at, start + row.tobytes(), at, k)
     writer.finish()
-    return buffer.getvalue()
+    yield buffer.getvalue()
 
 
 def _definition(kind: str) -> str:
@@ -93,7 +94,7 @@ def read_mcap(data: bytes) -> list[Piecewise]:
     return curves
 
 
-def write_rrd(motion: ExportedMotion, rate: float | None) -> bytes:
+def write_rrd(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     """One recording: a frame that moves for each vehicle, with a ball of its radius, on the timeline "time"."""
     import rerun as rr
 
@@ -113,7 +114,7 @@ def write_rrd(motion: ExportedMotion, rate: float | None) -> bytes:
     recording.flush()
     data = stream.read()
     recording.disconnect()
-    return data or b""
+    yield data or b""
 
 
 def read_rrd(data: bytes) -> list[Piecewise]:

@@ -12,13 +12,14 @@ import base64
 import io
 import json
 import zipfile
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curve, heading_lines
+from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curves, heading_lines
 from rigidfleet.interchange.lights import light_program
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades
@@ -31,7 +32,7 @@ _EAST = 90.0
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def write_skyc(motion: ExportedMotion, tolerance: float) -> bytes:
+def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """One show: for each drone its home, a way of cubic curves, its yaw and its light.
 
     Raises
@@ -44,8 +45,8 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> bytes:
     mission = motion.result.mission
     changes = fades(motion.result)
     drones, files = [], {}
-    for agent in range(motion.n_agents):
-        curve = fit_curve(motion.curve(agent), tolerance, 2, YAW_TOLERANCE / 2).later(-motion.start)
+    curves = fit_curves(motion.ways(), tolerance, 2, YAW_TOLERANCE / 2)
+    for agent, curve in enumerate(way.later(-motion.start) for way in curves):
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _bezier_segments(curve)
@@ -91,7 +92,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> bytes:
         for path, content in {"show.json": show, **files}.items():
             entry = zipfile.ZipInfo(path, _DATE)
             archive.writestr(entry, json.dumps(content), zipfile.ZIP_DEFLATED)
-    return buffer.getvalue()
+    yield buffer.getvalue()
 
 
 def read_skyc(data: bytes) -> list[Piecewise]:

@@ -52,6 +52,7 @@ from rigidfleet.kernel.segments import (
     between_segments,
     from_obstacle,
     from_solid,
+    kept_from,
     least_along,
 )
 
@@ -341,7 +342,7 @@ def set_floor_beside(t, i, o, r, v, closest, a):
     if apart < need or apart - need < a.margin[OBSTACLE, 0]:
         # Rounding alone must not make the bound a loose one: the vehicle could lose a little at each tick
         enough = need - 10.0 * _ROUNDING
-        kept, _, _ = from_obstacle(way[0], way[2], o, a.solids, enough, a.normal)
+        kept = kept_from(way[0], way[2], o, a.solids, enough, a.normal)
         a.walls[i, o] = min(need, kept)
         note(OBSTACLE, kept - a.reach[i], t, i, o, a)
         if kept - need < closest or (apart < need and closest == 0.0):
@@ -393,7 +394,7 @@ def set_floors(t, r, v, lost, a):
             a.walls[i, o] = need
             if apart < need or apart - need < a.margin[OBSTACLE, 0]:
                 way = a.ways[i]
-                kept, _, _ = from_obstacle(way[4], way[3], o, a.solids, need, a.normal)
+                kept = kept_from(way[4], way[3], o, a.solids, need, a.normal)
                 a.walls[i, o] = min(need, kept)
                 note(OBSTACLE, kept - a.reach[i], t, i, o, a)
 

@@ -5,14 +5,10 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.problem import Extents, PerAgent, PlacesInTime
-from rigidfleet.kernel.records import Corners
 from rigidfleet.typing import Bools, Floats, Ints
 
 Vectors = Annotated[Floats, Extents((None, 3))]
 Quaternions = Annotated[Floats, Extents((None, 4))]
-
-#: Samples of one agent whose places and distances stay in the processor's first cache.
-BLOCK = 512
 
 
 class Measured(NamedTuple):
@@ -42,37 +38,10 @@ class Measured(NamedTuple):
     thrust: Annotated[Floats, Extents((None, "N"))]
     distance: Annotated[Floats, Extents((None, "m"))]
     line: Bools  # (K,) whether the slots count as a line, without a spin about itself
-    work: Annotated[
-        Floats, Extents((9, 4, 4))
-    ]  # work[5] is expected if the first sample commands no attitude
+    # work[5] is expected if the first sample commands no attitude
+    work: Annotated[Floats, Extents((9, 4, 4))]
     left: PerAgent  # masses of the agents left, 0 of others
     x: Annotated[Floats, Extents((2, "N", 3))]  # agents and slots about their centres
-
-
-class SingularValues(NamedTuple):
-    """Singular values of the constraint Jacobian at K samples, of eight at once: rows of eights are theirs."""
-
-    positions: Floats  # (K, N, 3)
-    edges: Ints  # (m, 2)
-    share: Floats  # (m, m) of two edges in J J^T: what their unit vectors' product counts; empty if m > 3N
-    r: Floats  # (N, 3 * 8)
-    u: Floats  # (m, 3 * 8) unit vectors
-    A: Floats  # (s, s * 8), s the smaller of m and 3N
-    least: Floats  # (1, 8) the smallest non-zero eigenvalue
-    one: Floats  # (s, s) A of one sample
-    work: Floats  # (3, s)
-    values: Floats  # (K,) the smallest non-zero singular value
-
-
-class Nearest(NamedTuple):
-    """The nearest of some boxes to each of N agents at K samples; infinity and -1 without boxes."""
-
-    r: PlacesInTime
-    radius: PerAgent
-    boxes: Corners
-    least: Annotated[Floats, Extents(("N", None))]  # distance of the agent's surface
-    nearest: Annotated[Ints, Extents(("N", None))]
-    places: Annotated[Floats, Extents((3, BLOCK))]  # of one agent
 
 
 def measurement_of(n: int, m: int, K: int, **samples: Any) -> Measured:
@@ -86,21 +55,3 @@ def measurement_of(n: int, m: int, K: int, **samples: Any) -> Measured:
         "line": np.zeros(K, dtype=np.bool_), "work": work, "left": np.empty(n), "x": np.empty((2, n, 3)),
     }  # fmt: skip
     return Measured(**(fields | samples))
-
-
-def spectrum_of(r: Floats, edges: Ints) -> SingularValues:
-    """Arrays for the singular values of J with ``edges`` (m, 2) at positions r (K, N, 3)."""
-    m, size = len(edges), min(len(edges), 3 * r.shape[1])
-    share = np.empty((m, m) if m == size else (0, 0))
-    return SingularValues(
-        r, edges, share, np.empty((r.shape[1], 24)), np.empty((m, 24)), np.empty((size, 8 * size)), np.empty((1, 8)),
-        np.empty((size, size)), np.empty((3, size)), np.empty(len(r)),
-    )  # fmt: skip
-
-
-def nearest_of(r: Floats, radius: Floats, boxes: Floats) -> Nearest:
-    """Arrays for the nearest of boxes (B, 6) to agents r (K, N, 3) with ``radius`` (N,)."""
-    K, n, _ = r.shape
-    return Nearest(
-        r, radius, boxes, np.full((n, K), np.inf), np.full((n, K), -1), np.empty((3, BLOCK))
-    )

@@ -1,4 +1,4 @@
-"""What follows from the recorded positions and forces of a flight: attitude, rates, wrench, thrust, singular values.
+"""What follows from the recorded positions and forces of a flight: attitude, rates, wrench and thrust.
 
 One pass over all samples. Attitudes are those of the formation's slots, fitted to the agents (Wahba's problem): the
 quaternion is the eigenvector of the largest eigenvalue of Davenport's matrix K, found as in QUEST by Newton's method
@@ -9,7 +9,7 @@ doi:10.1107/S0108767305015266).
 import math
 
 from rigidfleet.kernel.compiler.jit import exact, jit
-from rigidfleet.kernel.linalg import jacobi_eigen, least_eigenvalue
+from rigidfleet.kernel.linalg import jacobi_eigen
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
     centre_of_mass,
@@ -18,7 +18,6 @@ from rigidfleet.kernel.rigid_body import (
     multiply,
     multiply_transposed,
 )
-from rigidfleet.kernel.vectors import fill_lanes, in_vectors, inverse_root_of, where_positive
 
 #: Slots thinner than this, relative to their length, count as a line in an attitude fit.
 _THIN = 1e-3
@@ -29,12 +28,6 @@ _HALF_TURN = 5e-17
 #: Share of K's size, to the third power, below which the product of the gaps between its largest eigenvalue and the
 #: others is too small for the root of a polynomial; the error grows with the inverse square of the gap.
 _MULTIPLE = 0.03
-#: Eigenvalues of J J^T below this share of the largest count as zero.
-_ZERO = 1e-14
-#: Samples of which singular values are found at once.
-_AT_ONCE = 8
-#: Sweeps of rotations that leave 1e-20 of a matrix of three rows off its diagonal; a square that adds nothing.
-_SWEEPS, _TINY = 4, 1e-300
 
 
 @jit
@@ -473,99 +466,3 @@ def angular_momentum(m, k, mass, h):
         h[0] += mass[i] * (x[i, 1] * Z - x[i, 2] * Y)
         h[1] += mass[i] * (x[i, 2] * X - x[i, 0] * Z)
         h[2] += mass[i] * (x[i, 0] * Y - x[i, 1] * X)
-
-
-@jit
-def spectrum(s):
-    """The smallest non-zero singular value of the constraint Jacobian J, from the smaller of J J^T and J^T J.
-
-    Of eight samples at once.
-    """
-    edges, share = s.edges, s.share
-    K, n, m, size = s.positions.shape[0], s.positions.shape[1], edges.shape[0], s.A.shape[0]
-    r, u, A, least = in_vectors(s.r), in_vectors(s.u), in_vectors(s.A), in_vectors(s.least)
-    for e in range(share.shape[0]):
-        i, j = edges[e, 0], edges[e, 1]
-        for o in range(e + 1):
-            a, b = edges[o, 0], edges[o, 1]
-            sign = 0.0
-            sign += 1.0 if i == a else 0.0
-            sign += 1.0 if j == b else 0.0
-            sign -= 1.0 if i == b else 0.0
-            sign -= 1.0 if j == a else 0.0
-            share[e, o] = sign
-    for first in range(0, K, _AT_ONCE):
-        for l in range(_AT_ONCE):  # the last sample takes the places of those missing
-            k = min(first + l, K - 1)
-            for i in range(n):
-                for a in range(3):
-                    s.r[i, a * _AT_ONCE + l] = s.positions[k, i, a]
-        for e in range(m):
-            i, j = edges[e, 0], edges[e, 1]
-            x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
-            inverse = inverse_root_of(x * x + y * y + z * z)
-            u[e, 0], u[e, 1], u[e, 2] = x * inverse, y * inverse, z * inverse
-        if m <= 3 * n:
-            for e in range(m):
-                for o in range(e + 1):
-                    uv = u[e, 0] * u[o, 0] + u[e, 1] * u[o, 1] + u[e, 2] * u[o, 2]
-                    A[e, o] = share[e, o] * uv
-        else:
-            for a in range(3 * n):
-                for b in range(3 * n):
-                    A[a, b] = fill_lanes(0.0)
-            for e in range(m):
-                i, j = 3 * edges[e, 0], 3 * edges[e, 1]
-                for a in range(3):
-                    for b in range(3):
-                        uv = u[e, a] * u[e, b]
-                        A[i + a, i + b] += uv
-                        A[j + a, j + b] += uv
-                        A[i + a, j + b] -= uv
-                        A[j + a, i + b] -= uv
-        if size == 3:
-            least[0, 0] = least_eigenvalue_of_three(A)
-        else:
-            for l in range(_AT_ONCE):
-                for a in range(size):
-                    for b in range(a + 1):
-                        s.one[a, b] = s.A[a, b * _AT_ONCE + l]
-                s.least[0, l] = least_eigenvalue(s.one, s.work[0], s.work[1], s.work[2], _ZERO)
-        for l in range(min(_AT_ONCE, K - first)):
-            s.values[first + l] = math.sqrt(s.least[0, l])
-
-
-@jit
-def least_eigenvalue_of_three(A):
-    """As `linalg.least_eigenvalue`, of eight symmetric matrices at once: A (3, 3) of vectors.
-
-    Jacobi's rotations, equally many for all matrices, so that none depends on those beside it.
-    """
-    a, b, c, d, e, f = A[0, 0], A[1, 1], A[2, 2], A[1, 0], A[2, 0], A[2, 1]
-    none = fill_lanes(0.0)
-    for _ in range(_SWEEPS):
-        a, b, e, f = rotate(d, a, b, e, f)
-        a, c, d, f = rotate(e, a, c, none, f)
-        b, c, d, e = rotate(f, b, c, d, none)
-        f = none
-    largest = max(a, b)
-    largest = max(largest, c)
-    zero, least = _ZERO * largest, largest
-    least = min(least, where_positive(a - zero, a, largest))
-    least = min(least, where_positive(b - zero, b, largest))
-    return min(least, where_positive(c - zero, c, largest))
-
-
-@jit
-def rotate(off, p, q, x, y):
-    """Rotate so that an element ``off`` the diagonal of a matrix becomes zero.
-
-    p and q are the elements of the diagonal in its row and column, x and y what else is in these.
-    """
-    # The tangent of the angle is sign(d) off / (|d| + sqrt(d^2 + off^2)); it is 0 where there is nothing to do.
-    d = 0.5 * (q - p)
-    square = d * d + off * off + _TINY
-    t = where_positive(d, off, -1.0 * off) / (abs(d) + square * inverse_root_of(square))
-    c = inverse_root_of(t * t + 1.0)
-    s = t * c
-    return p - t * off, q + t * off, c * x - s * y, s * x + c * y

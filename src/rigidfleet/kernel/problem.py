@@ -11,9 +11,8 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet._common.kept import kept
 from rigidfleet.solids.records import Solids, join
-from rigidfleet.typing import Bools, Edges, Floats, Ints
+from rigidfleet.typing import Bools, Edges, Floats
 
 
 class Extents(tuple[int | str | None, ...]):
@@ -104,9 +103,8 @@ class Reference(NamedTuple):
     dp: Places  # what the blend adds to them [m]
     turn: Vector  # rotation vector by which the slots turn during the blend [rad]; zero with ``knots``
     knots: Floats = NO_KNOTS  # (K + 1,) [s], or empty
-    ways: Floats = (
-        NO_WAYS  # (K, N, 3, P): piece, slot in body axes [m], power of (t - knots[piece])
-    )
+    # (K, N, 3, P): piece, slot in body axes [m], power of (t - knots[piece])
+    ways: Floats = NO_WAYS
 
 
 class Motion(NamedTuple):
@@ -247,7 +245,7 @@ def zeros(*shape: int) -> Floats:
     """Zeros aligned to a cache line: rows that straddle lines would cost up to a tenth of the time."""
     size = math.prod(shape)
     memory = np.zeros(size + 8)
-    skip = -memory.ctypes.data // memory.itemsize % 8
+    skip = -memory.__array_interface__["data"][0] // memory.itemsize % 8
     return memory[skip : skip + size].reshape(shape)
 
 
@@ -321,28 +319,8 @@ def graph(ends: NDArray[np.integer], masses: Floats, *, large: bool = False) -> 
     edges = np.ascontiguousarray(ends, dtype=np.uint32).reshape(-1, 2)
     if large:
         return Graph(edges, np.zeros((0, 2), dtype=np.uint32), np.zeros(0), np.zeros(0))
-    inverse = 1.0 / masses
-    pairs, where, agent, sign = _meeting(edges)
-    # Edges that share both agents meet twice.
-    weight = np.zeros(len(pairs))
-    np.add.at(weight, where, sign * inverse[agent])
-    return Graph(edges, pairs.copy(), weight, inverse[edges].sum(axis=1))
-
-
-@kept
-def _meeting(edges: NDArray[np.integer]) -> tuple[Edges, Ints, Ints, Floats]:
-    """Pairs (P, 2) of edges (m, 2) that share an agent; each time they do: which pair, which agent, which sign (M,)."""
-    parts = [np.zeros((4, 0))]
-    for agent in np.unique(edges):
-        k, end = np.nonzero(edges == agent)
-        sign = 1.0 - 2.0 * end
-        p, q = np.tril_indices(len(k), -1)
-        parts.append(np.stack([k[p], k[q], np.full(len(p), float(agent)), sign[p] * sign[q]]))
-    meetings = np.concatenate(parts, axis=1)
-    pairs, where = np.unique(meetings[:2].T.astype(np.uint32), axis=0, return_inverse=True)
-    return (
-        np.ascontiguousarray(pairs).reshape(-1, 2),
-        where.ravel(),
-        meetings[2].astype(np.int64),
-        meetings[3],
-    )
+    A, inverse = np.zeros((len(edges), len(edges))), 1.0 / masses
+    k, l, end, other = np.nonzero(edges[:, None, :, None] == edges[:, None])
+    np.add.at(A, (k, l), np.where(end == other, 1.0, -1.0) * inverse[edges[k, end]])
+    pairs = np.ascontiguousarray(np.argwhere(np.tril(A, -1)), dtype=np.uint32)
+    return Graph(edges, pairs, A[tuple(pairs.T)], A.diagonal().copy())

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet.kernel.problem import Extents, PerAgent, Places, PlacesInTime, Vector, padded, zeros
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.typing import Bools, Edges, Floats, Ints
 
 PerEdgeInTime = Annotated[Floats, Extents((None, "m"))]
 #: Boxes by their least and greatest corners, and pairs of agents.
@@ -43,8 +43,10 @@ QUANTITIES = VERTICAL_ACCELERATION + 1
 #: steps listed in `Monitor.listed` that alone can hold worse distances, and worse forces, or `ANY_STEP`.
 STAYED, LISTED_DISTANCES, LISTED_FORCES = range(3)
 ANY_STEP = -1
-#: Approximate size of a trail in bytes; the integrator pauses when it is full.
-_TRAIL = 1 << 20
+#: Triple product of three unit vectors below which a pivot counts as lost.
+LOST_PIVOT = 1e-6
+#: Approximate size of a trail in bytes; the integrator pauses when it is full. With more, flights wait for memory.
+_TRAIL = 1 << 17
 #: Greatest number of points in a search for a greatest force.
 _NODES = 27
 
@@ -75,7 +77,7 @@ class Trail(NamedTuple):
 
 
 def trail(states: int, agents: int, edges: int, directed: bool) -> Trail:
-    """Allocate a trail of a megabyte, or of three steps; ``directed``: with accelerations by direction."""
+    """Allocate a trail of an eighth of a megabyte, or of three steps; ``directed``: with accelerations by direction."""
     gauge = (5 if directed else 3) * agents + 2 * edges
     rows = max(3, _TRAIL // (8 * (5 * states + gauge)))
     shapes = (rows, 2), (rows, 5, states), (rows, gauge), (gauge,)
@@ -139,27 +141,26 @@ class Monitor(NamedTuple):
 
 
 def monitor(
-    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **changes: Any
+    radius: Floats, boxes: Floats, fence: Floats, states: int, gauge: int, **watched: Any
 ) -> Monitor:
-    """A new monitor without values; pairs are listed only if they are among the ``changes`` of fields."""
+    """A monitor with work arrays of its own. Without the fields that are ``watched``, it has no values and no pairs."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
-    fields: dict[str, Any] = {
-        "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
-        "who": np.full((QUANTITIES, 2), -1), "radius": radius, "boxes": boxes, "fence": fence,
-        "left": np.ones(n, dtype=np.bool_), "standing": np.zeros(n, dtype=np.int64),
-        "low": np.full((n, 3), np.inf), "pad": 0.0, "altitude": np.inf, "pairs": none, "struck": none, "columns": none,
-        "count": np.array([0, ANY_STEP, ANY_STEP]),
-        "listed": np.zeros((2, 0), dtype=np.int64), "moves": np.zeros(2),
-        "recorder": 0, "segment": 0, "record": 0, "time": np.zeros(1),
-        "states": np.zeros((1, states)), "gauge": np.zeros((2, gauge)),
-        "nodes": np.empty((_NODES, gauge)), "instants": np.zeros(_NODES),
-        "rank": np.zeros(_NODES, dtype=np.int64),
-        "places": np.zeros((n, 5, 3)), "balls": np.zeros((n, 4)), "curve": np.zeros((5, 3)),
-        "curves": np.zeros((3, 5, 3)), "work": np.zeros((40, 11)),
-        "pieces": np.zeros((40, 17)), "basis": np.zeros((5, 5)), "attitudes": np.zeros((5, 3, 3)),
-        "centres": np.zeros((5, 6)), "knots": np.zeros((5, 3)), "scratch": np.zeros((3, 10)),
-    }  # fmt: skip
-    return Monitor(**(fields | changes))
+    return Monitor(
+        radius=radius, boxes=boxes, fence=fence, count=np.array([0, ANY_STEP, ANY_STEP]), moves=np.zeros(2),
+        recorder=0, segment=0, record=0, time=np.zeros(1),
+        states=np.zeros((1, states)), gauge=np.zeros((2, gauge)),
+        nodes=np.empty((_NODES, gauge)), instants=np.zeros(_NODES), rank=np.zeros(_NODES, dtype=np.int64),
+        places=np.zeros((n, 5, 3)), balls=np.zeros((n, 4)), curve=np.zeros((5, 3)),
+        curves=np.zeros((3, 5, 3)), work=np.zeros((40, 11)),
+        pieces=np.zeros((40, 17)), basis=np.zeros((5, 5)), attitudes=np.zeros((5, 3, 3)),
+        centres=np.zeros((5, 6)), knots=np.zeros((5, 3)), scratch=np.zeros((3, 10)),
+        **watched or {
+            "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
+            "who": np.full((QUANTITIES, 2), -1), "left": np.ones(n, dtype=np.bool_),
+            "standing": np.zeros(n, dtype=np.int64), "low": np.full((n, 3), np.inf), "pad": 0.0, "altitude": np.inf,
+            "pairs": none, "struck": none, "columns": none, "listed": np.zeros((2, 0), dtype=np.int64),
+        },
+    )  # fmt: skip
 
 
 class IntegratorState(NamedTuple):
@@ -263,3 +264,24 @@ class Recursion(NamedTuple):
     y: Floats = NO_ROWS
     first: int = 0
     b: Floats = NO_FACTORS
+
+
+class Order(NamedTuple):
+    """The order of elimination: agents, each with its edges to three before it; missing entries are 0."""
+
+    agent: Edges  # (N,)
+    edge: Edges  # (N, 3): none, one, two, then three each
+    other: Edges  # (N, 3) the agents at their other ends
+    sign: NDArray[np.int8]  # (N, 3) 1 where u of the edge points towards the agent, else -1
+
+
+class Pattern(NamedTuple):
+    """Positions of the blocks of L: by columns, the diagonal first, and by rows."""
+
+    place: Ints  # (N,) column of each agent
+    column: Ints  # (N + 1,) first block of each column
+    row: Ints  # (B,) row of each block
+    first: Ints  # (N + 1,) of each row, the blocks left of the diagonal:
+    left: Ints  # (B - N,) their columns
+    block: Ints  # (B - N,) and which blocks they are
+    of_edge: Ints  # (m,) block of each edge

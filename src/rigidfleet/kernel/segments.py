@@ -126,6 +126,15 @@ def from_obstacle(p, q, o, solids, enough, normal):
 
 
 @jit
+def kept_from(p, q, o, solids, need, normal):
+    """Distance of the segment from p to q (3,) from obstacle o: exact below ``need``, else a lower bound."""
+    kept, _, _ = from_obstacle(p, q, o, solids, need, normal)
+    if kept < need:
+        kept, _, _ = from_obstacle(p, q, o, solids, math.nan, normal)
+    return kept
+
+
+@jit
 def least_along(x, rate, rise, T):
     """Least value of x + rate t + rise t^2 / 2 over [0, T]."""
     least = min(x, x + T * (rate + 0.5 * T * rise))

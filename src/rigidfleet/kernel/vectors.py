@@ -6,8 +6,6 @@ A vector holds eight consecutive states of one flight, or the same state of eigh
 - ``in_vectors(rows)``: float64 rows (k, n), n a multiple of 8, viewed as vectors (k, n / 8); rows of vectors unchanged;
 - ``fill_lanes(x)``: a vector of eight numbers x;
 - ``rough_inverse(v)``: 1/v to four digits, in a fraction of a quotient's time;
-- ``inverse_root_of(v)``: 1/sqrt(v), exact to the last bit but one;
-- ``where_positive(v, a, b)``: a where v > 0, b elsewhere;
 - ``total_or_worst(v, y)``: the sum of a vector's numbers if y are the states of one flight, the greatest if of eight.
 
 These are names of `rigidfleet.kernel.compiler.simd`. Functions around them would cost the integrator some per cent.
@@ -16,17 +14,13 @@ These are names of `rigidfleet.kernel.compiler.simd`. Functions around them woul
 from rigidfleet.kernel.compiler.simd import (
     fill_lanes,
     in_vectors,
-    inverse_root_of,
     rough_inverse,
     total_or_worst,
-    where_positive,
 )
 
 __all__ = [
     "fill_lanes",
     "in_vectors",
-    "inverse_root_of",
     "rough_inverse",
     "total_or_worst",
-    "where_positive",
 ]

@@ -65,9 +65,9 @@ def filter_factors(
 def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = None) -> Floats:
     """Smallest non-zero singular value (K,) of the constraint Jacobian J at r (K, N, 3).
 
-    Eq. (4) counts independent constraints: their number is the rank of J. Zero means below
-    1e-7 of the largest. NaN without edges. With ``masses`` the Jacobian is
-    weighted, J M^-1/2 sqrt(mbar), whose squares are the eigenvalues w of mbar A.
+    Eq. (4) counts independent constraints: their number is the rank of J. Zero means below 1e-7 of the largest.
+    NaN without edges, and where agents of an edge are at the same place. With ``masses`` the Jacobian is weighted,
+    J M^-1/2 sqrt(mbar), whose squares are the eigenvalues w of mbar A.
     """
     if not len(edges):
         return np.full(len(r), np.nan)
@@ -86,6 +86,8 @@ def smallest_of(J: Floats, masses: ArrayLike | None = None) -> Floats:
         J = J * np.repeat(np.sqrt(m.mean() / m), 3)
     # The smaller Gram matrix takes a third of the time of a decomposition of J itself.
     gram = J @ J.swapaxes(1, 2) if J.shape[1] <= J.shape[2] else J.swapaxes(1, 2) @ J
+    known = np.isfinite(gram).all(axis=(1, 2))
+    gram[~known] = 0.0
     w = np.linalg.eigvalsh(gram)
     w[w < 1e-14 * w[:, -1:]] = np.inf
-    return np.sqrt(w.min(axis=1))
+    return np.where(known, np.sqrt(w.min(axis=1)), np.nan)

@@ -18,7 +18,7 @@ doi:10.1080/00207177708922216).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from rigidfleet.math import pid
 from rigidfleet.math.constraint_jacobian import filter_factors, jacobian
 from rigidfleet.math.rigid_body import rigid_motions
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Bools, Floats, Ints
 
 Complexes = NDArray[np.complexfloating]
 
@@ -45,6 +45,8 @@ _FREQUENCIES, _SAMPLES = (1e-3, 1e5), 120
 _FAINT = 0.02
 # Greatest change of log(locus) between samples.
 _STEP = 0.4
+# Accuracy of the logarithm of a frequency at which a locus crosses, and the greatest number of secants to it.
+_CLOSE, _TRIES = 1e-12, 60
 # Number of instants of an impulse response, and the time between them [s]: a minute.
 _INSTANTS, _APART = 1 << 15, 2e-3
 # Least and greatest rate p of a triple pole that is tried [1/s], ratio of successive trials, relative accuracy.
@@ -172,7 +174,7 @@ class Loop(NamedTuple):
 
     ``S`` (2, n, n) is the share of the constraint law, and ``Q`` (2, n, n) the projection on rigid motions: whole, and
     what each vehicle adds of its own state. ``P`` (g, n, n) are the directions of each of the ``channels``: a lag, and
-    whether it is the vertical one.
+    whether it is the vertical one. B parts of one size are one loop with a further axis before the last two.
     """
 
     S: Floats
@@ -187,14 +189,16 @@ class Loop(NamedTuple):
 
     def gain(self, s: Complexes, law: LoopGains) -> Complexes:
         """L (K, n, n) at s (K,)."""
-        k_u, to_k_c, to_rigid = _gains(s, law)[..., None, None]
-        heard = np.exp(-s * law.link)[:, None, None]
+        each = (..., *(None,) * (self.S.ndim - 1))
+        k_u, to_k_c, to_rigid = _gains(s, law)[each]
+        heard = np.exp(-s * law.link)[each]
         S, Q = (heard * X[0] + (1 - heard) * X[1] for X in (self.S, self.Q))
-        K = k_u * np.eye(len(self.S[0])) + to_k_c * S + to_rigid * Q
+        K = k_u * np.eye(self.S.shape[-1]) + to_k_c * S + to_rigid * Q
         G = [lag.response(s, vertical=vertical) / (s * s) for lag, vertical in self.channels]
         if len(G) == 1:
-            return G[0][:, None, None] * K
-        return np.tensordot(np.transpose(G), self.P, axes=1) @ K
+            return G[0][each] * K
+        # Elementwise: for few channels, a product by BLAS mostly wakes its threads.
+        return np.sum([g[each] * part for g, part in zip(G, self.P, strict=True)], axis=0) @ K
 
 
 def _gains(s: Complexes, law: LoopGains) -> Complexes:
@@ -222,6 +226,13 @@ class Margins:
     gain: tuple[float, float] = (math.nan, math.nan)
     phase: float = math.nan
     delay: float = math.nan
+
+    def common(self, other: Margins) -> Margins:
+        """The smaller margins of both: those of their loops together."""
+        if not (self.stable and other.stable):
+            return Margins(stable=False)
+        gain = max(self.gain[0], other.gain[0]), min(self.gain[1], other.gain[1])
+        return Margins(True, gain, min(self.phase, other.phase), min(self.delay, other.delay))
 
     def data(self) -> dict[str, Any]:
         """Plain data: the phase in degrees."""
@@ -344,19 +355,31 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
 
 def is_stable(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> bool:
     """Whether no motion grows at a rate of ``growth`` [1/s] > 0 or more: Nyquist's criterion on det(1 + L)."""
-    return all(_unstable(loop, law, growth) == 0 for loop in loops)
+    return all(_is_stable(part, law, growth) for part in _by_size(loops))
 
 
-def _unstable(loop: Loop, law: LoopGains, growth: float) -> int:
-    """Number of roots of det(1 + L) to the right of ``growth``; 1 if a vehicle's attitude itself is unstable."""
+def _by_size(loops: Sequence[Loop]) -> Iterator[Loop]:
+    """The loops of each size, small ones first, as one: most are small, and what is done with each takes longer."""
+    for n in sorted({len(loop.S[0]) for loop in loops}):
+        some = [loop for loop in loops if len(loop.S[0]) == n]
+        channels = tuple(dict.fromkeys(channel for loop in some for channel in loop.channels))
+        P = np.zeros((len(channels), len(some), n, n))
+        for k, loop in enumerate(some):
+            P[[channels.index(channel) for channel in loop.channels], k] = loop.P
+        S, Q = (np.stack(parts, axis=1) for parts in zip(*(loop[:2] for loop in some), strict=True))
+        yield Loop(S, Q, P, channels)
+
+
+def _is_stable(loop: Loop, law: LoopGains, growth: float) -> bool:
+    """`is_stable` of the parts (B, n, n) of one loop; never where a vehicle's attitude itself is unstable."""
     if not all(lag.stable for lag, _ in loop.channels):
-        return 1
-    n = len(loop.S[0])
+        return False
+    n = loop.S.shape[-1]
     # From F to F (1 + X), det F turns by sum arg(1 + eig X) < pi if the norm of X is below this.
     near = min(0.7, 2.5 / math.sqrt(n))
     end = _highest(loop, law, min(0.7, 2.5 / n))  # from here on, det F turns by less than pi
     if end == 0.0:
-        return 0
+        return True
 
     def return_difference(omega: Floats) -> Complexes:
         return np.eye(n) + loop.gain(growth + 1j * omega, law)
@@ -366,7 +389,8 @@ def _unstable(loop: Loop, law: LoopGains, growth: float) -> int:
     F = return_difference(omega)
     turn = np.linalg.solve(F[:-1], F[1:])
     for _ in range(30):
-        far = np.flatnonzero(np.linalg.norm(turn - np.eye(n), axis=(1, 2)) > near)
+        turns = np.linalg.norm(turn - np.eye(n), axis=(-2, -1))
+        far = np.flatnonzero(turns.max(axis=1) > near)
         if not len(far):
             break
         middle = 0.5 * (omega[far] + omega[far + 1])
@@ -378,10 +402,10 @@ def _unstable(loop: Loop, law: LoopGains, growth: float) -> int:
         omega = np.insert(omega, far + 1, middle)
         F = np.insert(F, far + 1, between, axis=0)
     else:
-        return 1  # det(1 + L) = 0 on the line itself
-    turned = np.angle(np.linalg.slogdet(turn)[0]).sum()
+        return False  # det(1 + L) = 0 on the line itself
+    turned = np.angle(np.linalg.slogdet(turn)[0]).sum(axis=0)
     rest = np.angle(np.linalg.slogdet(F[-1])[0])
-    return round(float(rest - turned) / math.pi)
+    return bool((np.round((rest - turned) / math.pi) == 0.0).all())
 
 
 def _highest(loop: Loop, law: LoopGains, size: float) -> float:
@@ -406,54 +430,41 @@ def margins(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> Ma
         return Margins(stable=False)
     low, high, phase, delay = 0.0, math.inf, math.pi, math.inf
     for loop in loops:
-        for _, locus in _loci_at(loop, law, on_axis=True):
-            if 1 / abs(locus) > 1:
-                high = min(high, 1 / abs(locus))
-            else:
-                low = max(low, 1 / abs(locus))
-        for omega, locus in _loci_at(loop, law, on_axis=False):
-            angle = float(np.angle(-locus))
-            phase = min(phase, abs(angle))
-            delay = min(delay, angle % (2 * math.pi) / omega)
-    return Margins(True, (low, high), phase, delay)
+        omega, loci, on_axis = _crossings(loop, law)
+        gain = 1.0 / np.abs(loci[on_axis])
+        high = min(high, gain[gain > 1].min(initial=math.inf))
+        low = max(low, gain[gain <= 1].max(initial=0.0))
+        angle = np.angle(-loci[~on_axis])
+        phase = min(phase, np.abs(angle).min(initial=math.pi))
+        delay = min(delay, (angle % (2 * math.pi) / omega[~on_axis]).min(initial=math.inf))
+    return Margins(True, (float(low), float(high)), float(phase), float(delay))
 
 
-def _loci_at(loop: Loop, law: LoopGains, *, on_axis: bool) -> list[tuple[float, complex]]:
-    """Frequencies [rad/s] at which a locus is negative real (``on_axis``), or has unit gain; and the locus there."""
+def _crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
+    """Frequencies (M,) [rad/s] where a locus is negative real or has unit gain; the loci there; which are real."""
     omega, loci = _loci(loop, law)
-    if not len(omega):
-        return []
-
-    def place(z: Complexes) -> Floats:
-        """A number that is whole at a crossing, of log(locus)."""
-        return (z.imag - math.pi) / (2 * math.pi) if on_axis else z.real * 1e-3
-
-    crossings = []
-    number = place(loci)
-    for k, c in np.argwhere(np.floor(number[:-1]) != np.floor(number[1:])):
-        target = max(np.floor(number[k, c]), np.floor(number[k + 1, c]))
-        ends = np.log(omega[k : k + 2])
-
-        def at(x: float, k: int = k, c: int = c, ends: Floats = ends) -> complex:
-            """log(locus) at log(omega) = x: the eigenvalue nearest to the chord."""
-            part = (x - ends[0]) / (ends[1] - ends[0])
-            guess = (1 - part) * loci[k, c] + part * loci[k + 1, c]
-            z = np.log(
-                _eigenvalues(loop.gain(np.array([1j * math.exp(x)]), law))[0] / np.exp(guess)
-            )
-            return complex(z[np.abs(z).argmin()] + guess)
-
-        x = _root(lambda x, at=at, target=target: float(place(np.array(at(x)))) - target, *ends)
-        crossings.append((math.exp(x), complex(np.exp(at(x)))))
-    return crossings
-
-
-def _root(f: Callable[[float], float], a: float, b: float) -> float:
-    from scipy.optimize import brentq
-
-    if f(a) * f(b) > 0:  # a crossing at an end, within rounding
-        return a if abs(f(a)) < abs(f(b)) else b
-    return float(brentq(f, a, b, xtol=1e-12))
+    # Numbers of log(locus) that are whole where a locus is negative real, and that change sign at unit gain.
+    numbers = np.stack([(loci.imag - math.pi) / (2 * math.pi), loci.real * 1e-3])
+    whole = np.floor(numbers)
+    kind, k, c = np.nonzero(whole[:, :-1] != whole[:, 1:])
+    target = np.maximum(whole[kind, k, c], whole[kind, k + 1, c])
+    chord, off = loci[[k, k + 1], c], numbers[kind, [k, k + 1], c] - target
+    x = begin, end = np.log(omega[[k, k + 1]])
+    z = chord[1]
+    for _ in range(_TRIES):  # all at once by secants, between ends of different signs ("Illinois")
+        slope = off[1] - off[0]
+        new = x[1] - off[1] * (x[1] - x[0]) / np.where(slope == 0.0, 1.0, slope)
+        share = (new - begin) / (end - begin)
+        guess = (1 - share) * chord[0] + share * chord[1]
+        values = np.log(_eigenvalues(loop.gain(1j * np.exp(new), law)) / np.exp(guess)[:, None])
+        z = values[np.arange(len(k)), np.abs(values).argmin(axis=1)] + guess
+        number = np.where(kind == 0, (z.imag - math.pi) / (2 * math.pi), z.real * 1e-3) - target
+        moved, same = np.abs(new - x[1]), number * off[1] > 0
+        x = np.where(same, x[0], x[1]), new
+        off = np.where(same, 0.5 * off[0], off[1]), number
+        if (moved <= _CLOSE).all():
+            break
+    return np.exp(x[1]), np.exp(z), kind == 0
 
 
 def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:

@@ -38,13 +38,7 @@ class Piecewise(NamedTuple):
     @classmethod
     def of_ends(cls, time: Floats, begin: Floats, end: Floats) -> Piecewise:
         """The same, from m derivatives (m, K, ...) at the beginning and at the end of each piece."""
-        m = len(begin)
-        h = np.diff(time).reshape(-1, *(1,) * (begin.ndim - 2))
-        scale = np.stack([h**k for k in range(2 * m)])
-        start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
-        reached = [sum(start[k] * float(perm(k, j)) for k in range(j, m)) for j in range(m)]
-        rest = np.tensordot(_to_highest(m), end * scale[:m] - np.stack(reached), 1)
-        return cls(time, np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1))
+        return cls(time, hermite_pieces(np.diff(time), begin, end))
 
     @classmethod
     def of_bernstein(cls, time: Floats, points: Floats) -> Piecewise:
@@ -167,12 +161,24 @@ class Piecewise(NamedTuple):
         return scaled @ _to_bernstein(powers).T
 
 
+def hermite_pieces(h: Floats, begin: Floats, end: Floats) -> Floats:
+    """Pieces (K, ..., 2 m) of lengths (K,) [s] from m derivatives (m, K, ...) at their beginnings and at their ends."""
+    m = len(begin)
+    h = h.reshape(-1, *(1,) * (begin.ndim - 2))
+    scale = np.stack([h**k for k in range(2 * m)])
+    start = series.from_derivatives(begin) * scale[:m]  # coefficients in u = (t - t0) / h
+    reached = [sum(start[k] * float(perm(k, j)) for k in range(j, m)) for j in range(m)]
+    rest = np.tensordot(_to_highest(m), end * scale[:m] - np.stack(reached), 1)
+    return np.moveaxis(np.concatenate([start, rest]) / scale, 0, -1)
+
+
 def piece_at(knots: Floats, t: Floats, side: Literal["left", "right"] = "right") -> Ints:
     """Interval (T,) between knots (K + 1,) in which times (T,) are; beyond the ends, the first and the last.
 
     At a knot, it is the one after it ("right") or before it ("left").
     """
-    return np.clip(np.searchsorted(knots, t, side=side) - 1, 0, len(knots) - 2)
+    after = np.searchsorted(knots, t, side=side) - 1
+    return np.minimum(np.maximum(after, 0), len(knots) - 2)  # `clip` takes far longer
 
 
 def refine(knots: Floats, times: Floats, apart: float = 0.0) -> Floats:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.solids import distance
-from rigidfleet.solids.records import HEIGHTS, HULL, Solids, boxes_of
+from rigidfleet.solids.records import HEIGHTS, HULL, Solids
 from rigidfleet.typing import Bools, Floats, Ints
 
 # Number of agents beyond which a tree finds near pairs, instead of a search of all pairs.
@@ -321,13 +321,6 @@ def obstacle_clearances(
     Obstacles that move are where they are at ``time`` (...) [s]. Distances beyond ``most`` (..., N) [m] need not be
     known: these are ``most``, without an obstacle.
     """
-    compiled = distance.nearest_boxes()
-    if compiled is not None and r.ndim == 3 and r.dtype == np.float64 and r.flags.c_contiguous:
-        boxes = boxes_of([thing.solid for thing in obstacles]) if most is np.inf else None
-        if boxes is not None:
-            radius = np.array(np.broadcast_to(radius, r.shape[1]), dtype=float)
-            least, nearest = compiled(r, radius, boxes)
-            return least.T, nearest.T
     nearest = np.full(r.shape[-2::-1], -1)
     least = np.broadcast_to(np.asarray(most, dtype=float).T, nearest.shape).copy()
     n = r.shape[-2]

@@ -18,7 +18,9 @@ from rigidfleet.typing import Floats
 #: Up to this squared angle, Stumpff functions are summed as series, with this number of terms: exact to rounding.
 _SERIES, _TERMS = 16.0, 16
 #: 1/k!
-_RECIPROCALS = [1.0 / math.factorial(k) for k in range(64)]
+_RECIPROCALS = np.array([1.0 / math.factorial(k) for k in range(64)])
+#: k!
+_FACTORIALS = np.array([float(math.factorial(k)) for k in range(64)])
 
 
 def derivatives(x: Floats) -> Floats:
@@ -32,8 +34,7 @@ def from_derivatives(x: Floats) -> Floats:
 
 
 def _factorials(x: Floats) -> Floats:
-    factorials = [float(math.factorial(k)) for k in range(len(x))]
-    return np.array(factorials).reshape(-1, *(1,) * (x.ndim - 1))
+    return _FACTORIALS[: len(x)].reshape(-1, *(1,) * (x.ndim - 1))
 
 
 def rate(x: Floats) -> Floats:
@@ -42,9 +43,13 @@ def rate(x: Floats) -> Floats:
 
 
 def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
-    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,)."""
-    c = list(np.moveaxis(np.asarray(coefficients, dtype=float), -1, 0))
-    x = x.reshape(-1, *(1,) * (c[0].ndim - 1))
+    """Series (orders, K, ...) of polynomials with coefficients (K, ..., P), ascending, at x (K,).
+
+    In memory, x is the last axis: arithmetic on long rows is fast.
+    """
+    coefficients = np.asarray(coefficients, dtype=float)
+    inner = range(1, coefficients.ndim - 1)
+    c = list(np.ascontiguousarray(coefficients.transpose(-1, *inner, 0)))
     powers = len(c)
     for order in range(min(orders, powers)):  # repeated synthetic division by (t - x)
         for k in range(powers - 2, order - 1, -1):
@@ -52,7 +57,7 @@ def of_polynomials(coefficients: Floats, x: Floats, orders: int) -> Floats:
     full = np.zeros((orders, *np.broadcast_shapes(x.shape, c[0].shape)))
     for order, values in enumerate(c[:orders]):
         full[order] = values
-    return full
+    return full.transpose(0, -1, *inner)
 
 
 def product(
@@ -66,14 +71,17 @@ def product(
     return total
 
 
-def rotation(phi: Floats) -> Floats:
+def rotation(phi: Floats, orders: int | None = None) -> Floats:
     """Series (n, ..., 3, 3) of R = Exp(phi), body to world, of rotation vectors phi (n, ..., 3) [rad].
+
+    With fewer ``orders``, the others are left out, and the numbers are the same.
 
     R = c_0(u) + c_1(u) [phi x] + c_2(u) phi phi^T with u = |phi|^2 and the Stumpff functions c_k, which are analytic in
     u, so that no angle is special. Times are the last axis in memory: arithmetic on long rows is fast.
     """
-    x = np.ascontiguousarray(np.moveaxis(phi, -1, 1))
-    c0, c1, c2 = _stumpff_series(product(x, x).sum(axis=1))
+    count = 2 * len(phi) + 1  # of functions; two fewer with each order
+    x = np.ascontiguousarray(phi[:orders].transpose(0, -1, *range(1, phi.ndim - 1)))
+    c0, c1, c2 = _stumpff_series(product(x, x).sum(axis=1), count)
     S = product(c1[:, None], x)
     P = product(product(c2[:, None], x)[:, [0, 1, 2, 0, 0, 1]], x[:, [0, 1, 2, 1, 2, 2]])
     P[:, :3] += c0[:, None]
@@ -83,7 +91,7 @@ def rotation(phi: Floats) -> Floats:
     for k, (i, j, sign) in enumerate(((0, 1, -1.0), (0, 2, 1.0), (1, 2, -1.0))):
         R[:, i, j] = P[:, 3 + k] + sign * S[:, 2 - k]
         R[:, j, i] = P[:, 3 + k] - sign * S[:, 2 - k]
-    return np.moveaxis(R, (1, 2), (-2, -1))
+    return R.transpose(0, *range(3, R.ndim), 1, 2)
 
 
 def rotation_vector(R: Floats) -> Floats:
@@ -95,7 +103,7 @@ def rotation_vector(R: Floats) -> Floats:
     phi = np.zeros(R.shape[:-1])
     phi[0] = att.rotation_vector_from_dcm(np.swapaxes(R[0], -1, -2))
     for k in range(1, len(R)):
-        lacking = R[k] - rotation(phi[: k + 1])[k]
+        lacking = R[k] - rotation(phi[: k + 1])[k] if k > 1 else R[k]  # nothing moves yet
         phi[k] = att.rotation_vector_rate(phi[0], _axial(np.swapaxes(R[0], -1, -2) @ lacking))
     return phi
 
@@ -150,11 +158,11 @@ def _stumpff(u: Floats, count: int) -> Floats:
     values = np.zeros((count, *u.shape))
     near = u < _SERIES
     small = np.where(near, u, 0.0)
-    for k in (count - 1, count - 2):
-        total = values[k, ...]  # a view, of single numbers as well
-        for i in range(_TERMS, -1, -1):  # Horner
-            np.multiply(total, small, out=total)
-            np.subtract(_RECIPROCALS[2 * i + k], total, out=total)
+    total, column = values[count - 2 :], (2, *(1,) * u.ndim)
+    for i in range(_TERMS, -1, -1):  # Horner, of both
+        np.multiply(total, small, out=total)
+        first = 2 * i + count - 2
+        np.subtract(_RECIPROCALS[first : first + 2].reshape(column), total, out=total)
     for k in range(count - 3, -1, -1):  # c_k = 1/k! - u c_(k + 2), downwards for small u
         values[k] = _RECIPROCALS[k] - small * values[k + 2]
     if near.all():
@@ -167,13 +175,12 @@ def _stumpff(u: Floats, count: int) -> Floats:
     return np.where(near, values, np.stack(closed))
 
 
-def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
-    """Series (n, ...) of c_0(u), c_1(u) and c_2(u) of a series u (n, ...).
+def _stumpff_series(u: Floats, count: int) -> tuple[Floats, Floats, Floats]:
+    """Series (n, ...) of c_0(u), c_1(u) and c_2(u) of a series u (n, ...), by so many Stumpff functions.
 
     c_k' = (k c_(k+2) - c_(k+1)) / 2 gives each order from the order before of the following functions.
     """
     n, slope = len(u), rate(u)
-    count = 2 * n + 1  # of the functions; two fewer with each order
     orders = [_stumpff(u[0], count)]
     chain: list[Floats] = []  # derivatives by u
     for order in range(1, n):
@@ -184,5 +191,5 @@ def _stumpff_series(u: Floats) -> tuple[Floats, Floats, Floats]:
         for i in range(1, order):
             total += slope[i] * chain[order - 1 - i][: len(total)]
         orders.append(total / order)
-    c0, c1, c2 = (np.stack([c[k] for c in orders]) for k in range(3))
+    c0, c1, c2 = (np.array([c[k] for c in orders]) for k in range(3))
     return c0, c1, c2

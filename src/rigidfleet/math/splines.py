@@ -40,9 +40,8 @@ def minimum_snap(times: Floats, x: Floats, begin: Floats, end: Floats, *v: Float
     """
     if np.isnan(end[0]).any():
         ends = [np.stack([np.full_like(end[0], speed), *end[1:]]) for speed in (0.0, 1.0)]
-        slow, fast = (
-            minimum_snap(times, x, begin, one, *v) for one in ends
-        )  # linear in the velocity
+        # Linear in the velocity.
+        slow, fast = (minimum_snap(times, x, begin, one, *v) for one in ends)
         h = times[-1] - times[-2]
         least, most = (way[-1, ..., 6] + 7.0 * h * way[-1, ..., 7] for way in (slow, fast))
         return slow + (least / (least - most))[..., None] * (fast - slow)

@@ -328,9 +328,8 @@ def _limits(m: Draft) -> Breaches:
         problem = "has no effect without separation"
         yield Breach("separation_altitude", problem, "remove it or add separation")
     jerks = (q.name for q in MOTIONS if q.order == 3)
-    for key in (
-        jerks if m.flies_vehicles else (*jerks, "tilt_deg")
-    ):  # of vehicles, the verdict judges the tilt
+    # Of vehicles, the verdict judges the tilt.
+    for key in jerks if m.flies_vehicles else (*jerks, "tilt_deg"):
         if getattr(limits, key) is not None and not m.smooth:
             problem = "has no effect: only the plan of a smooth mission keeps it"
             yield Breach(key, problem, "remove it or add smoothness = 'jerk' at the top")

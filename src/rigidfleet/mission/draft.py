@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.templates import templates
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity
 from rigidfleet.mission.findings import suggest_shape
@@ -104,31 +105,17 @@ def draft(
     extent = json.dumps([float(x) for x in size]) if len(size) > 1 else f"{size[0]:g}"
     if _is_box(shape, size):
         extent = json.dumps([float(size[0])] * 3)
-    head = _HEAD.format(
-        name=json.dumps(name, ensure_ascii=False),
+    text = templates("rigidfleet.mission", escape=False).get_template("mission.toml").render(
+        name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
         title=f"{n} vehicles fly as a {shape}" if n > 1 else "One vehicle flies",
-        file=file or f"{name}.toml",
-        mass=f"{mass:g}",
-        start=_rows(start),
-        radius=f"{radius:.3g}",
-        thrust=f"{limit:g}",
-        shape=shape,
-        size=extent,
-        edges="" if n <= _ALL_PAIRS else _NO_EDGES,
-        takes=shapes.agents_taken(shape),
-        text=shapes.SHAPES[shape].text,
-        separation=f"{min(0.5, nearest / 6):.3g}",
+        mass=f"{mass:g}", start=[_row(place) for place in start], below=below, step=output_step(n, lasts),
+        radius=f"{radius:.3g}", thrust=f"{limit:g}", shape=shape, size=extent, many=n > _ALL_PAIRS,
+        takes=shapes.agents_taken(shape), text=shapes.SHAPES[shape].text, separation=f"{min(0.5, nearest / 6):.3g}",
         # In a small spatial shape, or one of many agents, some agents pass below others in any case.
-        below="" if below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0) else "# ",
-        keys=("" if below else _ASSIGNED) + output_step(n, lasts),
-        aloft=_row(aloft),
-        blend=""
-        if blend == 4
-        else f"blend = {blend}.0                       # [s] duration of the change of shape\n",
-        establish=f"{blend + _SETTLE}.0",
-        climb=f"{climb}.0",
-    )
-    return align_comments(head + "".join(text for text, _ in flights) + _TAIL)
+        warned=below and (distance_geometry.dimension(slots) < 3 or nearest >= 3.0),
+        aloft=_row(aloft), climb=climb, blend=blend, settle=_SETTLE, flights=flights, hold=_HOLD,
+    )  # fmt: skip
+    return align_comments(text)
 
 
 def shape_known(shape: str) -> None:
@@ -191,19 +178,17 @@ def blend_time(way: float) -> int:
     return math.ceil(max(35 / 16 * way / _SPEED, math.sqrt(7.52 * way / _ACCELERATION)))
 
 
-def output_step(n: int, lasts: float) -> str:
-    """Return the key `output_step` if the default would store too much in a mission of this duration [s]; else ''."""
-    step = math.ceil(20 * lasts * n / _STORED) / 20
-    return "" if step <= 0.05 else f"output_step = {step:g}                # [s] between samples\n"
+def output_step(n: int, lasts: float) -> float:
+    """Time between samples [s] with which a mission of this duration [s] does not store too much."""
+    return math.ceil(20 * lasts * n / _STORED) / 20
 
 
 def _flights(at: Floats, waypoints: Sequence[Sequence[float]]) -> list[tuple[str, int]]:
-    """Return a phase for each waypoint and its duration [s]; the first one starts at the position (3,) [m]."""
+    """Each waypoint as a list in TOML, and the duration [s] of the way there from a position (3,) [m]."""
     flights = []
     for waypoint in waypoints:
         to = np.asarray(waypoint, dtype=float)
-        time = _time(to - at)
-        flights.append((_FLY.format(position=_row(to), time=f"{time}.0"), time))
+        flights.append((_row(to), _time(to - at)))
         at = to
     return flights
 
@@ -229,85 +214,3 @@ def __getattr__(name: str) -> Any:
 def _row(values: Sequence[float] | Floats) -> str:
     # Adding zero removes the sign of a negative zero.
     return f"[{', '.join(f'{round(float(x), 3) + 0.0:g}' for x in values)}]"
-
-
-def _rows(values: Floats) -> str:
-    return "".join(f"    {_row(row)},\n" for row in values)
-
-
-_HEAD = """\
-# {title}.
-#
-# Change any number, then check the mission and fly it:
-#     rigidfleet check {file}
-#     rigidfleet run {file}
-# Units are SI; x is east, y north, z up; agents count from 1. An error in a key is reported with its remedy.
-
-schema_version = 1
-name = {name}                   # results are written to flights/NAME
-title = "{title}"
-smoothness = "jerk"               # acceleration and jerk are continuous; "lqr": the legs of the paper
-{keys}
-[agents]
-mass = {mass}                        # [kg] one number for all, or a list
-position = [                      # [m] initial positions
-{start}]
-radius = {radius}                     # [m] radius of the sphere around each agent; spheres must not touch
-thrust_limit = {thrust}                # [N] of each agent; the verdict fails if thrust exceeds it
-
-[formations.{shape}]              # {takes}: {text}
-shape = "{shape}"                 # or slots = [[x, y, z], ...], one per agent [m]
-size = {size}                          # [m]
-{edges}
-# To change to another shape in flight, add a table [formations.NAME] and a phase with
-#     kind = "reshape", formation = "NAME", duration = 6.0
-
-[[obstacles]]
-kind = "ground"
-
-# [[obstacles]]                   # a wall to avoid
-# kind = "box"
-# min = [8, 4, 0]                 # [m]
-# max = [9, 6, 15]
-
-[limits]                          # limits that the verdict checks
-separation = {separation}                  # [m] minimum distance between surfaces
-{below}separation_below = 0.8            # [m] minimum height above another agent (downwash)
-# speed = 6.0                     # [m/s]; with limits, duration = "auto" takes the least time that keeps them
-# acceleration = 4.0              # [m/s^2]
-# jerk = 6.0                      # [m/s^3]
-# geofence = {{min = [-50, -50, 0], max = [50, 50, 30]}}
-
-# -- the flight: phases in order, each ending after its duration [s] ------------------------------
-
-[[phases]]                        # straight up, in the initial shape
-name = "climb"
-kind = "fly"
-position = {aloft}                # [m] centre of mass, here and below
-duration = {climb}
-
-[[phases]]                        # take the formation
-kind = "establish"
-formation = "{shape}"
-{blend}duration = {establish}
-"""
-
-_ASSIGNED = 'assignment = "each"               # each agent takes a near slot: least sum of squared distances\n'
-
-_NO_EDGES = (
-    "edges = []  # held by tracking alone; to add constraints, list the edges: [[1, 2], ...]\n"
-)
-
-_FLY = """
-[[phases]]
-kind = "fly"
-position = {position}
-yaw_deg = 0.0                     # attitude of the formation on arrival
-duration = {time}
-"""
-
-_TAIL = """
-[[phases]]
-kind = "hold"
-duration = 3.0
-"""

@@ -28,6 +28,7 @@ from rigidfleet.mission.values import (
     Vector,
     Velocity,
     VelocityOrFree,
+    key,
 )
 
 #: Keys of a phase that may be automatic, and the word for it.
@@ -41,9 +42,9 @@ ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 class Settle(Part):
     """The phase ends when its error has stayed within a tolerance for some time."""
 
-    tolerance: Tolerance = Field(1e-3, description="maximum error [m]")
-    dwell: Dwell = Field(1.0, description="time that the error must stay within tolerance [s]")
-    timeout: Time = Field(60.0, description="time after which the mission fails [s]")
+    tolerance: Tolerance = key("maximum error [m]", 1e-3)
+    dwell: Dwell = key("time that the error must stay within tolerance [s]", 1.0)
+    timeout: Time = key("time after which the mission fails [s]", 60.0)
 
 
 class AnyPhase(Part):
@@ -67,22 +68,22 @@ class AnyPhase(Part):
     #: Default control in architecture "body".
     body_control: ClassVar[str] = "body"
 
-    name: str = Field("", description="unique name; default: its kind and number")
-    until: Time | None = Field(None, description="the phase ends at this mission time [s]")
-    duration: Duration | None = Field(
+    name: str = key("unique name; default: its kind and number", "")
+    until: Time | None = key("the phase ends at this mission time [s]", None)
+    duration: Duration | None = key(
+        "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
         None,
-        description="the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
     )
-    settle: Settle | None = Field(None, description="the phase ends when its error has settled")
-    control: Literal["open", "tracking", "body"] = Field(
-        "tracking",
-        description="open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
+    settle: Settle | None = key("the phase ends when its error has settled", None)
+    control: Literal["open", "tracking", "body"] = key(
+        "open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
         "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
         "orbit and body for other phases",
+        "tracking",
     )
-    input_force: Force = Field(
+    input_force: Force = key(
+        "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
-        description="force on each agent in addition to weight compensation [N]; only with control 'open'",
     )
 
     @property
@@ -191,11 +192,10 @@ class AnyPhase(Part):
 class Attitude(Part):
     """Angles of an attitude; if one is given, the default of the others is 0."""
 
-    roll_deg: Angle | None = Field(None, description="roll at arrival [deg], 3-2-1 Euler angles")
-    pitch_deg: Angle | None = Field(None, description="pitch at arrival [deg]")
-    yaw_deg: Angle | None = Field(
-        None,
-        description="yaw at arrival [deg]; if one angle is given, the default of the others is 0",
+    roll_deg: Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles", None)
+    pitch_deg: Angle | None = key("pitch at arrival [deg]", None)
+    yaw_deg: Angle | None = key(
+        "yaw at arrival [deg]; if one angle is given, the default of the others is 0", None
     )
 
     @model_validator(mode="before")
@@ -218,19 +218,19 @@ class Shaping(AnyPhase):
 
     shapes: ClassVar[bool] = True
 
-    formation: str = Field(description="name of the formation to take")
-    reference: Literal["shape", "distances", "squares", "step"] = Field(
-        "shape",
-        description="how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
+    formation: str = key("name of the formation to take")
+    reference: Literal["shape", "distances", "squares", "step"] = key(
+        "how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
         "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
+        "shape",
     )
-    blend: Duration = Field(
+    blend: Duration = key(
+        "duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
         4.0,
-        description="duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
     )
 
-    position: Vector | None = Field(
-        None, description="centre of mass at the end, at rest [x, y, z] [m]; default: as before"
+    position: Vector | None = key(
+        "centre of mass at the end, at rest [x, y, z] [m]; default: as before", None
     )
 
     @property
@@ -266,34 +266,34 @@ class Establish(Attitude, Shaping):
 
     body_control: ClassVar[str] = "open"
 
-    kind: Literal["establish"] = Field(description="take a formation")
-    attitude: Literal["drawn", "free"] = Field(
-        "drawn",
-        description="drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
+    kind: Literal["establish"] = key("take a formation")
+    attitude: Literal["drawn", "free"] = key(
+        "drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
         "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
         "free if no slots are tracked, or if the formation is given by distances and no angle is commanded",
+        "drawn",
     )
 
 
 class Reshape(Shaping):
     """Change from one formation to another."""
 
-    kind: Literal["reshape"] = Field(description="change the formation")
-    transition: Literal["straight", "layers", "ways", "auto"] = Field(
-        "straight",
-        description="ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
+    kind: Literal["reshape"] = key("change the formation")
+    transition: Literal["straight", "layers", "ways", "auto"] = key(
+        "ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
         "across, and together again, as three phases, with every pair proved; ways: bent ways for all together, found "
         "within limits.speed and acceleration, and proved; auto: straight if that keeps limits.separation, else layers",
+        "straight",
     )
-    control_points: tuple[tuple[Vector, ...], ...] | None = Field(
-        None,
-        description="bent ways to the new slots over `blend`: control points of uniform cubic B-splines, a row of "
+    control_points: tuple[tuple[Vector, ...], ...] | None = key(
+        "bent ways to the new slots over `blend`: control points of uniform cubic B-splines, a row of "
         "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'",
+        None,
     )
-    alignment: Literal["fit", "none"] = Field(
-        "fit",
-        description="fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
+    alignment: Literal["fit", "none"] = key(
+        "fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
         "straight ways in the axes of the body",
+        "fit",
     )
 
     @property
@@ -312,14 +312,12 @@ class Steering(Attitude, AnyPhase):
 
     moves: ClassVar[bool] = True
 
-    travel: Duration | None = Field(
-        None,
-        description="time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
+    travel: Duration | None = key(
+        "time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
         "limits",
+        None,
     )
-    rates_deg_s: Rates = Field(
-        (0.0, 0.0, 0.0), description="body rates [p, q, r] at arrival [deg/s]"
-    )
+    rates_deg_s: Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
 
     @property
     def meets(self) -> tuple[str, ...]:
@@ -336,28 +334,27 @@ class Steering(Attitude, AnyPhase):
 class Through(Part):
     """A point that a `fly` phase passes without a stop."""
 
-    position: Vector = Field(description="centre of mass [x, y, z] [m]")
-    time: Time | None = Field(
-        None,
-        description="time from the start of the phase [s]; default: the times with the least snap",
+    position: Vector = key("centre of mass [x, y, z] [m]")
+    time: Time | None = key(
+        "time from the start of the phase [s]; default: the times with the least snap", None
     )
-    velocity: Velocity | None = Field(
-        None, description="its velocity then [m/s]; default: the one with the least snap"
+    velocity: Velocity | None = key(
+        "its velocity then [m/s]; default: the one with the least snap", None
     )
 
 
 class Fly(Steering):
     """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
 
-    kind: Literal["fly"] = Field(description="fly to a waypoint")
-    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
-    velocity: VelocityOrFree = Field(
-        (0.0, 0.0, 0.0), description="its velocity at arrival [m/s]; free: any, not judged"
+    kind: Literal["fly"] = key("fly to a waypoint")
+    position: Vector = key("centre of mass at arrival [x, y, z] [m]")
+    velocity: VelocityOrFree = key(
+        "its velocity at arrival [m/s]; free: any, not judged", (0.0, 0.0, 0.0)
     )
-    through: tuple[Through, ...] = Field(
-        (),
-        description="points to pass on the way, with the least snap (smooth missions): "
+    through: tuple[Through, ...] = key(
+        "points to pass on the way, with the least snap (smooth missions): "
         "`through = [{ position = [x, y, z], time = 4.0, velocity = [vx, vy, vz] }]`",
+        (),
     )
 
     @property
@@ -387,18 +384,18 @@ class Go(Attitude, AnyPhase):
     replaced: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    kind: Literal["go"] = Field(description="fly to a pose, on a way that is found round obstacles")
-    position: Vector = Field(description="centre of mass at arrival [x, y, z] [m]")
-    clearance: LengthOrZero = Field(
-        0.2, description="least distance of vehicles from obstacles on the planned way [m]"
+    kind: Literal["go"] = key("fly to a pose, on a way that is found round obstacles")
+    position: Vector = key("centre of mass at arrival [x, y, z] [m]")
+    clearance: LengthOrZero = key(
+        "least distance of vehicles from obstacles on the planned way [m]", 0.2
     )
-    formations: tuple[str, ...] | None = Field(
-        None,
-        description="formations that may be taken on the way; default: all that have slots. The phase ends in the "
+    formations: tuple[str, ...] | None = key(
+        "formations that may be taken on the way; default: all that have slots. The phase ends in the "
         "formation in which it begins",
+        None,
     )
-    scales: tuple[Scale, ...] = Field(
-        (), description="factors by which formations may shrink on the way, below 1; default: none"
+    scales: tuple[Scale, ...] = key(
+        "factors by which formations may shrink on the way, below 1; default: none", ()
     )
 
     @property
@@ -410,13 +407,13 @@ class Go(Attitude, AnyPhase):
 class Turn(Steering):
     """Turn on the spot to an attitude. At least one angle is required."""
 
-    kind: Literal["turn"] = Field(description="turn on the spot")
+    kind: Literal["turn"] = key("turn on the spot")
 
 
 class Hold(AnyPhase):
     """Stay at the commanded position and attitude."""
 
-    kind: Literal["hold"] = Field(description="stay at the commanded position and attitude")
+    kind: Literal["hold"] = key("stay at the commanded position and attitude")
 
 
 class Arriving(AnyPhase):
@@ -425,15 +422,15 @@ class Arriving(AnyPhase):
     moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    travel: Time | None = Field(
-        None, description="time from the start to the arrival [s]; default: the whole phase"
+    travel: Time | None = key(
+        "time from the start to the arrival [s]; default: the whole phase", None
     )
 
 
 class Brake(Arriving):
     """Come to rest where braking leads, in position and attitude, with the least snap."""
 
-    kind: Literal["brake"] = Field(description="come to rest where braking leads")
+    kind: Literal["brake"] = key("come to rest where braking leads")
 
 
 class Vertical(Arriving):
@@ -441,18 +438,18 @@ class Vertical(Arriving):
 
     grounded: ClassVar[bool] = True
 
-    agents: tuple[AgentNumber, ...] = Field(
-        (), description="numbers of the vehicles that move; the others stay. Default: all"
+    agents: tuple[AgentNumber, ...] = key(
+        "numbers of the vehicles that move; the others stay. Default: all", ()
     )
-    stagger: Time | None = Field(
-        None,
-        description="time [s] from one group's start to the next's; all arrive by the end of the phase, each before "
+    stagger: Time | None = key(
+        "time [s] from one group's start to the next's; all arrive by the end of the phase, each before "
         "the next starts. Default: all start together",
+        None,
     )
-    by: Literal["rows", "vehicles"] = Field(
-        "rows",
-        description="groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
+    by: Literal["rows", "vehicles"] = key(
+        "groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
         "in the order of their numbers",
+        "rows",
     )
 
     @property
@@ -479,10 +476,8 @@ class Vertical(Arriving):
 class Takeoff(Vertical):
     """Climb straight up from the ground, until all vehicles are at one height."""
 
-    kind: Literal["takeoff"] = Field(description="climb straight up to a level height")
-    height: Length = Field(
-        description="height of the vehicles' centres above the ground on arrival [m]"
-    )
+    kind: Literal["takeoff"] = key("climb straight up to a level height")
+    height: Length = key("height of the vehicles' centres above the ground on arrival [m]")
 
     @property
     def level(self) -> float | None:
@@ -505,7 +500,7 @@ class Land(Vertical):
 
     lands: ClassVar[bool] = True
 
-    kind: Literal["land"] = Field(description="descend straight down to the ground")
+    kind: Literal["land"] = key("descend straight down to the ground")
 
     @property
     def leads_to(self) -> str:
@@ -526,35 +521,35 @@ class Follow(Cruising):
 
     follows_curves: ClassVar[bool] = True
 
-    kind: Literal["follow"] = Field(description="follow trajectories of a file")
-    file: str | None = Field(
-        None,
-        description="file of the trajectories, relative to the mission file: one for the virtual body, or one for each "
+    kind: Literal["follow"] = key("follow trajectories of a file")
+    file: str | None = key(
+        "file of the trajectories, relative to the mission file: one for the virtual body, or one for each "
         "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place",
-    )
-    units: str | None = Field(
         None,
-        description="units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'",
     )
-    axes: str | None = Field(
+    units: str | None = key(
+        "units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'",
         None,
-        description="where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d",
     )
-    trajectories: Trajectories | None = Field(
+    axes: str | None = key(
+        "where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d",
         None,
-        description="of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
+    )
+    trajectories: Trajectories | None = key(
+        "of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
         "the coefficients of x, y, z [m] and yaw [rad], in ascending powers of the time since its beginning, equally "
         "many of each (at most 8)",
-    )
-    yaw: Literal["fixed", "file"] = Field(
-        "fixed",
-        description="fixed: keeps the attitude commanded before; file: the virtual body is level and has the yaw of "
-        "the file. The yaw of single vehicles follows [yaw]",
-    )
-    travel: Time | None = Field(
         None,
-        description="time from the start to the end of the trajectories [s]; default: the whole phase, whose default "
+    )
+    yaw: Literal["fixed", "file"] = key(
+        "fixed: keeps the attitude commanded before; file: the virtual body is level and has the yaw of "
+        "the file. The yaw of single vehicles follows [yaw]",
+        "fixed",
+    )
+    travel: Time | None = key(
+        "time from the start to the end of the trajectories [s]; default: the whole phase, whose default "
         "is the time in the file. With another time, all speeds scale",
+        None,
     )
 
     @model_validator(mode="before")
@@ -604,21 +599,21 @@ def _time_of(trajectories: Any) -> float:
 class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
-    kind: Literal["orbit"] = Field(description="circle a point")
-    centre: Vector = Field(description="centre of the horizontal circle [x, y, z] [m]")
-    radius: Length = Field(description="radius of the circle [m]")
-    rate_deg_s: Angle = Field(
-        description="angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
+    kind: Literal["orbit"] = key("circle a point")
+    centre: Vector = key("centre of the horizontal circle [x, y, z] [m]")
+    radius: Length = key("radius of the circle [m]")
+    rate_deg_s: Angle = key(
+        "angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
     )
-    yaw: Literal["fixed", "along"] = Field(
-        "fixed",
-        description="fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
+    yaw: Literal["fixed", "along"] = key(
+        "fixed: keeps the attitude commanded before; along: the body turns with the orbit, with the same "
         "side towards the centre as at the start",
+        "fixed",
     )
-    blend: Duration = Field(
-        4.0,
-        description="duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
+    blend: Duration = key(
+        "duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
         "the limits",
+        4.0,
     )
 
     @property

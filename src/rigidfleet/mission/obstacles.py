@@ -23,6 +23,7 @@ from rigidfleet.mission.values import (
     Seconds,
     Vector,
     Velocity,
+    key,
 )
 from rigidfleet.solids import records
 from rigidfleet.solids.records import Form, Solids
@@ -34,10 +35,8 @@ _EVER = bounds.TIME.most
 class Solid(Part):
     """An obstacle, which is a solid shape; distances to it are those of `rigidfleet.solids`."""
 
-    name: str = Field("", description="name; default: the kind and a number")
-    zone: Flag = Field(
-        False, description="true: a no-fly zone; judged as an obstacle, and drawn as a zone"
-    )
+    name: str = key("name; default: the kind and a number", "")
+    zone: Flag = key("true: a no-fly zone; judged as an obstacle, and drawn as a zone", False)
 
     @property
     @abstractmethod
@@ -75,23 +74,18 @@ class Solid(Part):
 class Moving(Solid):
     """An obstacle that may move, without turning."""
 
-    velocity: Velocity | None = Field(
-        None, description="constant velocity [m/s], from the start of the mission"
-    )
-    waypoints: tuple[Vector, ...] | None = Field(
-        None,
-        description="places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant "
+    velocity: Velocity | None = key("constant velocity [m/s], from the start of the mission", None)
+    waypoints: tuple[Vector, ...] | None = key(
+        "places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant "
         "speed, at rest before the first and after the last",
-    )
-    times: tuple[Seconds, ...] | None = Field(
-        None, description="mission times of the waypoints [s], increasing"
-    )
-    appears: Seconds | None = Field(
         None,
-        description="mission time from which the obstacle is there [s]; default: from the start",
     )
-    vanishes: Seconds | None = Field(
-        None, description="mission time until which it is there [s]; default: to the end"
+    times: tuple[Seconds, ...] | None = key("mission times of the waypoints [s], increasing", None)
+    appears: Seconds | None = key(
+        "mission time from which the obstacle is there [s]; default: from the start", None
+    )
+    vanishes: Seconds | None = key(
+        "mission time until which it is there [s]; default: to the end", None
     )
 
     @property
@@ -122,14 +116,12 @@ class Moving(Solid):
 class Box(Moving):
     """A box, parallel to the world axes or turned."""
 
-    kind: Literal["box"] = Field(description="a box, parallel to the world axes unless turned")
-    min: Vector = Field(description="lowest corner [x, y, z] [m], before turning")
-    max: Vector = Field(description="highest corner [x, y, z] [m], before turning")
-    roll_deg: Angle = Field(
-        0.0, description="roll [deg] about the box's centre, 3-2-1 Euler angles"
-    )
-    pitch_deg: Angle = Field(0.0, description="pitch [deg]")
-    yaw_deg: Angle = Field(0.0, description="yaw [deg]")
+    kind: Literal["box"] = key("a box, parallel to the world axes unless turned")
+    min: Vector = key("lowest corner [x, y, z] [m], before turning")
+    max: Vector = key("highest corner [x, y, z] [m], before turning")
+    roll_deg: Angle = key("roll [deg] about the box's centre, 3-2-1 Euler angles", 0.0)
+    pitch_deg: Angle = key("pitch [deg]", 0.0)
+    yaw_deg: Angle = key("yaw [deg]", 0.0)
 
     @property
     def corners(self) -> tuple[float, ...] | None:
@@ -158,9 +150,9 @@ class Box(Moving):
 class Sphere(Moving):
     """A sphere."""
 
-    kind: Literal["sphere"] = Field(description="a sphere")
-    centre: Vector = Field((0.0, 0.0, 0.0), description="centre [x, y, z] [m]")
-    radius: Length = Field(description="radius [m]")
+    kind: Literal["sphere"] = key("a sphere")
+    centre: Vector = key("centre [x, y, z] [m]", (0.0, 0.0, 0.0))
+    radius: Length = key("radius [m]")
 
     @property
     def form(self) -> Form:
@@ -171,11 +163,11 @@ class Sphere(Moving):
 class Cylinder(Moving):
     """A cylinder along any axis."""
 
-    kind: Literal["cylinder"] = Field(description="a cylinder along any axis, with flat ends")
-    ends: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=2)] = Field(
-        description="centres of the two ends, [[x, y, z], [x, y, z]] [m]"
+    kind: Literal["cylinder"] = key("a cylinder along any axis, with flat ends")
+    ends: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=2)] = key(
+        "centres of the two ends, [[x, y, z], [x, y, z]] [m]"
     )
-    radius: Length = Field(description="radius [m]")
+    radius: Length = key("radius [m]")
 
     @property
     def form(self) -> Form:
@@ -186,9 +178,9 @@ class Cylinder(Moving):
 class Hull(Moving):
     """The convex hull of points."""
 
-    kind: Literal["hull"] = Field(description="the convex hull of points; its centre is their mean")
-    points: Annotated[tuple[Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = Field(
-        description="points [x, y, z] [m], four or more, not all in a plane"
+    kind: Literal["hull"] = key("the convex hull of points; its centre is their mean")
+    points: Annotated[tuple[Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = key(
+        "points [x, y, z] [m], four or more, not all in a plane"
     )
 
     @property
@@ -200,26 +192,26 @@ class Hull(Moving):
 class Heights(Solid):
     """A height map: terrain over a rectangle."""
 
-    kind: Literal["heights"] = Field(
-        description="everything between a surface of given heights and a base, over a rectangle"
+    kind: Literal["heights"] = key(
+        "everything between a surface of given heights and a base, over a rectangle"
     )
-    corner: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)] = Field(
-        (0.0, 0.0), description="place [x, y] [m] of the first height"
+    corner: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)] = key(
+        "place [x, y] [m] of the first height", (0.0, 0.0)
     )
-    spacing: Length = Field(description="distance between neighbouring heights along x and y [m]")
-    heights: tuple[tuple[Coordinate, ...], ...] | None = Field(
-        None,
-        description="heights [m]: a list for each x, in which y increases; each square between four heights is two "
+    spacing: Length = key("distance between neighbouring heights along x and y [m]")
+    heights: tuple[tuple[Coordinate, ...], ...] | None = key(
+        "heights [m]: a list for each x, in which y increases; each square between four heights is two "
         "triangles, divided from its lowest x and y to its highest",
-    )
-    file: str | None = Field(
         None,
-        description="instead of heights: a CSV or NPY file with them, relative to the mission file; the result holds "
+    )
+    file: str | None = key(
+        "instead of heights: a CSV or NPY file with them, relative to the mission file; the result holds "
         "the heights themselves",
-    )
-    base: Coordinate | None = Field(
         None,
-        description="height of the underside [m]; default: as far below the lowest height as the map is wide",
+    )
+    base: Coordinate | None = key(
+        "height of the underside [m]; default: as far below the lowest height as the map is wide",
+        None,
     )
 
     @property
@@ -234,9 +226,9 @@ class Heights(Solid):
 class Ground(Part):
     """Everything below a height."""
 
-    kind: Literal["ground"] = Field(description="everything below a height")
-    name: str = Field("", description="name; default: 'ground'")
-    height: Coordinate = Field(0.0, description="height of the ground [m]")
+    kind: Literal["ground"] = key("everything below a height")
+    name: str = key("name; default: 'ground'", "")
+    height: Coordinate = key("height of the ground [m]", 0.0)
 
     @property
     def zone(self) -> bool:

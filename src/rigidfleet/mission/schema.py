@@ -71,6 +71,7 @@ from rigidfleet.mission.values import (
     Weights,
     Whole,
     from_zero,
+    key,
     number_or_list,
     of_either_sign,
 )
@@ -85,15 +86,12 @@ DRAG = 0.3
 class Start(Part):
     """Start positions of the agents on the slots of a named shape, in their order."""
 
-    shape: str = Field(
-        description=f"named shape: {', '.join(shapes.SHAPES)}",
-        json_schema_extra={"enum": [*shapes.SHAPES]},
+    shape: str = key(
+        f"named shape: {', '.join(shapes.SHAPES)}", json_schema_extra={"enum": [*shapes.SHAPES]}
     )
-    size: Size = Field(description="edge length of the shape [m], or its three sizes")
-    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = Field(
-        description="number of agents"
-    )
-    centre: Vector = Field((0.0, 0.0, 0.0), description="centre of the shape [x, y, z] [m]")
+    size: Size = key("edge length of the shape [m], or its three sizes")
+    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = key("number of agents")
+    centre: Vector = key("centre of the shape [x, y, z] [m]", (0.0, 0.0, 0.0))
 
     def points(self) -> Floats:
         """Positions (count, 3) [m].
@@ -109,187 +107,165 @@ class Start(Part):
 class Vehicle(Part):
     """A model of vehicle. Keys that are not given are those of the model; `rigidfleet.mission.vehicles` has them."""
 
-    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = Field(
-        description="point: a point mass that gives any force at once; the others are quadrotors: paper: the paper's, "
+    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = key(
+        "point: a point mass that gives any force at once; the others are quadrotors: paper: the paper's, "
         "1 kg with four rotors of 5.9 N; px4-sih: PX4's simulation in hardware; hummingbird: AscTec Hummingbird; "
         "crazyflie: Crazyflie 2; x500: Holybro X500"
     )
-    mass: Mass | None = Field(None, description="mass [kg]; required for a point")
-    inertia: Inertia | None = Field(
-        None, description="moments of inertia about the body's axes [x, y, z] [kg m^2]"
+    mass: Mass | None = key("mass [kg]; required for a point", None)
+    inertia: Inertia | None = key(
+        "moments of inertia about the body's axes [x, y, z] [kg m^2]", None
     )
-    arm: Length | None = Field(
-        None, description="distance of each rotor from the centre of mass [m]; rotors form an X"
+    arm: Length | None = key(
+        "distance of each rotor from the centre of mass [m]; rotors form an X", None
     )
-    thrust_coefficient: Small | None = Field(
-        None, description="k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed"
+    thrust_coefficient: Small | None = key(
+        "k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed", None
     )
-    torque_coefficient: Small | None = Field(
+    torque_coefficient: Small | None = key(
+        "k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed", None
+    )
+    rotor_speed: RotorSpeeds | None = key("[least, greatest] speed of a rotor [rad/s]", None)
+    motor_time: MotorTimes | None = key(
+        "time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down",
         None,
-        description="k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed",
     )
-    rotor_speed: RotorSpeeds | None = Field(
-        None, description="[least, greatest] speed of a rotor [rad/s]"
+    rotor_drag: Coefficient | None = key(
+        "k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis", None
     )
-    motor_time: MotorTimes | None = Field(
-        None,
-        description="time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down",
+    rotor_inflow: Coefficient | None = key("k_z [kg/rad]: the same along its axis", None)
+    rotor_lift: Coefficient | None = key(
+        "k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it", None
     )
-    rotor_drag: Coefficient | None = Field(
-        None,
-        description="k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis",
+    body_drag: BodyDrag | None = key(
+        "drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]", None
     )
-    rotor_inflow: Coefficient | None = Field(
-        None, description="k_z [kg/rad]: the same along its axis"
+    rotor_radius: Length | None = key("radius of a rotor [m], for downwash and ground effect", None)
+    attitude_gains: AttitudeGains | None = key(
+        "[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]", None
     )
-    rotor_lift: Coefficient | None = Field(
-        None,
-        description="k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it",
+    tilt_limit_deg: Tilt | None = key("maximum tilt that the attitude control commands [deg]", None)
+    thrust_limit: Limit | None = key(
+        "maximum thrust [N], only for a point; default: unlimited", None
     )
-    body_drag: BodyDrag | None = Field(
-        None, description="drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]"
-    )
-    rotor_radius: Length | None = Field(
-        None, description="radius of a rotor [m], for downwash and ground effect"
-    )
-    attitude_gains: AttitudeGains | None = Field(
-        None,
-        description="[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]",
-    )
-    tilt_limit_deg: Tilt | None = Field(
-        None, description="maximum tilt that the attitude control commands [deg]"
-    )
-    thrust_limit: Limit | None = Field(
-        None, description="maximum thrust [N], only for a point; default: unlimited"
-    )
-    drag: Weight | None = Field(
-        None,
-        description="drag force per velocity relative to the air [N s/m], only for a point; default: 0",
+    drag: Weight | None = key(
+        "drag force per velocity relative to the air [N s/m], only for a point; default: 0", None
     )
 
 
 class Autopilot(Part):
     """Sampled control on board: how often each vehicle's computer acts. Only with [vehicles]."""
 
-    rate: Rate = Field(
-        500.0, description="rate of the attitude control [Hz]; commands are held in between"
-    )
-    formation_rate: Rate = Field(
+    rate: Rate = key("rate of the attitude control [Hz]; commands are held in between", 500.0)
+    formation_rate: Rate = key(
+        "rate of the formation's laws [Hz], which give each vehicle its force; rate is a multiple of it",
         100.0,
-        description="rate of the formation's laws [Hz], which give each vehicle its force; rate is a multiple of it",
     )
-    delay_compensation: Flag = Field(
-        True,
-        description="true: measurements carry their time, and are compared with the reference of that time, while "
+    delay_compensation: Flag = key(
+        "true: measurements carry their time, and are compared with the reference of that time, while "
         "slots are tracked; false: with the reference of now",
+        True,
     )
-    step: Annotated[float, Strict(), Field(ge=1e-5, le=0.01)] = Field(
-        0.001, description="longest step of the integrator, a fourth-order Runge-Kutta method [s]"
+    step: Annotated[float, Strict(), Field(ge=1e-5, le=0.01)] = key(
+        "longest step of the integrator, a fourth-order Runge-Kutta method [s]", 0.001
     )
 
 
 class Avoidance(Part):
     """Avoidance in flight, at the rate of the formation's laws; see docs/avoidance.md. Only with [vehicles]."""
 
-    guard: Flag = Field(
-        True,
-        description="true: a vehicle does only what leaves all of them able to brake in time",
+    guard: Flag = key(
+        "true: a vehicle does only what leaves all of them able to brake in time", True
     )
-    barrier: Flag = Field(
-        True,
-        description="true: barriers change accelerations early and as little as possible, and edges of a formation let "
+    barrier: Flag = key(
+        "true: barriers change accelerations early and as little as possible, and edges of a formation let "
         "go near them",
-    )
-    clock: Flag = Field(
         True,
-        description="true: a formation waits on its path while an obstacle that moves passes",
     )
-    patience: Annotated[float, Strict(), Field(ge=0, le=3600)] = Field(
-        30.0, description="time by which a phase may end later because its formation waits [s]"
+    clock: Flag = key(
+        "true: a formation waits on its path while an obstacle that moves passes", True
     )
-    body: Flag = Field(
-        True,
-        description="true: a formation is steered round obstacles that move as one body, before single agents give "
+    patience: Annotated[float, Strict(), Field(ge=0, le=3600)] = key(
+        "time by which a phase may end later because its formation waits [s]", 30.0
+    )
+    body: Flag = key(
+        "true: a formation is steered round obstacles that move as one body, before single agents give "
         "way",
+        True,
     )
-    separation: LengthOrZero | None = Field(
-        None, description="separation of agents to keep [m]; default: that of [limits], or 0"
+    separation: LengthOrZero | None = key(
+        "separation of agents to keep [m]; default: that of [limits], or 0", None
     )
-    clearance: LengthOrZero = Field(
-        0.0, description="distance of an agent's surface from obstacles to keep [m]"
-    )
-    margin: LengthOrZero | None = Field(
-        None,
-        description="by which each agent is taken to be larger [m]; default: three times the noise of positions, and "
+    clearance: LengthOrZero = key("distance of an agent's surface from obstacles to keep [m]", 0.0)
+    margin: LengthOrZero | None = key(
+        "by which each agent is taken to be larger [m]; default: three times the noise of positions, and "
         "0.02 m for a quadrotor",
-    )
-    rate: Annotated[float, Strict(), Field(gt=0, le=100)] = Field(
-        3.0,
-        description="rate at which a barrier is approached [1/s]: lower, and vehicles give way earlier",
-    )
-    share: Annotated[float, Strict(), Field(gt=0, le=1)] = Field(
-        0.9, description="share of the vehicles' braking that barriers plan with [-]"
-    )
-    release: Annotated[float, Strict(), Field(ge=0.01, le=60)] = Field(
-        0.5, description="time in which edges let go near a barrier, and take hold again [s]"
-    )
-    reference: Literal["path", "flow"] = Field(
-        "path",
-        description="path: vehicles are asked for what the laws ask; flow: what they ask is led round obstacles as a "
-        "flow round balls",
-    )
-    sensing_range: Length | None = Field(
         None,
-        description="distance of an agent's centre from an obstacle that moves within which all see it [m]; default: "
+    )
+    rate: Annotated[float, Strict(), Field(gt=0, le=100)] = key(
+        "rate at which a barrier is approached [1/s]: lower, and vehicles give way earlier", 3.0
+    )
+    share: Annotated[float, Strict(), Field(gt=0, le=1)] = key(
+        "share of the vehicles' braking that barriers plan with [-]", 0.9
+    )
+    release: Annotated[float, Strict(), Field(ge=0.01, le=60)] = key(
+        "time in which edges let go near a barrier, and take hold again [s]", 0.5
+    )
+    reference: Literal["path", "flow"] = key(
+        "path: vehicles are asked for what the laws ask; flow: what they ask is led round obstacles as a "
+        "flow round balls",
+        "path",
+    )
+    sensing_range: Length | None = key(
+        "distance of an agent's centre from an obstacle that moves within which all see it [m]; default: "
         "its motion is known in advance",
+        None,
     )
-    sensing_noise: LengthOrZero = Field(
-        0.0, description="standard deviation of the place of an obstacle seen, along each axis [m]"
+    sensing_noise: LengthOrZero = key(
+        "standard deviation of the place of an obstacle seen, along each axis [m]", 0.0
     )
-    obstacle_acceleration: Annotated[float, Strict(), Field(ge=0, le=100)] = Field(
+    obstacle_acceleration: Annotated[float, Strict(), Field(ge=0, le=100)] = key(
+        "acceleration of obstacles that is reckoned with [m/s^2]: in the Kalman filter, and less braking",
         0.0,
-        description="acceleration of obstacles that is reckoned with [m/s^2]: in the Kalman filter, and less braking",
     )
-    seed: Seed = Field(
-        0, description="seed of the random numbers; the same seed gives the same sensing noise"
-    )
+    seed: Seed = key("seed of the random numbers; the same seed gives the same sensing noise", 0)
 
 
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
-    mass: Annotated[tuple[Mass, ...], number_or_list(MASS.least)] = Field(
-        description="mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
+    mass: Annotated[tuple[Mass, ...], number_or_list(MASS.least)] = key(
+        "mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
         "vehicle's"
     )
-    vehicle: Annotated[tuple[str, ...], NAME_OR_LIST] = Field(
-        (),
-        description="name of a table [vehicles.NAME], or a list with one name per agent; default: point masses that "
+    vehicle: Annotated[tuple[str, ...], NAME_OR_LIST] = key(
+        "name of a table [vehicles.NAME], or a list with one name per agent; default: point masses that "
         "give any force at once",
+        (),
     )
-    position: Annotated[tuple[Vector, ...], Field(min_length=1)] = Field(
-        description="initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
+    position: Annotated[tuple[Vector, ...], Field(min_length=1)] = key(
+        "initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
         "shape in which the agents start, or the name of a file of points: CSV, NPY or PLY, relative to the mission "
         "file"
     )
-    velocity: tuple[Velocity, ...] = Field(
-        (), description="initial velocity of each agent [m/s]; default: at rest"
+    velocity: tuple[Velocity, ...] = key(
+        "initial velocity of each agent [m/s]; default: at rest", ()
     )
-    fixed: tuple[AgentNumber, ...] = Field(
-        (), description="numbers of agents that never move; only with control 'open', solver 'pinv'"
+    fixed: tuple[AgentNumber, ...] = key(
+        "numbers of agents that never move; only with control 'open', solver 'pinv'", ()
     )
-    radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = Field(
+    radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = key(
+        "radius of the sphere around an agent that must not touch anything [m]: a number or a list",
         (0.25,),
-        description="radius of the sphere around an agent that must not touch anything [m]: a number or a list",
     )
-    thrust_limit: Annotated[tuple[Limit, ...], number_or_list(FORCE.least)] = Field(
-        (math.inf,),
-        description="maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
+    thrust_limit: Annotated[tuple[Limit, ...], number_or_list(FORCE.least)] = key(
+        "maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
         "default: unlimited",
+        (math.inf,),
     )
-    saturate: Flag = Field(
+    saturate: Flag = key(
+        "true: thrust is clipped at thrust_limit; false: the verdict compares it with thrust_limit",
         False,
-        description="true: thrust is clipped at thrust_limit; false: the verdict compares it with thrust_limit",
     )
 
     @model_validator(mode="before")
@@ -300,47 +276,44 @@ class Agents(Part):
             return data
         n = len(data["position"])
         full = {"velocity": [(0.0, 0.0, 0.0)] * n, "radius": 0.25, "thrust_limit": math.inf} | data
-        for key in full.keys() & {"mass", "radius", "thrust_limit"}:
-            if not isinstance(full[key], list | tuple):
-                full[key] = [full[key]] * n
+        for name in full.keys() & {"mass", "radius", "thrust_limit"}:
+            if not isinstance(full[name], list | tuple):
+                full[name] = [full[name]] * n
         return full
 
 
 class Constraint(Part):
     """The constraint force: feedback of the constraint c = L - d, and the solver for the multipliers."""
 
-    alpha: Gain = Field(3.0, description="alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha")
-    beta: Gain = Field(
-        math.sqrt(12), description="beta [1/s], > 0; the feedback gain of c is beta^2"
+    alpha: Gain = key("alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha", 3.0)
+    beta: Gain = key("beta [1/s], > 0; the feedback gain of c is beta^2", math.sqrt(12))
+    gamma: Annotated[float, Strict(), of_either_sign(GAIN, 3)] = key(
+        "feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2", 8.0
     )
-    gamma: Annotated[float, Strict(), of_either_sign(GAIN, 3)] = Field(
-        8.0, description="feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2"
+    stabilisation: Literal["pid", "none"] = key(
+        "pid: feedback with alpha, beta, gamma; none: no feedback, so constraints drift", "pid"
     )
-    stabilisation: Literal["pid", "none"] = Field(
-        "pid",
-        description="pid: feedback with alpha, beta, gamma; none: no feedback, so constraints drift",
-    )
-    solver: Literal["iterated", "spectral", "exact", "pinv"] = Field(
-        "iterated",
-        description="iterated: iterated Tikhonov; spectral: spectral damping, smaller forces at steps; exact: the "
+    solver: Literal["iterated", "spectral", "exact", "pinv"] = key(
+        "iterated: iterated Tikhonov; spectral: spectral damping, smaller forces at steps; exact: the "
         "paper's inverse; pinv: pseudo-inverse",
+        "iterated",
     )
-    damping: Damping = Field(
-        "auto",
-        description="damping mu of the iterated solver [-], > 0; auto: 0.03, or in phases that start in their "
+    damping: Damping = key(
+        "damping mu of the iterated solver [-], > 0; auto: 0.03, or in phases that start in their "
         "formation a quarter of its smallest non-zero eigenvalue w if that is less",
+        "auto",
     )
-    iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = Field(
-        3, description="number of iterations k of the iterated solver, 1 to 100"
+    iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = key(
+        "number of iterations k of the iterated solver, 1 to 100", 3
     )
-    threshold: Tolerance = Field(0.1, description="threshold s0 of the spectral solver [-], > 0")
-    cutoff: Annotated[float, Strict(), Field(gt=0, lt=1)] = Field(
-        1e-3,
-        description="cut-off of the pinv solver relative to the largest eigenvalue w, in (0, 1); smaller eigenvalues "
+    threshold: Tolerance = key("threshold s0 of the spectral solver [-], > 0", 0.1)
+    cutoff: Annotated[float, Strict(), Field(gt=0, lt=1)] = key(
+        "cut-off of the pinv solver relative to the largest eigenvalue w, in (0, 1); smaller eigenvalues "
         "fade out smoothly",
+        1e-3,
     )
-    deformation_damping: Annotated[float, Strict(), from_zero(GAIN)] = Field(
-        1.0, description="damping of deformation velocities while no slots are tracked [1/s], >= 0"
+    deformation_damping: Annotated[float, Strict(), from_zero(GAIN)] = key(
+        "damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0
     )
 
     @property
@@ -357,20 +330,20 @@ class Constraint(Part):
 class Regulator(Part):
     """Weights of a linear quadratic regulator for a double integrator, the same on each axis."""
 
-    horizon: Literal["finite", "infinite"] = Field(
-        "finite", description="finite: arrival at a time, weighted by S; infinite: Q and R alone"
+    horizon: Literal["finite", "infinite"] = key(
+        "finite: arrival at a time, weighted by S; infinite: Q and R alone", "finite"
     )
-    Q: Weights = Field((0.0, 0.0), description="weights [error, rate error], >= 0")
-    R: Cost = Field(1.0, description="weight of the acceleration, > 0")
-    S: Weights = Field((1e3, 1e2), description="weights at arrival [error, rate error], >= 0")
+    Q: Weights = key("weights [error, rate error], >= 0", (0.0, 0.0))
+    R: Cost = key("weight of the acceleration, > 0", 1.0)
+    S: Weights = key("weights at arrival [error, rate error], >= 0", (1e3, 1e2))
 
 
 class Lqr(Regulator):
     """Regulator of the virtual body: its centre of mass and, in `lqr.attitude`, its attitude."""
 
-    attitude: Regulator = Field(
+    attitude: Regulator = key(
+        "regulator of the attitude; missing keys are those of lqr",
         default_factory=Regulator.model_construct,
-        description="regulator of the attitude; missing keys are those of lqr",
     )
 
     @model_validator(mode="before")
@@ -385,63 +358,58 @@ class Lqr(Regulator):
 class Tracking(Part):
     """Infinite-horizon regulator by which each agent tracks its slot."""
 
-    Q: Weights = Field(
-        (4.0, 4.0), description="weights [position error, velocity error], the first > 0"
-    )
-    R: Cost = Field(1.0, description="weight of the acceleration, > 0")
-    integral: Annotated[float, Strict(), from_zero(GAIN)] = Field(
-        0.0,
-        description="gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
+    Q: Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
+    R: Cost = key("weight of the acceleration, > 0", 1.0)
+    integral: Annotated[float, Strict(), from_zero(GAIN)] = key(
+        "gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
+        0.0,
     )
-    drag_feedforward: Flag = Field(
-        False,
-        description="true: the drag expected at the desired velocity in still air is added to the force; only with "
+    drag_feedforward: Flag = key(
+        "true: the drag expected at the desired velocity in still air is added to the force; only with "
         "[vehicles]",
+        False,
     )
 
 
 class Allocation(Part):
     """Control allocation: from the wrench on the virtual body to forces on the agents (control 'body')."""
 
-    method: Literal["rigid", "pinv"] = Field(
+    method: Literal["rigid", "pinv"] = key(
+        "rigid: the forces that move the agents as points of a rigid body; pinv: the paper's matrix H",
         "rigid",
-        description="rigid: the forces that move the agents as points of a rigid body; pinv: the paper's matrix H",
     )
-    torque_split: Literal["equal", "inertia", "inertia+force"] = Field(
-        "equal", description="only for method 'pinv': how the torque is divided among the agents"
+    torque_split: Literal["equal", "inertia", "inertia+force"] = key(
+        "only for method 'pinv': how the torque is divided among the agents", "equal"
     )
 
 
 class IntegratorOptions(Part):
     """Tolerances of the adaptive integrator."""
 
-    rtol: Annotated[float, Strict(), Field(gt=0, le=0.1)] = Field(
-        1e-8, description="relative tolerance [-]"
-    )
-    atol: Tolerance = Field(1e-10, description="absolute tolerance [m, m/s]")
-    atol_velocity: Tolerance | None = Field(
-        None,
-        description="absolute tolerance of velocities [m/s]; default: atol, in a large formation that of positions "
+    rtol: Annotated[float, Strict(), Field(gt=0, le=0.1)] = key("relative tolerance [-]", 1e-8)
+    atol: Tolerance = key("absolute tolerance [m, m/s]", 1e-10)
+    atol_velocity: Tolerance | None = key(
+        "absolute tolerance of velocities [m/s]; default: atol, in a large formation that of positions "
         "times beta",
-    )
-    atol_integral: Tolerance | None = Field(
         None,
-        description="absolute tolerance of the integrals of c [m s]; default: atol, plus rtol times the distance if "
+    )
+    atol_integral: Tolerance | None = key(
+        "absolute tolerance of the integrals of c [m s]; default: atol, plus rtol times the distance if "
         "the solver is not dense",
-    )
-    atol_attitude: Tolerance | None = Field(
         None,
-        description="absolute tolerance of the quaternion of the body frame [-]; default: atol",
+    )
+    atol_attitude: Tolerance | None = key(
+        "absolute tolerance of the quaternion of the body frame [-]; default: atol", None
     )
 
 
 class BodyFrame(Part):
     """Attach the body frame at t = 0 with this attitude instead of when a formation is established."""
 
-    roll_deg: Angle = Field(0.0, description="roll [deg], 3-2-1 Euler angles")
-    pitch_deg: Angle = Field(0.0, description="pitch [deg]")
-    yaw_deg: Angle = Field(0.0, description="yaw [deg]")
+    roll_deg: Angle = key("roll [deg], 3-2-1 Euler angles", 0.0)
+    pitch_deg: Angle = key("pitch [deg]", 0.0)
+    yaw_deg: Angle = key("yaw [deg]", 0.0)
 
 
 class Formation(Part):
@@ -450,56 +418,54 @@ class Formation(Part):
     The methods require a checked formation of `n` agents.
     """
 
-    shape: str | None = Field(
+    shape: str | None = key(
+        f"named shape: {', '.join(shapes.SHAPES)}",
         None,
-        description=f"named shape: {', '.join(shapes.SHAPES)}",
         json_schema_extra={"enum": [*shapes.SHAPES]},
     )
-    size: Size | None = Field(
-        None, description="edge length of the shape [m]; for a cuboid also [x, y, z]"
-    )
-    slots: tuple[Vector, ...] | None = Field(
-        None,
-        description="instead of a shape: desired position of each agent in the body frame [m], or the name of a "
+    size: Size | None = key("edge length of the shape [m]; for a cuboid also [x, y, z]", None)
+    slots: tuple[Vector, ...] | None = key(
+        "instead of a shape: desired position of each agent in the body frame [m], or the name of a "
         "file of points: CSV, NPY or PLY, relative to the mission file and not outside its folder",
+        None,
     )
-    edges: Edges = Field(
-        "complete",
-        description="list of pairs of agents, counted from 1; 'complete': all pairs; 'neighbours': pairs within reach; "
+    edges: Edges = key(
+        "list of pairs of agents, counted from 1; 'complete': all pairs; 'neighbours': pairs within reach; "
         "'henneberg': each agent to three nearer to the centre; 'henneberg-multilevel': each agent to three before "
         "it, from coarse to fine; both have 3 N - 6 edges",
+        "complete",
     )
-    reach: Length = Field(
-        graphs.REACH,
-        description="maximum length of edges 'neighbours', in distances of nearest neighbours; 1.9 includes second "
+    reach: Length = key(
+        "maximum length of edges 'neighbours', in distances of nearest neighbours; 1.9 includes second "
         "neighbours",
+        graphs.REACH,
     )
-    distances: tuple[Length, ...] | None = Field(
-        None, description="length of each edge [m]; default: those between the slots"
+    distances: tuple[Length, ...] | None = key(
+        "length of each edge [m]; default: those between the slots", None
     )
-    dimension: Literal[2, 3] | None = Field(
+    dimension: Literal[2, 3] | None = key(
+        "dimension of the space in which the agents keep this formation; default: that of the mission",
         None,
-        description="dimension of the space in which the agents keep this formation; default: that of the mission",
     )
-    agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = Field(
-        None, description="number of vehicles in the shape, if the others rest; default: all"
+    agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = key(
+        "number of vehicles in the shape, if the others rest; default: all", None
     )
-    rest: Rest | None = Field(
-        None,
-        description="where vehicles wait for which there are no slots, in the axes of the slots: a list of points [m]; "
+    rest: Rest | None = key(
+        "where vehicles wait for which there are no slots, in the axes of the slots: a list of points [m]; "
         "'sides': left and right of the formation, along x, mirrored so that its middle stays the same",
-    )
-    tolerance: Length | None = Field(
-        None, description="greatest error of a distance [m]; default: by tolerance_share"
-    )
-    tolerance_share: Share = Field(
-        SHAPE_TOLERANCE, gt=0, description="the same, as a share of the shortest distance [-]"
-    )
-    colour: Colour | None = Field(
         None,
-        description="light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
+    )
+    tolerance: Length | None = key(
+        "greatest error of a distance [m]; default: by tolerance_share", None
+    )
+    tolerance_share: Share = key(
+        "the same, as a share of the shortest distance [-]", SHAPE_TOLERANCE, gt=0
+    )
+    colour: Colour | None = key(
+        "light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
         "default: that of the file of slots if it has colours, else the light before. Vehicles that rest are dark. "
         "Replay, figures and the exports skyc and gltf show it",
+        None,
     )
 
     def greatest_error(self, shortest: float) -> float:
@@ -539,62 +505,60 @@ class Formation(Part):
 class Geofence(Part):
     """A box that no agent may leave."""
 
-    min: Vector = Field(description="lowest corner [x, y, z] [m]")
-    max: Vector = Field(description="highest corner [x, y, z] [m]")
+    min: Vector = key("lowest corner [x, y, z] [m]")
+    max: Vector = key("highest corner [x, y, z] [m]")
 
 
 class Limits(Part):
     """Limits for each agent: the verdict checks the flight, and `check` the plan of a smooth mission."""
 
-    speed: Speed | None = Field(None, description="maximum speed [m/s]")
-    acceleration: Acceleration | None = Field(None, description="maximum acceleration [m/s^2]")
-    horizontal_speed: Speed | None = Field(None, description="maximum speed over the ground [m/s]")
-    vertical_speed: Speed | None = Field(None, description="maximum speed up and down [m/s]")
-    horizontal_acceleration: Acceleration | None = Field(
-        None, description="maximum horizontal acceleration [m/s^2]"
+    speed: Speed | None = key("maximum speed [m/s]", None)
+    acceleration: Acceleration | None = key("maximum acceleration [m/s^2]", None)
+    horizontal_speed: Speed | None = key("maximum speed over the ground [m/s]", None)
+    vertical_speed: Speed | None = key("maximum speed up and down [m/s]", None)
+    horizontal_acceleration: Acceleration | None = key(
+        "maximum horizontal acceleration [m/s^2]", None
     )
-    vertical_acceleration: Acceleration | None = Field(
-        None, description="maximum acceleration up and down [m/s^2]"
+    vertical_acceleration: Acceleration | None = key(
+        "maximum acceleration up and down [m/s^2]", None
     )
-    jerk: Jerk | None = Field(
-        None,
-        description="maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission",
+    jerk: Jerk | None = key(
+        "maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission", None
     )
-    horizontal_jerk: Jerk | None = Field(
-        None, description="maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`"
+    horizontal_jerk: Jerk | None = key(
+        "maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`", None
     )
-    vertical_jerk: Jerk | None = Field(
-        None, description="maximum jerk of the reference up and down [m/s^3]; kept like `jerk`"
+    vertical_jerk: Jerk | None = key(
+        "maximum jerk of the reference up and down [m/s^3]; kept like `jerk`", None
     )
-    tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = Field(
-        None,
-        description="maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
+    tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = key(
+        "maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
         "a smooth mission",
-    )
-    separation: LengthOrZero | None = Field(
-        None, description="minimum separation of agents [m]: centre distance minus radii"
-    )
-    separation_altitude: Coordinate | None = Field(
         None,
-        description="altitude z [m] from which on `separation` holds: two agents that are both below it, as on their "
+    )
+    separation: LengthOrZero | None = key(
+        "minimum separation of agents [m]: centre distance minus radii", None
+    )
+    separation_altitude: Coordinate | None = key(
+        "altitude z [m] from which on `separation` holds: two agents that are both below it, as on their "
         "pads, may be nearer, but not touch; default: it always holds",
-    )
-    separation_allowance: LengthOrZero = Field(
-        0.1,
-        description="how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
-        "has a certificate",
-    )
-    separation_below: LengthOrZero | None = Field(
         None,
-        description="minimum separation from an agent straight below [m]: height minus radii (downwash)",
     )
-    geofence: Geofence | None = Field(None, description="box that no agent may leave")
-    saturation: Share = Field(
+    separation_allowance: LengthOrZero = key(
+        "how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
+        "has a certificate",
+        0.1,
+    )
+    separation_below: LengthOrZero | None = key(
+        "minimum separation from an agent straight below [m]: height minus radii (downwash)", None
+    )
+    geofence: Geofence | None = key("box that no agent may leave", None)
+    saturation: Share = key(
+        "maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
         0.01,
-        description="maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
     )
-    tracking_error: Length | None = Field(
-        None, description="maximum distance of a vehicle from the slot that it tracks [m]"
+    tracking_error: Length | None = key(
+        "maximum distance of a vehicle from the slot that it tracks [m]", None
     )
 
     @property
@@ -606,120 +570,103 @@ class Limits(Part):
 class Gusts(Part):
     """Gusts: the velocity of the air at each agent in addition to the steady wind, stationary from the start."""
 
-    model: Literal["first-order", "dryden"] = Field(
-        description="first-order: one correlation time for all directions; dryden: spectra of MIL-F-8785C along the "
+    model: Literal["first-order", "dryden"] = key(
+        "first-order: one correlation time for all directions; dryden: spectra of MIL-F-8785C along the "
         "wind, across it and vertical"
     )
-    intensity: PerAxis | None = Field(
-        None,
-        description="standard deviation [m/s]: a number, or [along the wind, across, vertical]; default: from altitude "
+    intensity: PerAxis | None = key(
+        "standard deviation [m/s]: a number, or [along the wind, across, vertical]; default: from altitude "
         "and wind speed",
-    )
-    time_scale: Time | None = Field(None, description="correlation time of first-order gusts [s]")
-    length: Size | None = Field(
         None,
-        description="scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]",
     )
-    altitude: Annotated[float, Strict(), Field(ge=3.048, le=304.8)] | None = Field(
-        None,
-        description="instead of length: height above ground [m], 3.048 to 304.8, which determines the lengths by "
+    time_scale: Time | None = key("correlation time of first-order gusts [s]", None)
+    length: Size | None = key(
+        "scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]", None
+    )
+    altitude: Annotated[float, Strict(), Field(ge=3.048, le=304.8)] | None = key(
+        "instead of length: height above ground [m], 3.048 to 304.8, which determines the lengths by "
         "MIL-F-8785C",
-    )
-    airspeed: Speed | None = Field(
         None,
-        description="speed at which Dryden gusts pass by [m/s]; default: wind speed",
     )
-    correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = Field(
-        None, description="correlation of the gusts at any two agents [-], 0 to 1; default: 0"
+    airspeed: Speed | None = key(
+        "speed at which Dryden gusts pass by [m/s]; default: wind speed", None
     )
-    correlation_length: Length | None = Field(
-        None,
-        description="instead of correlation: length [m] in correlation = exp(-distance / length), with the distances "
+    correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = key(
+        "correlation of the gusts at any two agents [-], 0 to 1; default: 0", None
+    )
+    correlation_length: Length | None = key(
+        "instead of correlation: length [m] in correlation = exp(-distance / length), with the distances "
         "of slots in the first established formation",
+        None,
     )
-    seed: Seed = Field(
-        0, description="seed of the random numbers; the same seed gives the same gusts"
-    )
+    seed: Seed = key("seed of the random numbers; the same seed gives the same gusts", 0)
 
 
 class Noise(Part):
     """Measurement of each vehicle's own state: normal, independent noise, sampled at a fixed rate, and its delay."""
 
-    position: LengthOrZero = Field(
-        0.0, description="standard deviation of each component of the measured position [m]"
+    position: LengthOrZero = key(
+        "standard deviation of each component of the measured position [m]", 0.0
     )
-    velocity: Spread = Field(
-        0.0, description="standard deviation of each component of the measured velocity [m/s]"
+    velocity: Spread = key(
+        "standard deviation of each component of the measured velocity [m/s]", 0.0
     )
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
-        50.0, description="measurements per second [Hz], at most 1000"
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
+        "measurements per second [Hz], at most 1000", 50.0
     )
-    delay: Delay = Field(
-        0.0, description="age of a measurement when the laws use it [s]; only with [vehicles]"
+    delay: Delay = key("age of a measurement when the laws use it [s]; only with [vehicles]", 0.0)
+    dropped: Share = key(
+        "share of the measurements that are lost, 0 to 0.95; only with [vehicles]", 0.0
     )
-    dropped: Share = Field(
-        0.0, description="share of the measurements that are lost, 0 to 0.95; only with [vehicles]"
-    )
-    seed: Seed = Field(
-        0, description="seed of the random numbers; the same seed gives the same noise"
-    )
+    seed: Seed = key("seed of the random numbers; the same seed gives the same noise", 0)
 
 
 class LostLink(Part):
     """Loss of a link: from this time on, two vehicles know nothing of each other, and no edge joins them."""
 
-    between: tuple[Whole, Whole] = Field(description="the two agents, counted from 1")
-    time: Time = Field(description="mission time of the loss [s], > 0")
+    between: tuple[Whole, Whole] = key("the two agents, counted from 1")
+    time: Time = key("mission time of the loss [s], > 0")
 
 
 class Outage(Part):
     """A time without messages: between two vehicles, from and to one, or everywhere."""
 
-    between: tuple[Whole, ...] = Field(
-        (), description="one or two agents, counted from 1; default: all", max_length=2
+    between: tuple[Whole, ...] = key(
+        "one or two agents, counted from 1; default: all", (), max_length=2
     )
-    start: Seconds = Field(description="mission time from which no message is sent [s]")
-    end: Time = Field(description="mission time from which messages are sent again [s]")
+    start: Seconds = key("mission time from which no message is sent [s]")
+    end: Time = key("mission time from which messages are sent again [s]")
 
 
 class Network(Part):
     """How vehicles know each other: each computes its force from its own state and its neighbours' messages."""
 
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = Field(
-        50.0, description="broadcasts of each vehicle a second [Hz], at most 1000"
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
+        "broadcasts of each vehicle a second [Hz], at most 1000", 50.0
     )
-    delay: Delay = Field(0.0, description="time from a broadcast to its arrival [s]")
-    jitter: Delay = Field(
-        0.0,
-        description="greatest time by which a message is later than that [s]: each is by a share of its own, so that "
+    delay: Delay = key("time from a broadcast to its arrival [s]", 0.0)
+    jitter: Delay = key(
+        "greatest time by which a message is later than that [s]: each is by a share of its own, so that "
         "messages may overtake each other",
+        0.0,
     )
-    loss: Share = Field(0.0, description="share of the messages that a link loses, 0 to 0.95")
-    burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = Field(
-        None,
-        description="mean number of messages lost one after the other; default: losses are independent",
+    loss: Share = key("share of the messages that a link loses, 0 to 0.95", 0.0)
+    burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = key(
+        "mean number of messages lost one after the other; default: losses are independent", None
     )
-    range: Length | None = Field(
-        None, description="distance beyond which no message is heard [m]; default: none"
-    )
-    budget: Annotated[float, Strict(), Field(gt=0)] | None = Field(
-        None,
-        description="broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
+    range: Length | None = key("distance beyond which no message is heard [m]; default: none", None)
+    budget: Annotated[float, Strict(), Field(gt=0)] | None = key(
+        "broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
         "no limit",
+        None,
     )
-    silence: Time = Field(
-        0.5, description="time without a message after which a vehicle lets go of an edge [s]"
+    silence: Time = key("time without a message after which a vehicle lets go of an edge [s]", 0.5)
+    seed: Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
+    outages: tuple[Outage, ...] = key(
+        "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()
     )
-    seed: Seed = Field(
-        0, description="seed of the random numbers; the same seed loses the same messages"
-    )
-    outages: tuple[Outage, ...] = Field(
-        (),
-        description="times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`",
-    )
-    lost: tuple[LostLink, ...] = Field(
-        (),
-        description="links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`",
+    lost: tuple[LostLink, ...] = key(
+        "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
 
     def sent_rate(self, n: int) -> float:
@@ -730,181 +677,164 @@ class Network(Part):
 class Lost(Part):
     """Loss of a vehicle: from this time on it has neither thrust nor edges."""
 
-    agent: Whole = Field(description="agent that is lost, counted from 1")
-    time: Time = Field(description="mission time of the loss [s], > 0")
+    agent: Whole = key("agent that is lost, counted from 1")
+    time: Time = key("mission time of the loss [s], > 0")
 
 
 class Disturbances(Part):
     """Disturbances of the flight. Control laws and constraint law do not know them."""
 
-    wind: Velocity = Field(
-        (0.0, 0.0, 0.0),
-        description="velocity of the steady wind [m/s]: the direction in which the air moves",
+    wind: Velocity = key(
+        "velocity of the steady wind [m/s]: the direction in which the air moves", (0.0, 0.0, 0.0)
     )
-    drag: PerAgent | None = Field(
-        None,
-        description="drag force per velocity relative to the air [N s/m]: a number or a list; default: 0.3 per kg of "
+    drag: PerAgent | None = key(
+        "drag force per velocity relative to the air [N s/m]: a number or a list; default: 0.3 per kg of "
         "mass if there is wind or gusts, else 0",
+        None,
     )
-    mass_error: PerAgentError = Field(
-        0.0,
-        description="relative error of mass [-], > -1: a number or a list; true mass = mass (1 + mass_error), control "
+    mass_error: PerAgentError = key(
+        "relative error of mass [-], > -1: a number or a list; true mass = mass (1 + mass_error), control "
         "laws use mass",
+        0.0,
     )
-    gusts: Gusts | None = Field(None, description="gusts: [disturbances.gusts]")
-    noise: Noise | None = Field(None, description="measurement noise: [disturbances.noise]")
-    downwash: Flag = Field(
-        False,
-        description="true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]",
+    gusts: Gusts | None = key("gusts: [disturbances.gusts]", None)
+    noise: Noise | None = key("measurement noise: [disturbances.noise]", None)
+    downwash: Flag = key(
+        "true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]", False
     )
-    ground_effect: Flag = Field(
-        False, description="true: rotors near the ground give more thrust; only with [vehicles]"
+    ground_effect: Flag = key(
+        "true: rotors near the ground give more thrust; only with [vehicles]", False
     )
-    lost: tuple[Lost, ...] = Field(
-        (), description="vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`"
+    lost: tuple[Lost, ...] = key(
+        "vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`", ()
     )
-    on_loss: Literal["continue", "hold", "land"] = Field(
-        "continue",
-        description="what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "
+    on_loss: Literal["continue", "hold", "land"] = key(
+        "what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "
         "brake to a stop and hold the formation; land: brake to a stop and land straight down",
+        "continue",
     )
-    hold_until: Time | None = Field(
+    hold_until: Time | None = key(
+        "mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission",
         None,
-        description="mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission",
     )
-    landing_formation: str | None = Field(
+    landing_formation: str | None = key(
+        "level formation that on_loss 'land' takes before the descent; default: the one that is held",
         None,
-        description="level formation that on_loss 'land' takes before the descent; default: the one that is held",
     )
 
 
 class MissionHeader(Part):
     """Keys at the top of a mission file."""
 
-    schema_version: Literal[1] = Field(description="version of this format: 1")
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = Field(
-        description="short name, used for the files of results: letters, digits, '.', '_', '-'"
+    schema_version: Literal[1] = key("version of this format: 1")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = key(
+        "short name, used for the files of results: letters, digits, '.', '_', '-'"
     )
-    title: Annotated[str, Field(pattern=r"^[^\r\n]*$")] = Field(
-        "", description="title of the mission in one line"
+    title: Annotated[str, Field(pattern=r"^[^\r\n]*$")] = key(
+        "title of the mission in one line", ""
     )
-    source: str = Field("", description="table or figure of the paper that the mission reproduces")
-    architecture: Literal["local", "body"] = Field(
-        "local", description="local: each agent tracks its slot; body: a wrench on the virtual body"
+    source: str = key("table or figure of the paper that the mission reproduces", "")
+    architecture: Literal["local", "body"] = key(
+        "local: each agent tracks its slot; body: a wrench on the virtual body", "local"
     )
-    formulation: Literal["inertial", "body"] = Field(
-        "inertial",
-        description="equations of motion: inertial: Newton's; body: the paper's in the body frame, which need fewer "
+    formulation: Literal["inertial", "body"] = key(
+        "equations of motion: inertial: Newton's; body: the paper's in the body frame, which need fewer "
         "steps when many agents turn",
+        "inertial",
     )
-    smoothness: Literal["lqr", "jerk"] = Field(
-        "lqr",
-        description="way of the virtual body: lqr: legs of the regulators of [lqr], as in the paper, between which the "
+    smoothness: Literal["lqr", "jerk"] = key(
+        "way of the virtual body: lqr: legs of the regulators of [lqr], as in the paper, between which the "
         "acceleration jumps; jerk: acceleration and jerk are continuous, [lqr] is not used",
+        "lqr",
     )
-    assignment: Literal["given", "shortest", "safe", "each"] = Field(
-        "given",
-        description="assignment of agents to slots and their edges: given: agent 1 to slot 1 and so on; shortest: "
+    assignment: Literal["given", "shortest", "safe", "each"] = key(
+        "assignment of agents to slots and their edges: given: agent 1 to slot 1 and so on; shortest: "
         "least sum of squared distances from the start to the first established formation; safe: most clearance on the "
         "paths there; each: as shortest, anew at each change of formation, without turning the shapes",
+        "given",
     )
-    assignment_downwash: Annotated[float, Strict(), Field(ge=1, le=100)] = Field(
-        1.0,
-        description="with assignment 'each': heights count divided by this, so that vehicles that change places keep "
+    assignment_downwash: Annotated[float, Strict(), Field(ge=1, le=100)] = key(
+        "with assignment 'each': heights count divided by this, so that vehicles that change places keep "
         "more of a distance above each other than beside",
+        1.0,
     )
-    gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = Field(
-        9.81, description="gravity [m/s^2], >= 0"
+    gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = key(
+        "gravity [m/s^2], >= 0", 9.81
     )
-    output_step: Time = Field(0.05, description="time between samples of the result [s]")
-    dimension: Literal[2, 3] = Field(
-        3,
-        description="dimension of the space in which the agents keep their formations, for `check`: 2: in a plane, "
+    output_step: Time = key("time between samples of the result [s]", 0.05)
+    dimension: Literal[2, 3] = key(
+        "dimension of the space in which the agents keep their formations, for `check`: 2: in a plane, "
         "where it judges rigidity and searches other shapes; no flight changes by it",
+        3,
     )
 
 
 class GeodeticOrigin(Part):
     """Place on the Earth of the mission's origin, for exports; x points east, y north and z up there."""
 
-    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = Field(
-        description="latitude [deg], WGS 84"
-    )
-    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = Field(
-        description="longitude [deg]"
-    )
-    altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = Field(
-        0.0, description="height of z = 0 above mean sea level [m]"
+    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = key("latitude [deg], WGS 84")
+    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = key("longitude [deg]")
+    altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = key(
+        "height of z = 0 above mean sea level [m]", 0.0
     )
 
 
 class VehicleYaw(Part):
     """Yaw of each vehicle, which no force of a formation depends on."""
 
-    kind: Literal["formation", "fixed", "along", "towards"] = Field(
-        "formation",
-        description="formation: the vehicles turn with the virtual body; fixed: they keep yaw_deg; along: they look "
+    kind: Literal["formation", "fixed", "along", "towards"] = key(
+        "formation: the vehicles turn with the virtual body; fixed: they keep yaw_deg; along: they look "
         "along their way, and keep their heading while slow; towards: they look at a point",
+        "formation",
     )
-    yaw_deg: Angle = Field(0.0, description="yaw [deg] of kind 'fixed'")
-    point: Vector | None = Field(None, description="the point [x, y, z] [m] of kind 'towards'")
+    yaw_deg: Angle = key("yaw [deg] of kind 'fixed'", 0.0)
+    point: Vector | None = key("the point [x, y, z] [m] of kind 'towards'", None)
 
 
 class Contents(MissionHeader):
     """A whole mission file."""
 
-    agents: Agents = Field(description="the vehicles: [agents]")
-    vehicles: dict[str, Vehicle] = Field(
-        default_factory=dict, description="models of vehicles by name: [vehicles.NAME]"
+    agents: Agents = key("the vehicles: [agents]")
+    vehicles: dict[str, Vehicle] = key(
+        "models of vehicles by name: [vehicles.NAME]", default_factory=dict
     )
-    autopilot: Autopilot = Field(
-        default_factory=Autopilot.model_construct,
-        description="sampled control on board: [autopilot]",
+    autopilot: Autopilot = key(
+        "sampled control on board: [autopilot]", default_factory=Autopilot.model_construct
     )
-    avoidance: Avoidance | None = Field(
-        None, description="barriers and guard in flight: [avoidance]"
+    avoidance: Avoidance | None = key("barriers and guard in flight: [avoidance]", None)
+    constraint: Constraint = key(
+        "the constraint force: [constraint]", default_factory=Constraint.model_construct
     )
-    constraint: Constraint = Field(
-        default_factory=Constraint.model_construct, description="the constraint force: [constraint]"
+    lqr: Lqr = key("regulator of the virtual body: [lqr]", default_factory=Lqr.model_construct)
+    tracking: Tracking = key(
+        "regulator of each agent: [tracking]", default_factory=Tracking.model_construct
     )
-    lqr: Lqr = Field(
-        default_factory=Lqr.model_construct, description="regulator of the virtual body: [lqr]"
+    allocation: Allocation = key(
+        "from wrench to forces on agents: [allocation]", default_factory=Allocation.model_construct
     )
-    tracking: Tracking = Field(
-        default_factory=Tracking.model_construct, description="regulator of each agent: [tracking]"
-    )
-    allocation: Allocation = Field(
-        default_factory=Allocation.model_construct,
-        description="from wrench to forces on agents: [allocation]",
-    )
-    integrator: IntegratorOptions = Field(
+    integrator: IntegratorOptions = key(
+        "tolerances of the integrator: [integrator]",
         default_factory=IntegratorOptions.model_construct,
-        description="tolerances of the integrator: [integrator]",
     )
-    body_frame: BodyFrame | None = Field(
-        None, description="attitude of the body frame at t = 0: [body_frame]"
+    body_frame: BodyFrame | None = key("attitude of the body frame at t = 0: [body_frame]", None)
+    formations: dict[str, Formation] = key(
+        "formations by name: [formations.NAME]", default_factory=dict
     )
-    formations: dict[str, Formation] = Field(
-        default_factory=dict, description="formations by name: [formations.NAME]"
+    obstacles: tuple[Obstacle, ...] = key("obstacles: [[obstacles]]", ())
+    limits: Limits = key(
+        "limits that the verdict checks: [limits]", default_factory=Limits.model_construct
     )
-    obstacles: tuple[Obstacle, ...] = Field((), description="obstacles: [[obstacles]]")
-    limits: Limits = Field(
-        default_factory=Limits.model_construct,
-        description="limits that the verdict checks: [limits]",
+    yaw: VehicleYaw = key("yaw of each vehicle: [yaw]", default_factory=VehicleYaw.model_construct)
+    geodetic_origin: GeodeticOrigin | None = key(
+        "place of the origin on the Earth, for exports: [geodetic_origin]", None
     )
-    yaw: VehicleYaw = Field(
-        default_factory=VehicleYaw.model_construct, description="yaw of each vehicle: [yaw]"
-    )
-    geodetic_origin: GeodeticOrigin | None = Field(
-        None, description="place of the origin on the Earth, for exports: [geodetic_origin]"
-    )
-    network: Network | None = Field(
+    network: Network | None = key(
+        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
         None,
-        description="messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
     )
-    disturbances: Disturbances | None = Field(
-        None, description="wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
+    disturbances: Disturbances | None = key(
+        "wind, gusts, noise, mass errors, lost vehicles: [disturbances]", None
     )
-    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = Field(
-        description="phases of the flight, in order: [[phases]]"
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = key(
+        "phases of the flight, in order: [[phases]]"
     )

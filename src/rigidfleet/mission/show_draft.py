@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.templates import templates
 from rigidfleet._common.toml import toml_key
 from rigidfleet.formation import shapes
 from rigidfleet.formation.assignment import assign_slots
@@ -150,12 +151,10 @@ def show(
         blend = max(4, blend_time(float(np.linalg.norm(slots - places, axis=1).max())))
         title = one.name if one.name not in taken else f"{one.name}, phase {k + 2}"
         shown = _SHOWN if one is not pads else _SETTLED
-        phases.append(
-            _CHANGE.format(
-                name=json.dumps(title), kind="reshape" if k else "establish",
-                formation=json.dumps(one.name), blend=f"{blend:.1f}", duration=f"{blend + shown:.1f}",
-            )
-        )  # fmt: skip
+        phases.append({
+            "name": json.dumps(title), "kind": "reshape" if k else "establish", "formation": json.dumps(one.name),
+            "blend": f"{blend:.1f}", "duration": f"{blend + shown:.1f}",
+        })  # fmt: skip
         taken.add(one.name)
         places, lasts = slots, lasts + blend + shown
     separation = math.floor(100 * _ASKED * (spacing / math.sqrt(2) - 2 * radius)) / 100
@@ -163,78 +162,13 @@ def show(
         raise ValueError(f"a spacing of {spacing:g} m is too small for a show")
     what = f"A show of {agents} vehicles: {', '.join(one.name for one in scenes)}"
     what = " ".join(what.split())  # a name may have line breaks
-    return align_comments(
-        _HEAD.format(
-            name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
-            what=what, title=json.dumps(what, ensure_ascii=False),
-            step=output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
-            limit=math.ceil(LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
-            spacing=f"{spacing:g}", agents=agents, ground=ground, start=f"{start:.4g}", separation=f"{separation:g}",
-            formations="".join(
-                f"[formations.{toml_key(key)}]\n{one.table}edges = []                        # slots alone hold it\n\n"
-                for key, one in tables.items()
-            ),
-            height=f"{height:.1f}", climb=f"{climb:.1f}",
-        )
-        + "".join(phases)
-        + _LAND.format(climb=f"{climb:.1f}")
+    text = templates("rigidfleet.mission", escape=False).get_template("show.toml").render(
+        name=json.dumps(name, ensure_ascii=False), file=file or f"{name}.toml",
+        what=what, title=json.dumps(what, ensure_ascii=False),
+        step=output_step(agents, lasts), mass=f"{mass:g}", radius=f"{radius:.3g}",
+        limit=math.ceil(LIFT * mass * 98.1) / 10 if thrust_limit is None else f"{thrust_limit:g}",
+        spacing=f"{spacing:g}", agents=agents, ground=ground, start=f"{start:.4g}", separation=f"{separation:g}",
+        formations={toml_key(key): one.table for key, one in tables.items()},
+        height=f"{height:.1f}", climb=f"{climb:.1f}", phases=phases,
     )  # fmt: skip
-
-
-_HEAD = """\
-# {what}.
-#
-# Change any number, then check the show, fly it, and watch it:
-#     rigidfleet check {file}
-#     rigidfleet run {file} --replay
-# Units are SI; x is east, y north, z up; agents count from 1. An error in a key is reported with its remedy.
-
-schema_version = 1
-name = {name}                     # results are written to flights/NAME
-title = {title}
-smoothness = "jerk"               # acceleration and jerk are continuous
-assignment = "each"               # at each change, the slots with the least squared distances: no two ways cross
-{step}
-[agents]
-mass = {mass}                        # [kg]
-radius = {radius}                     # [m] radius of the sphere around each agent
-thrust_limit = {limit}                # [N] of each agent
-position = {{ shape = "{ground}", size = {spacing}, count = {agents}, centre = [0.0, 0.0, {start}] }}
-
-[integrator]
-rtol = 1e-6
-atol = 1e-6                       # [m, m/s]
-
-{formations}[limits]                          # limits that the verdict checks
-separation = {separation}                  # [m] between surfaces; the plan is proved to keep it
-speed = 6.0                       # [m/s]
-acceleration = 4.0                # [m/s^2]
-
-[[obstacles]]
-kind = "ground"
-
-# -- the show: phases in order, each ending after its duration [s] --------------------------------
-
-[[phases]]
-name = "take off"
-kind = "takeoff"
-height = {height}                     # [m] above the ground; all scenes are centred there
-duration = {climb}
-# stagger = {climb}                   # [s] row after row: then, duration is that of all rows together
-"""
-
-_CHANGE = """
-[[phases]]
-name = {name}
-kind = "{kind}"
-formation = {formation}
-blend = {blend}                      # [s] of the change
-duration = {duration}
-"""
-
-_LAND = """
-[[phases]]
-name = "land"
-kind = "land"
-duration = {climb}
-"""
+    return align_comments(text)

@@ -11,6 +11,7 @@ from pydantic import (
     Tag,
     WithJsonSchema,
 )
+from pydantic_core import PydanticUndefined
 
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
@@ -172,6 +173,11 @@ def number_or_list(least: float) -> WithJsonSchema:
     """In the schema: a number of at least ``least``, or a list of them."""
     number = {"type": "number", "minimum": least}
     return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
+
+
+def key(text: str, default: Any = PydanticUndefined, **more: Any) -> Any:
+    """A key of a table: its meaning with its unit, and its default; without one it is required."""
+    return Field(default, description=text, **more)
 
 
 class Part(BaseModel):

@@ -1,4 +1,4 @@
-"""Models of vehicles, with the source of every number, and the check of [vehicles].
+"""Models of vehicles, whose numbers and their sources are in `vehicles.toml`, and the check of [vehicles].
 
 The model of a quadrotor is that of RotorPy (Folk, Paulos, Kumar, "RotorPy: A Python-based Multirotor Simulator with
 Aerodynamics for Education and Research", arXiv 2306.04485): rotor thrust and drag torque by the square of the speed,
@@ -8,6 +8,8 @@ motors with a first-order lag, drag of the rotors and of the body.
 from __future__ import annotations
 
 import math
+import tomllib
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from rigidfleet.mission.findings import look_up, suggest
@@ -77,93 +79,16 @@ class VehicleModel(NamedTuple):
         return (across, across, along)
 
 
-_ROTORPY = "RotorPy 3.0"
-_CHOSEN = "chosen"
-#: Numbers of each model, with their source.
-MODELS: dict[str, dict[str, tuple[Any, str]]] = {
-    # The paper gives mass and thrust of a rotor. The rest is chosen: arm and drag as of the Hummingbird, inertia and
-    # ratio of torque to thrust as of quadrotors of about a kilogram, gains as RotorPy's for the Hummingbird.
-    "paper": {
-        "mass": (1.0, "paper, Tables 2 and 3"),
-        "inertia": ((0.01, 0.01, 0.0187), _CHOSEN),
-        "arm": (0.17, _CHOSEN),
-        "thrust_coefficient": (5.9e-6, "paper: 5.9 N at the greatest speed"),
-        "torque_coefficient": (5.9e-6 * 0.0152, _CHOSEN),
-        "rotor_speed": ((0.0, 1000.0), _CHOSEN),
-        "motor_time": ((0.02, 0.02), _CHOSEN),
-        "rotor_drag": (1.16e-4, _CHOSEN),
-        "rotor_inflow": (1.16e-4, _CHOSEN),
-        "rotor_lift": (0.0, _CHOSEN),
-        "rotor_radius": (0.127, _CHOSEN + ": propellers of ten inches"),
-        "body_drag": ((0.5e-2, 0.5e-2, 1e-2), _CHOSEN),
-        "attitude_gains": ((544.0, 46.64), _CHOSEN),
-    },
-    "px4-sih": {
-        "mass": (1.0, f"PX4 SIH_MASS, {_ROTORPY} px4_sihsim_quadx_params"),
-        "inertia": ((0.025, 0.025, 0.030), "PX4 SIH_IXX, SIH_IYY, SIH_IZZ"),
-        "arm": (0.17 * math.sqrt(2.0), _ROTORPY),
-        "thrust_coefficient": (5e-6, "PX4 SIH_T_MAX"),
-        "torque_coefficient": (1e-7, "PX4 SIH_Q_MAX"),
-        "rotor_speed": ((0.0, 1000.0), _ROTORPY),
-        "motor_time": ((0.05, 0.05), "PX4 SIH_T_TAU"),
-        "rotor_drag": (0.0, _ROTORPY),
-        "rotor_inflow": (0.0, _ROTORPY),
-        "rotor_lift": (0.0, _ROTORPY),
-        "rotor_radius": (0.1, _CHOSEN),
-        "body_drag": ((1e-2, 1e-2, 1e-2), _ROTORPY),
-        "attitude_gains": ((310.0, 57.0), f"{_ROTORPY} SE3Control"),
-    },
-    "hummingbird": {
-        "mass": (0.5, f"{_ROTORPY} hummingbird_params"),
-        "inertia": ((3.65e-3, 3.68e-3, 7.03e-3), _ROTORPY),
-        "arm": (0.17, _ROTORPY),
-        "thrust_coefficient": (5.57e-6, _ROTORPY),
-        "torque_coefficient": (1.36e-7, _ROTORPY),
-        "rotor_speed": ((0.0, 1500.0), _ROTORPY),
-        "motor_time": ((0.005, 0.005), _ROTORPY),
-        "rotor_drag": (1.19e-4, _ROTORPY),
-        "rotor_inflow": (2.32e-4, _ROTORPY),
-        "rotor_lift": (3.39e-3, _ROTORPY),
-        "rotor_radius": (0.1, _ROTORPY),
-        "body_drag": ((0.5e-2, 0.5e-2, 1e-2), _ROTORPY),
-        "attitude_gains": ((544.0, 46.64), _ROTORPY),
-    },
-    "crazyflie": {
-        "mass": (0.03, f"{_ROTORPY} crazyflie_params"),
-        "inertia": ((1.43e-5, 1.43e-5, 2.89e-5), _ROTORPY),
-        "arm": (0.043, _ROTORPY),
-        "thrust_coefficient": (2.3e-8, "Förster, System Identification of the Crazyflie 2.0, 2015"),
-        "torque_coefficient": (7.8e-10, "Förster 2015"),
-        "rotor_speed": ((0.0, 2500.0), _ROTORPY),
-        "motor_time": ((0.072, 0.072), "Eschmann et al., arXiv 2404.07837"),
-        "rotor_drag": (1.02506e-6, "Förster 2015"),
-        "rotor_inflow": (7.553e-7, "Förster 2015"),
-        "rotor_lift": (0.0, _ROTORPY),
-        "rotor_radius": (0.0225, "propellers of 45 mm"),
-        "body_drag": ((0.0, 0.0, 0.0), _ROTORPY),
-        "attitude_gains": ((310.0, 57.0), _ROTORPY),
-    },
-    "x500": {
-        "mass": (2.064307692, "PX4 Gazebo models, x500_base and its four rotors"),
-        "inertia": ((0.0216667, 0.0216667, 0.04), "PX4 Gazebo models, x500_base"),
-        "arm": (0.174 * math.sqrt(2.0), "PX4 Gazebo models, x500"),
-        "thrust_coefficient": (8.54858e-6, "PX4 Gazebo models, x500: motorConstant"),
-        "torque_coefficient": (8.54858e-6 * 0.016, "PX4 Gazebo models, x500: momentConstant"),
-        "rotor_speed": ((0.0, 1000.0), "PX4 Gazebo models, x500: maxRotVelocity"),
-        "motor_time": ((0.0125, 0.025), "PX4 Gazebo models, x500: timeConstantUp and -Down"),
-        "rotor_drag": (8.06428e-5, "PX4 Gazebo models, x500: rotorDragCoefficient"),
-        "rotor_inflow": (0.0, "PX4 Gazebo models, x500: the model has none"),
-        "rotor_lift": (0.0, "PX4 Gazebo models, x500: the model has none"),
-        "rotor_radius": (0.128, "PX4 Gazebo models, x500: propellers of ten inches"),
-        "body_drag": ((0.0, 0.0, 0.0), "PX4 Gazebo models, x500: the model has none"),
-        "attitude_gains": ((310.0, 57.0), f"{_ROTORPY} SE3Control"),
-    },
-}
-for _numbers in MODELS.values():
-    _numbers["tilt_limit_deg"] = (
-        45.0,
-        f"{_CHOSEN}; PX4 allows as much by default (MPC_TILTMAX_AIR)",
-    )
+def _models() -> dict[str, dict[str, tuple[Any, str]]]:
+    """The numbers of each model by key, each with its source."""
+    tables = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    for table in tables.values():
+        for key, (number, source) in table.items():
+            table[key] = (tuple(number) if isinstance(number, list) else number), source
+    return tables
+
+
+MODELS = _models()
 
 #: Keys that only a point has, and those of a quadrotor in their place.
 _OF_POINTS = {"thrust_limit": "thrust_coefficient", "drag": "rotor_drag"}

@@ -37,9 +37,8 @@ _THIN = 1e-9
 class Detour:
     """What the reference of a body deviates from the planned one by, in world axes."""
 
-    x: Floats = field(
-        default_factory=lambda: np.zeros((3, 3))
-    )  # displacement, two derivatives [m, s]
+    # Displacement, two derivatives [m, s].
+    x: Floats = field(default_factory=lambda: np.zeros((3, 3)))
     Q: Floats = field(default_factory=lambda: np.eye(3))  # rotation
     omega: Floats = field(default_factory=lambda: np.zeros((2, 3)))  # rates [rad/s], derivative
     scale: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))  # and two derivatives
@@ -79,7 +78,7 @@ class Detour:
         def derivatives_at(x: Floats, end: Floats) -> Floats:
             value, rate, second = x
             bend = (end - second) * share
-            return np.stack(
+            return np.array(
                 [
                     value + dt * (rate + dt * (second / 2 + bend / 6)),
                     rate + dt * (second + bend / 2),
@@ -88,7 +87,7 @@ class Detour:
             )
 
         # The rotation vector from Q, whose rates are those of the body as long as it is small
-        spin = derivatives_at(np.stack([np.zeros(3), *self.omega]), accelerations[3:6])
+        spin = derivatives_at(np.array([np.zeros(3), *self.omega]), accelerations[3:6])
         Q = att.dcm_from_rotation_vector(spin[0]).T @ self.Q
         return Detour(
             derivatives_at(self.x, accelerations[:3]),
@@ -99,9 +98,8 @@ class Detour:
 
     def series(self) -> tuple[Floats, Floats, Floats]:
         """Taylor series of displacement (3, 3), rotation (3, 3, 3), body to world, and scale (3,)."""
-        own = (
-            self.omega @ self.Q
-        )  # in the axes of Q, in which the derivative of the rates is the same
+        # In the axes of Q, in which the derivative of the rates is the same.
+        own = self.omega @ self.Q
         Q = series.from_rates(self.Q, own)
         return series.from_derivatives(self.x), Q, series.from_derivatives(self.scale)
 
@@ -115,9 +113,8 @@ def least_distance(G: Floats, h: Floats) -> Floats | None:
     f[-1] = 1.0
     u, _ = nnls(E, f)
     r = E @ u - f
-    if (
-        -r[-1] <= 1e-12
-    ):  # the residual of a consistent problem is not zero, and its last entry is its square
+    # The residual of a consistent problem is not zero, and its last entry is its square.
+    if -r[-1] <= 1e-12:
         return None
     return -r[:-1] / r[-1]
 

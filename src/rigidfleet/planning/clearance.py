@@ -139,9 +139,8 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
             continue
         spans = spans.of(np.flatnonzero(open_.any(axis=1)), np.flatnonzero(open_.any(axis=0)))
         rows, columns = np.arange(len(spans.first)), np.arange(len(spans.who))
-        if (
-            len(rows) > 1 and len(rows) * len(columns) > _AT_ONCE
-        ):  # not all are near at the same time
+        # Not all are near at the same time.
+        if len(rows) > 1 and len(rows) * len(columns) > _AT_ONCE:
             halves = np.array_split(np.argsort(spans.first, kind="stable"), 2)
             todo.extendleft(spans.of(half, columns) for half in halves)
             continue

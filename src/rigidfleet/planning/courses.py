@@ -70,9 +70,8 @@ class Course(NamedTuple):
     goal: Pose | None  # pose to reach; None if no frame is attached yet
     arrival: float  # time to reach it [s]
     motion: Callable[[], Motion] | None  # to it; None if there is none
-    lift: Lift | None = (
-        None  # what is added to the slots; None if they keep the shape, or blend to another
-    )
+    # What is added to the slots; None if they keep the shape, or blend to another.
+    lift: Lift | None = None
 
 
 def course(mission: Mission, phase: Phase, now: PhaseState, t_end: float) -> Course:

@@ -50,7 +50,7 @@ def slot_derivatives(
     piece after it counts. With fewer ``orders``, the last ones are left out.
     """
     derivatives = series.derivatives(
-        slot_series(reference, body_series(motion, time), time)[:orders]
+        slot_series(reference, body_series(motion, time, orders), time)
     )
     return derivatives.transpose(3, 0, 2, 1)
 
@@ -59,23 +59,24 @@ def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats)
     """Taylor series (5, 3, N, K) of each slot, from the `body_series` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body
     if len(reference.knots):
-        return series.product(way_series(reference, time), axes, _in_world) + cm[:, :, None]
-    s = blend_series(time, reference.t0, reference.T_b)
+        return (
+            series.product(way_series(reference, time)[: len(cm)], axes, _in_world) + cm[:, :, None]
+        )
+    s = blend_series(time, reference.t0, reference.T_b)[: len(cm)]
     if reference.turn.any():
-        turned = np.moveaxis(series.rotation(s[..., None] * reference.turn), 1, -1)
+        turned = series.rotation(s[..., None] * reference.turn).transpose(0, 2, 3, 1)
         axes = series.product(axes, turned, _matrix_product)
     slots = reference.p0 @ axes
     if reference.dp.any():
-        slots += reference.dp @ series.product(s[:, None, None], axes)
-    slots += cm[:, :, None]
-    return slots
+        slots = slots + reference.dp @ series.product(s[:, None, None], axes)
+    return slots + cm[:, :, None]
 
 
 def way_series(reference: Reference, time: Floats) -> Floats:
     """Taylor series (5, N, 3, K) of slots on their ways, body axes, at times (K,) [s]; at rest before and after."""
     ways = Piecewise(reference.knots, reference.ways)
     inside = np.clip(time, ways.time[0], ways.time[-1])
-    values = np.moveaxis(ways.series(inside, ORDERS), 1, -1)
+    values = ways.series(inside, ORDERS).transpose(0, 2, 3, 1)
     values[1:, ..., inside != time] = 0.0
     return values
 
@@ -90,25 +91,26 @@ def _matrix_product(a: Floats, b: Floats) -> Floats:
     return (a[..., :, :, None, :] * b[..., None, :, :, :]).sum(axis=-3)
 
 
-def body_series(motion: Motion, time: Floats) -> tuple[Floats, Floats]:
+def body_series(motion: Motion, time: Floats, orders: int = ORDERS) -> tuple[Floats, Floats]:
     """Taylor series (5, 3, K) [m] of the CM and (5, 3, 3, K) of the attitude, body to world, at times (K,) [s].
 
-    After the last knot, the CM and the rotation vector continue at the rates they have there. Times are the last axis,
-    also in memory, here and in `slot_series`: arithmetic on long rows is fast.
+    Of a body that does not turn, the attitude has one time instead of K, and so nothing is multiplied K times. Fewer
+    ``orders`` have the same numbers. After the last knot, the CM and the rotation vector continue at the rates they
+    have there. Times are the last axis, also in memory, here and in `slot_series`: arithmetic on long rows is fast.
     """
     way = Piecewise(motion.knots, motion.coefficients)
     inside = np.minimum(time, way.time[-1])
-    x = np.ascontiguousarray(np.moveaxis(way.series(inside, ORDERS), 1, -1))
+    x = np.ascontiguousarray(way.series(inside, ORDERS).swapaxes(1, 2))
     beyond = time > inside
     x[0][:, beyond] += (time - inside)[beyond] * x[1][:, beyond]
     x[2:, :, beyond] = 0.0
-    cm, phi = x[:, :3], x[:, 3:]
+    cm, phi = x[:orders, :3], x[:, 3:]
     if np.abs(phi).max(initial=0.0) <= _NO_TURN:  # most ways do not turn, but for rounding
-        axes = np.zeros((ORDERS, 3, 3, len(time)))
+        axes = np.zeros((orders, 3, 3, 1))
         axes[0] = motion.T1.T[..., None]
         return cm, axes
-    turned = np.moveaxis(series.rotation(phi.swapaxes(1, 2)), 1, -1)
-    return cm, (motion.T1.T @ turned.reshape(ORDERS, 3, -1)).reshape(turned.shape)
+    turned = series.rotation(phi.swapaxes(1, 2), orders).transpose(0, 2, 3, 1)
+    return cm, (motion.T1.T @ turned.reshape(orders, 3, -1)).reshape(turned.shape)
 
 
 def blend_series(time: Floats, t0: float, T_b: float) -> Floats:

@@ -47,9 +47,8 @@ class Departure(NamedTuple):
     before: PhaseState  # at the switch
     now: PhaseState  # with the body frame attached, if the phase needs one
     frame: Floats | None  # attitude (3, 3) of the mean-axis frame to integrate
-    target: (
-        Floats | None
-    )  # slots (N, 3) of the formation, if it has any, about the CM, body axes [m]
+    # Slots (N, 3) of the formation, if it has any, about the CM, body axes [m].
+    target: Floats | None
     kind: int  # of the reference of distances
     p0: Floats  # slots (N, 3) that the phase begins with [m]
     dp: Floats  # what a blend adds to them (N, 3) [m]

@@ -1,8 +1,8 @@
 """Choose the method that solves for a formation's constraint force, and prepare it before a flight.
 
 Small systems are solved densely. Under the exact law, if each agent is joined to three before it, two passes over the
-agents suffice (`rigidfleet.kernel.large.elimination`). Other large systems are solved on the vertex graph
-(`rigidfleet.kernel.large.block_cholesky`). Nothing here integrates or compiles.
+agents suffice (`rigidfleet.kernel.elimination`). Other large systems are solved on the vertex graph
+(`rigidfleet.kernel.block_cholesky`). Nothing here integrates or compiles.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ from typing import Any
 from rigidfleet._common.progress import report
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.mission import Mission, Phase
+from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import points_passed
@@ -34,6 +35,12 @@ _STALLED = 0.98
 _MARGIN, _UNIT = 1.005, 1e-3
 #: Excess over a limit that is ignored.
 SLACK = 1e-3
+#: What no transition, way or time of a plan depends on: it matters in flight alone.
+_IN_FLIGHT = (
+    ("integrator",), *(("disturbances", key) for key in ("wind", "drag", "mass_error", "gusts")),
+)  # fmt: skip
+#: The same of points, unless a phase ends by settling: for vehicles, gains and delays set a reserve of limits.
+_IN_FLIGHT_OF_POINTS = ("constraint",), ("disturbances", "noise")
 
 
 def expand_mission(mission: Mission) -> Mission:
@@ -47,6 +54,14 @@ def expand_mission(mission: Mission) -> Mission:
         No transition keeps the separation, or no way is found.
     """
     return ways.find_ways(expand_phases(mission, timed_leg), timed_leg)
+
+
+def matters_to_plan(mission: Mission, keys: Keys) -> bool:
+    """Whether `expand_mission` may depend on a key of a mission."""
+    free = _IN_FLIGHT
+    if mission.vehicle_models is None and all(p.settle is None for p in mission.phases):
+        free += _IN_FLIGHT_OF_POINTS
+    return not any(keys[: len(x)] == x for x in free)
 
 
 def complete_times(mission: Mission) -> Mission:

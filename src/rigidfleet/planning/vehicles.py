@@ -236,38 +236,39 @@ class TickTables:
         #: Where the yaw "along" of a turn is known from, to continue from table to table: time [s], yaw (N,).
         self._known: tuple[YawTurn, float, Floats] | None = None
 
-    def start_path(self, problem: Problem, tick: int) -> Floats:
-        """Begin to measure states about another path; return what to add (N, 6) to states measured before.
+    def start_path(self, problem: Problem, tick: int, tables: fleet.TickInputs) -> Floats:
+        """Begin to measure states about another path; return where the one before is (N, 6), by its ``tables``.
 
         While slots are tracked, the path is that of the reference. Otherwise it stays where it is.
         """
-        before = self._path(tick)
+        k = tick - tables.first
+        before = tables.path[k] if 0 <= k < len(tables.path) else self._path(np.array([tick]))[0]
         if problem.control.kind == TRACKING:
             self._source = problem
         else:
             self._source, self._anchor = None, before
-        return before - self._path(tick)
+        return before
 
-    def _path(self, tick: int) -> Floats:
+    def _path(self, ticks: Ints) -> Floats:
         if self._source is None:
-            return self._anchor
-        time = np.array([tick / self.rate])
-        states = slot_derivatives(self._source.reference, self._source.motion, time, 2)
-        return np.concatenate([states[0, 0], states[0, 1]], axis=1)
+            return np.tile(self._anchor, (len(ticks), 1, 1))
+        reference, motion = self._source.reference, self._source.motion
+        states = slot_derivatives(reference, motion, ticks / self.rate, 2)
+        return np.ascontiguousarray(np.concatenate([states[:, 0], states[:, 1]], axis=2))
 
     def tables_for(
         self, first: int, last: int, problem: Problem, turn: YawTurn
     ) -> fleet.TickInputs:
         """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase."""
-        sensing = self.flight.sensing
-        time = np.arange(first, last) / self.rate
-        yaw, slots = self._references(problem, time, turn)
-        jerk, snap = self._force_rates(slots)
-        path = np.zeros((0, self.n, 6))
+        sensing, ticks = self.flight.sensing, np.arange(first, last)
+        yaw = jerk = snap = np.zeros((0, self.n, 3))
+        slots, path = np.zeros(0), np.zeros((0, self.n, 6))
+        if not self.flight.vehicles.point.all() or self.yaw.kind == "along":
+            # An ideal point has no attitude that goes ahead of its force.
+            yaw, slots = self._references(problem, ticks / self.rate, turn)
+            jerk, snap = self._force_rates(slots)
         if self.compensated:
-            path = np.tile(self._anchor, (len(time), 1, 1))
-            if len(slots):
-                path = _by_tick(slots[:2].reshape(6, self.n, -1))
+            path = _by_tick(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         if self.noise is not None:

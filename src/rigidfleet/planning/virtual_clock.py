@@ -70,7 +70,7 @@ class VirtualClock:
         E = np.exp(-k * t)
         p, slope = A + B * t + 0.5 * C * t * t, B + C * t
         whole = A / k + B / k**2 + C / k**3 - E * (p / k + slope / k**2 + C / k**3)
-        return np.stack(
+        return np.array(
             [
                 u * t + whole, u + E * p, E * (slope - k * p), E * (C - 2.0 * k * slope + k * k * p)
             ]
@@ -100,4 +100,4 @@ class VirtualClock:
 def time_derivatives(x: Floats, rate: Floats) -> Floats:
     """Value and two derivatives over t (3, ..., K), of those over tau (3, ..., K), for s and its derivative (2, K)."""
     s, first = rate
-    return np.stack([x[0], s * x[1], s * s * x[2] + first * x[1]])
+    return np.array([x[0], s * x[1], s * s * x[2] + first * x[1]])

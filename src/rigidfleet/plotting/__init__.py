@@ -111,6 +111,11 @@ def figure_names(result: Result | None = None) -> list[str]:
     return [name for name in _FIGURES if not empty.get(name)]
 
 
+def caption(name: str) -> str:
+    """What a figure shows, in the sentence with which the function that draws it begins."""
+    return (_FIGURES[name].__doc__ or "").split("\n")[0]
+
+
 class Figures(list["Figure"]):
     """Figures of a flight, which a notebook shows one below the other."""
 

@@ -140,7 +140,7 @@ def _distinct_columns(values: Floats) -> list[int]:
 
 @in_style
 def distances(result: Result) -> Figure:
-    """Distances between agents with their references."""
+    """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
     ax = axes[0, 0]
     draw_distances(ax, result)
@@ -214,7 +214,7 @@ def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
 
 @in_style
 def cm(result: Result) -> Figure:
-    """Position and velocity of the centre of mass with their references and waypoints."""
+    """Centre of mass: flown, reference (dashed) and waypoints (rings)."""
     columns = (result.cm, result.cm_reference), (result.cm_velocity, result.cm_velocity_reference)
     fig, axes = st.time_figure(
         result, "Centre of mass", 3, 2, height=1.5, shares=_row_shares(*columns)
@@ -259,7 +259,7 @@ def flown_and_wanted_euler(result: Result) -> tuple[Floats, Floats, list[tuple[f
 
 @in_style
 def attitude(result: Result) -> Figure:
-    """Euler angles (3-2-1) and body rates of the formation with their references and waypoints."""
+    """Attitude of the formation: flown, reference (dashed) and waypoints (rings)."""
     title = "Attitude of the formation"
     flown, wanted, targets = flown_and_wanted_euler(result)
     if not np.isfinite([flown, wanted]).any():
@@ -301,7 +301,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
 
 @in_style
 def inputs(result: Result) -> Figure:
-    """Thrust of each agent with its limit, and enlarged."""
+    """Thrust of each vehicle with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
     above, below = axes[:, 0]
     draw_thrust(above, result)
@@ -317,7 +317,7 @@ def inputs(result: Result) -> Figure:
 
 @in_style
 def constraint_force(result: Result) -> Figure:
-    """Constraint force |f_C| on each agent and tension of each edge."""
+    """Constraint force on each vehicle, and tension of each edge (negative: the edge pushes)."""
 
     def edge(k: int) -> str:
         return f"edge {result.edge_labels[k]}"
@@ -346,7 +346,7 @@ def constraint_force(result: Result) -> Figure:
 
 @in_style
 def disturbance(result: Result) -> Figure:
-    """Aerodynamic force |f_D| on each agent, and distance of each agent from its slot."""
+    """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
     above, below = axes[:, 0]
     above.set_ylabel("aerodynamic force [N]")
@@ -425,7 +425,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
 
 @in_style
 def constraint_error(result: Result) -> Figure:
-    """Constraint errors |c| of the edges and their greatest, and the error of all pairs."""
+    """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     fig, axes = st.time_figure(
         result, "Constraint error, and shape error of all pairs against the slots", 1, height=3.6
     )
@@ -498,7 +498,7 @@ def _draw_planned(ax: Axes, result: Result) -> None:
 
 @in_style
 def clearance(result: Result) -> Figure:
-    """Least distances between agents, straight below an agent and to obstacles, with their limits."""
+    """Distances between surfaces, with the limits."""
     mission, several = result.mission, result.n_agents > 1
     wanted = {
         "separation": several or not mission.obstacles,
@@ -523,7 +523,7 @@ def limited_motions(result: Result) -> list[Quantity]:
 
 @in_style
 def motion(result: Result) -> Figure:
-    """Speed, acceleration and jerk of each agent, in all directions or one, with their limits."""
+    """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes[:, 0], strict=True):

@@ -23,8 +23,9 @@ def leaves_ground(result: Result) -> bool:
     return any(phase.vertical is not None for phase in result.mission.phases)
 
 
+@in_style
 def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
-    """Altitude, speed and vertical speed of all vehicles over time, and separation and clearance.
+    """Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.
 
     Parameters
     ----------
@@ -38,15 +39,6 @@ def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     n = result.n_agents
     if beyond := [i for i in agents if not 1 <= i <= n]:
         raise ValueError(f"there is no agent {beyond[0]}; agents are numbered from 1 to {n}")
-
-    @in_style
-    def drawn(result: Result) -> Figure:
-        return _draw_operation(result, agents)
-
-    return drawn(result)
-
-
-def _draw_operation(result: Result, agents: Sequence[int]) -> Figure:
     fig, axes = st.time_figure(result, "Operation", 5, height=1.6)
     above, fast, climb, apart, clear = axes[:, 0]
     v = result.velocity

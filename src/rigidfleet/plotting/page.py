@@ -48,7 +48,10 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
 
 @in_style
 def summary(result: Result) -> Figure:
-    """Trajectory, top view, distances (without edges: separation), attitude, thrust and clearance on one page."""
+    """Summary of the flight on one page.
+
+    It has the trajectory, the view from above, distances (without edges: separation), attitude, thrust and clearance.
+    """
     fig = st.blank_figure(11.4, 7.0)
     st.draw_head(fig, result, st.clean_name(result.mission.title, 80) or "Flight")
     view = space.scene(result)

@@ -60,7 +60,7 @@ def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
 
 @in_style
 def rotors(result: Result) -> Figure:
-    """Greatest force of a rotor of each vehicle with its limit, and all rotors of the vehicle nearest to its limit."""
+    """Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
     above, below = axes[:, 0]
     if not has_rotors(result):
@@ -120,7 +120,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
 
 @in_style
 def vehicles(result: Result) -> Figure:
-    """Tilt of each vehicle, its distance from its slot, and when it cannot give what is asked of it."""
+    """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
     saturated = _saturation_mask(result)
     shares = (1.0, 1.0, 0.6 if saturated.any() else _TEXT_ROW)
     title = "Tilt, tracking error and saturation of the vehicles"

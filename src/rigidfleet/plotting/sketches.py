@@ -71,7 +71,7 @@ def tiled_figure(
 
 @in_style
 def formations(result: Result) -> Figure:
-    """Constraint graph and body axes of each formation of the mission."""
+    """Formations with their edges and body axes."""
     names = list(result.mission.formations)
     legend = len(result.edges) > curves.SINGLE and bool(names)
     fig, rects = tiled_figure(len(names), 3.5, 0.5, (0.45, 0.7 * legend))

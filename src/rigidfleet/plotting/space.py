@@ -415,7 +415,7 @@ def legend_handles(result: Result, view: Scene) -> list[Any]:
 
 @in_style
 def trajectory(result: Result) -> Figure:
-    """Trajectory in three dimensions and from above, with the formation drawn at chosen times."""
+    """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)
     fig = st.blank_figure(wide, 2.2 * wide if st.is_narrow() else 6.2)
     st.draw_head(fig, result, "Trajectory")

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.text import Annotation, Text
     from matplotlib.transforms import Bbox
 
-Draw = Callable[[Result], "Figure"]
+Draw = Callable[..., "Figure"]
 
 #: Colours of the first twelve agents: those of Okabe and Ito's set that stand out on white, then colours as
 #: distinct from these as possible, to normal and to colour-blind vision.
@@ -130,9 +130,9 @@ def in_style(draw: Draw) -> Draw:
     """Draw a figure in our style."""
 
     @wraps(draw)
-    def draw_in_style(result: Result) -> Figure:
+    def draw_in_style(*what: Any, **more: Any) -> Figure:
         with settings():
-            figure = draw(result)
+            figure = draw(*what, **more)
             place_words(figure)
             return figure
 
@@ -198,9 +198,8 @@ def time_figure(
 ) -> tuple[Figure, Any]:
     """Figure with rows x columns axes (object array) that share time; `height` of a row [in], scaled by its share."""
     shares = [1.0] * rows if shares is None else shares
-    stacked = (
-        (columns, rows) if is_narrow() else None
-    )  # the second column then stands below the first
+    # The second column then stands below the first.
+    stacked = (columns, rows) if is_narrow() else None
     if stacked:
         rows, columns, shares = rows * columns, 1, list(shares) * columns
     whole = 1.3 + height * sum(shares)

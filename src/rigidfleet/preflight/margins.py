@@ -175,14 +175,7 @@ def _smaller_margins(
     constrained = [loop for loop in loops if loop.is_constrained]
     most = math.inf if known is None else known.largest_pole
     pole = largest_pole(constrained, law, most, growth) if constrained else most
-    if known is None:
-        return FormationMargins(now, pole)
-    was = known.margins
-    if not (was.stable and now.stable):
-        return FormationMargins(Margins(stable=False), pole)
-    low, high = max(was.gain[0], now.gain[0]), min(was.gain[1], now.gain[1])
-    worst = Margins(True, (low, high), min(was.phase, now.phase), min(was.delay, now.delay))
-    return FormationMargins(worst, pole)
+    return FormationMargins(now if known is None else known.margins.common(now), pole)
 
 
 def margin_remarks(preflight: Preflight) -> Iterator[Remark]:

@@ -58,9 +58,9 @@ def html_page(
     verdicts: Sequence[Verdict] | None = None,
 ) -> str:
     """The page that `report` writes."""
+    from rigidfleet._common.templates import templates
     from rigidfleet.reporting.contents import contents
     from rigidfleet.web.policy import content_policy
-    from rigidfleet.web.template import templates
 
     if isinstance(results, Result | str | Path):
         results = [results]

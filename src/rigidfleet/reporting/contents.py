@@ -368,24 +368,6 @@ def _flat_keys(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
 
 # -- figures -----------------------------------------------------------------------------------------
 
-_CAPTIONS = {
-    "summary": "Summary of the flight on one page.",
-    "trajectory": "Paths of the vehicles, and the formation at selected times.",
-    "distances": "Distances of the active edges, with their references (dashed).",
-    "cm": "Centre of mass: flown, reference (dashed) and waypoints (rings).",
-    "attitude": "Attitude of the formation: flown, reference (dashed) and waypoints (rings).",
-    "inputs": "Thrust of each vehicle with its limit, and enlarged.",
-    "constraint_force": "Constraint force on each vehicle, and tension of each edge (negative: the edge pushes).",
-    "constraint_error": "Constraint error |c| of each edge (length minus reference), and shape error of all pairs.",
-    "clearance": "Distances between surfaces, with the limits.",
-    "formations": "Formations with their edges and body axes.",
-    "disturbance": "Aerodynamic force on each vehicle, and distance of each vehicle from its slot.",
-    "rotors": "Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit.",
-    "operation": "Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.",
-    "motion": "Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits.",
-    "vehicles": "Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give.",
-}  # fmt: skip
-
 
 def _figures(result: Result) -> list[dict[str, str]]:
     """All figures except the summary, which has its own page."""
@@ -395,7 +377,7 @@ def _figures(result: Result) -> list[dict[str, str]]:
 def _figure(result: Result, name: str) -> dict[str, str]:
     svg = plotting.render_figure(result, name, ["svg"])["svg"]
     pairs = name == "constraint_error" and not len(result.edges)
-    return _picture(name, svg, "Shape error of all pairs." if pairs else _CAPTIONS.get(name, ""))
+    return _picture(name, svg, "Shape error of all pairs." if pairs else plotting.caption(name))
 
 
 def _picture(name: str, svg: bytes, caption: str) -> dict[str, str]:

@@ -279,10 +279,9 @@ class Result(Shown):
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
         dims, dtype = _CHECKED[name]
         value = np.ascontiguousarray(array, dtype=dtype)
-        expected = tuple(sizes.get(dim, "any") for dim in dims)
-        if value.ndim != len(expected) or any(
-            sizes.setdefault(dim, n) != n for dim, n in zip(dims, value.shape, strict=True)
-        ):
+        expected = tuple([sizes.get(dim, "any") for dim in dims])
+        known = [sizes.setdefault(*pair) for pair in zip(dims, value.shape, strict=False)]
+        if value.ndim != len(dims) or (*known,) != value.shape:
             raise ValueError(
                 f"{name} ({', '.join(dims)}) has shape {value.shape}, expected {expected}"
             )

@@ -20,6 +20,7 @@ from rigidfleet._common.arguments import numbers
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_multilevel, neighbours
+from rigidfleet.math.products import product_in_blocks
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 from rigidfleet.rigidity.analysis import as_framework, flatten
 from rigidfleet.typing import Floats, Ints
@@ -27,8 +28,8 @@ from rigidfleet.typing import Floats, Ints
 #: Positions of the exchange's barrier, as shares of the smallest eigenvalue, step by step.
 _BARRIERS = (0.0, 0.5, 0.8, 0.95)
 
-#: Work of a search, in multiplications: a few seconds.
-_WORK = 3e9
+#: Work of a search, in multiplications: a second or two.
+_WORK = 2e9
 
 #: Eigenvalues below this count as zero: an edge is missing.
 _SINGULAR = 1e-9
@@ -36,8 +37,9 @@ _SINGULAR = 1e-9
 #: Number of perturbed designs without improvement, in a row, after which the search ends.
 _PATIENCE = 60
 
-#: Number of candidate edges, the most helpful ones, that are tried against all that could be removed.
-_WORTH = 500
+#: Number of candidate edges, the most helpful ones, that are tried against all that could be removed: more take twice
+#: the time, for designs that are as good.
+_WORTH = 100
 
 
 def design(
@@ -54,8 +56,8 @@ def design(
     motions), and w its smallest eigenvalue. Edges are exchanged, the best pair at a time, as long as this lowers the
     barrier potential tr (M - t)^-1, for t = 0 and then closer and closer to w (Batson, Spielman and Srivastava,
     2012). The search starts from all candidates thinned out, from Delaunay's triangulation or from the convex hull,
-    whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8 agents, some
-    seconds for 30 to 100.
+    whichever is best, and again from perturbed designs while its budget lasts: a tenth of a second for 8 agents, one
+    or two seconds for 30 to 100.
 
     Parameters
     ----------
@@ -254,7 +256,8 @@ def _exchange(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
     for barrier in _BARRIERS:
         for _ in range(4 * r):
             work += 0.1 * m * r**2 + 2.0 * r**3 + 5e5
-            swap = _best_swap(rows, chosen, barrier * _least_eigenvalue(rows[chosen]))
+            least = _least_eigenvalue(rows[chosen]) if barrier else 0.0
+            swap = _best_swap(rows, chosen, barrier * least)
             if swap is None or work > _WORK:
                 break
             chosen = np.append(np.delete(chosen, swap[0]), swap[1])
@@ -268,14 +271,14 @@ def _best_swap(rows: Floats, chosen: Ints, t: float) -> tuple[int, int] | None:
     """
     A = rows[chosen]
     r = A.shape[1]
-    other = np.setdiff1d(np.arange(len(rows)), chosen)
+    other = np.delete(np.arange(len(rows)), chosen)
     B = rows[other]
-    G = np.linalg.inv(A.T @ A - t * np.eye(r))
-    AG, BG = A @ G, B @ G
+    G = np.linalg.inv(product_in_blocks(A.T, A) - t * np.eye(r))
+    AG, BG = product_in_blocks(A, G), product_in_blocks(B, G)
     b1, b2 = 1 + (BG * B).sum(axis=1), (BG**2).sum(axis=1)
     top = np.argsort(-b2 / b1, kind="stable")[:_WORTH]
     other, B, BG, b1, b2 = other[top], B[top], BG[top], b1[top], b2[top]
-    cross, cross2 = AG @ B.T, AG @ BG.T  # a G b and a G^2 b
+    cross, cross2 = (product_in_blocks(AG, X.T) for X in (B, BG))  # a G b and a G^2 b
     a1, a2 = (AG * A).sum(axis=1), (AG**2).sum(axis=1)
     gain = b2 / b1
     left = 1 - a1[:, None] + cross**2 / b1

@@ -39,7 +39,7 @@ from rigidfleet.simulation.solver_setup import equip
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.large.solver import Counts  # imports the compiler
+    from rigidfleet.kernel.large.solver import Counts
 
 #: Interval between checks whether a phase has settled, if it ends by settling [s].
 _CHECK = 0.1
@@ -138,9 +138,8 @@ class ActivePhase:
         self.next_loss = self._loss_ahead()  # of a vehicle or a link [s]
         self.asked = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
-        self.counted = np.zeros(
-            3, dtype=np.int64
-        )  # evaluations, steps and rejections before a loss
+        # Evaluations, steps and rejections before a loss.
+        self.counted = np.zeros(3, dtype=np.int64)
         self.solves: list[tuple[str, Counts]] = []  # by method, before a loss
         self.quiet_since = math.inf  # since when the phase has been settled [s]
         self.stop = math.inf  # time at which the caller wants a sample [s]

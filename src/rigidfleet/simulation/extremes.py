@@ -64,12 +64,6 @@ _STORED = [(name, k, 1.0 if QUANTITIES[name].at_least else -1.0) for name, k in 
 _OF_PHASE = np.array(list(_NAMES.values()))
 
 
-def _standing(position: Floats, radius: Floats, obstacles: tuple[Obstacle, ...], t: float) -> Ints:
-    """Whether agents stand on obstacles at a time [s] (N,)."""
-    below = proximity.below(position, radius, obstacles, np.full(len(radius), t), PAD)
-    return np.any(below, axis=0).astype(np.int64)
-
-
 class CurveWatch:
     """Watches curves of vehicles, and reports their worst values in continuous time."""
 
@@ -99,7 +93,10 @@ class CurveWatch:
         self.who, self.sign = np.full((count, 2), -1), np.zeros(1)
         self.left = np.ones(self.n, dtype=np.bool_)
         self.low = np.full((self.n, 3), np.inf)
-        self.standing = _standing(fleet.position, self.radius, tuple(obstacles), t)
+        self.standing = np.zeros(self.n, dtype=np.int64)
+        if obstacles:
+            below = proximity.below(fleet.position, self.radius, obstacles, np.full(self.n, t), PAD)
+            self.standing[:] = below.any(axis=0)
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
@@ -162,12 +159,12 @@ class CurveWatch:
                 self._step(problem, work, state, step)
             return
         self.monitor.distances(problem, state, 0, steps)
-        self._find_contacts(problem, work, state, _rows(state, np.arange(steps)))
+        self._find_contacts(problem, work, state, np.arange(steps))
 
     def _find_contacts(
-        self, problem: Problem, work: Workspace, state: records.IntegratorState, rows: Ints
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, some: Ints
     ) -> None:
-        """Find the first contact of each kind in some rows (S,) of the trail, if there has been none before.
+        """Find the first contact of each kind in some steps (S,) of the trail, if there has been none before.
 
         Of steps, and then of one step's halves, the first half is searched, until what is left is very short.
         """
@@ -175,6 +172,7 @@ class CurveWatch:
             if name in self.touched or not self.worst[kind] < -_TOUCH:
                 continue
             deepest = partial(self._deepest, kind, problem, work, state)
+            rows = _rows(state, some)
             steps, points = state.trail.clock[rows], state.trail.points[rows]
             while steps[-1].sum() - steps[0, 0] > _INSTANT:
                 if len(steps) == 1:
@@ -208,9 +206,7 @@ class CurveWatch:
     ) -> None:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is not None:
-            from rigidfleet.kernel.engine.solids import watch_solids  # loads the compiler
-
-            watch_solids(self.monitor, problem, state, first, end, self.solids)
+            self.monitor.clearances(problem, state, first, end, self.solids)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
@@ -267,7 +263,9 @@ class CurveWatch:
         self.moved[:] = np.inf
         if self.n <= _FEW:
             pairs = proximity.all_pairs(self.n).T
-            self.pairs = self.columns = np.ascontiguousarray(pairs[self.left[pairs].all(axis=1)])
+            self.pairs = self.columns = np.ascontiguousarray(
+                pairs if self.left.all() else pairs[self.left[pairs].all(axis=1)]
+            )
 
     def _step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
@@ -435,17 +433,16 @@ class Extremes(CurveWatch):
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         count, steps = self.monitor.monitor.count, int(state.count[records.TRAILED])
-        new: Ints = np.arange(int(count[records.STAYED]), steps)
-        listed = int(count[records.LISTED_DISTANCES])
-        rows = _rows(state, new if listed < 0 else self.monitor.monitor.listed[0, :listed])
-        self._take_solids(problem, state, steps - len(new), steps)
+        first, listed = int(count[records.STAYED]), int(count[records.LISTED_DISTANCES])
+        self._take_solids(problem, state, first, steps)
         if self.n > _FEW:
-            for step in new:
+            for step in range(first, steps):
                 self._step(problem, work, state, step)
         else:
-            self.monitor.distances(problem, state, steps - len(new), steps)
+            self.monitor.distances(problem, state, first, steps)
+        some = np.arange(first, steps) if listed < 0 else self.monitor.monitor.listed[0, :listed]
+        self._find_contacts(problem, work, state, some)
         self.monitor.forces(problem, work, state, last=last)
-        self._find_contacts(problem, work, state, rows)
 
     def room(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
@@ -520,7 +517,7 @@ class Extremes(CurveWatch):
 
     def _of_avoidance(self) -> dict[str, Extremum]:
         """What avoidance in flight has recorded of the phase so far, by name."""
-        arrays, extremes = self.avoidance, dict[str, Extremum]()
+        arrays, extremes = self.avoidance, {}
         if arrays is None:
             return extremes
         ticks = max(int(arrays.count[avoidance.TICKS]), 1)
@@ -550,7 +547,9 @@ class Extremes(CurveWatch):
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
-        return super().so_far() | self.of_vehicles | self._of_avoidance() | self.led
+        extremes = super().so_far()
+        extremes.update(self.of_vehicles, **self._of_avoidance(), **self.led)
+        return extremes
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""

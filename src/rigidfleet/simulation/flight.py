@@ -22,7 +22,7 @@ from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.losses import after_loss
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import PhaseState, Pose, copy_with
+from rigidfleet.planning.reference import PhaseState, Pose
 from rigidfleet.planning.timing import timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
@@ -45,7 +45,7 @@ from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.large.solver import Counts  # imports the compiler
+    from rigidfleet.kernel.large.solver import Counts
 
 __all__ = [
     "AttitudeCommand", "Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "RotorCommand",
@@ -228,8 +228,7 @@ class Flight:
         asked_for = None if times is None else times_asked(times, mission.latest_end)
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
-        r, v = mission.fleet.position.copy(), mission.fleet.velocity.copy()
-        self._begins = self._reached = copy_with(at_start(mission), r=r, v=v)
+        self._begins = self._reached = at_start(mission)
         self._vehicles = (
             FleetState(mission, self._push.max_step) if mission.vehicle_models else None
         )

@@ -212,7 +212,7 @@ class Leader:
         for o in seen:
             x, bound = a.sight.track[o], a.sight.bound[o]
             away = r - (x[:3] + ahead[:, None] * x[3:])[:, None]
-            room = signed_distance(*own_axes(*np.moveaxis(away, -1, 0), o, a.solids), o, a.solids)
+            room = signed_distance(*own_axes(*away.transpose(2, 0, 1), o, a.solids), o, a.solids)
             room = room - (a.reach + a.spare) - (bound[0] + bound[1] / 3.0 * ahead)[:, None]
             if (worst := float(room.min())) < least:
                 least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
@@ -265,14 +265,15 @@ class Leader:
         dt[2:-1:2] += _BESIDE
         progress, s, slope, _ = self.clock.ahead(dt)
         tau, rates = t - self.clock.delay + progress, np.stack([s, slope])
-        cm, axes = body_series(motion, tau)
+        cm, axes = body_series(motion, tau, 3)
+        axes = np.broadcast_to(axes, (3, 3, 3, len(tau)))  # also of a body that does not turn
         still = np.zeros_like(axes)
         still[0] = np.eye(3)[..., None]
         p = time_derivatives(
-            series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)[:3]), rates
+            series.derivatives(slot_series(reference, (np.zeros_like(cm), still), tau)), rates
         )
-        x = time_derivatives(series.derivatives(cm[:3]), rates)
-        B = series.from_derivatives(time_derivatives(series.derivatives(axes[:3]), rates))
+        x = time_derivatives(series.derivatives(cm), rates)
+        B = series.from_derivatives(time_derivatives(series.derivatives(axes), rates))
         ends = [self.deviation.at(each, accelerations, h) for each in dt]
         moves, turns, grows = (
             np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True)
@@ -356,12 +357,12 @@ class Leader:
     def _slots(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""
         tau = np.array([t - self.clock.delay])
-        cm, axes = body_series(self.problem.motion, tau)
+        cm, axes = body_series(self.problem.motion, tau, 3)
         slots = slot_series(self.problem.reference, (cm, axes), tau)
         rates = np.array(self.clock.rate[:2])[:, None]
-        c = time_derivatives(series.derivatives(cm[:3]), rates)[..., 0]
+        c = time_derivatives(series.derivatives(cm), rates)[..., 0]
         arm = (
-            time_derivatives(series.derivatives(slots[:3]), rates)[..., 0].transpose(0, 2, 1)
+            time_derivatives(series.derivatives(slots), rates)[..., 0].transpose(0, 2, 1)
             - c[:, None]
         )
         Q = series.derivatives(self.deviation.series()[1])

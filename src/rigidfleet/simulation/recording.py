@@ -15,6 +15,7 @@ from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.records import Record, recorder
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
+from rigidfleet.math.constraint_jacobian import smallest_singular_value
 from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
 from rigidfleet.simulation.solver_setup import (
@@ -553,13 +554,13 @@ def _singular(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
         return [np.full(len(r), np.nan)]
     count = max(_LEAST, _WORK // size**3)
     if count >= len(r):
-        return [native.least_singular_values(r, edges)]
+        return [smallest_singular_value(r, edges)]
     least = []
     for part in np.split(r, within):
         if count >= len(part):
-            least.append(native.least_singular_values(part, edges))
+            least.append(smallest_singular_value(part, edges))
             continue
         some = np.unique(np.linspace(0, len(part) - 1, count).round().astype(np.int64))
-        values = native.least_singular_values(part[some], edges)
+        values = smallest_singular_value(part[some], edges)
         least.append(np.interp(np.arange(len(part)), some, values))
     return least

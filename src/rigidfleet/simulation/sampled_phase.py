@@ -217,8 +217,10 @@ class SampledPhase(Stepper):
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
-            within = (abs(phase.state.trail.points[:rows]) < _FAR).all(axis=(1, 2))
-            phase.state.count[records.TRAILED] = rows if within.all() else int(within.argmin())
+            points = phase.state.trail.points[:rows]
+            if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
+                rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
+            phase.state.count[records.TRAILED] = rows
             phase.extremes.take_path(self.flown, phase.workspace, phase.state)
             self.sampled.count[fleet.TRAILED] = phase.state.count[records.TRAILED] = 0
             self.unjudged = True
@@ -281,17 +283,19 @@ class SampledPhase(Stepper):
         planned, source = self.phase.plan.problem, self.vehicles.tables
         if planned is self.tabled and tables.first <= tick < tables.last:
             return
+        before = None
         if planned is not self.tabled and source.compensated:
-            moved = source.start_path(planned, tick)
-            s = self.sampled
-            for known in (s.seen, s.history):
-                np.add(known, moved, out=known)
+            before = source.start_path(planned, tick, tables)
         # A piece of a reference that is led holds until the next stop
         until = self.phase.plan.t_end
         if self.led:
             until = min(until, self.led_until if not self.steered else self.phase.stop)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn)
+        if before is not None:  # states that were measured about another path
+            s, moved = self.sampled, before - made.path[0]
+            for known in (s.seen, s.history):
+                np.add(known, moved, out=known)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
     def _follow(self) -> None:

@@ -32,16 +32,20 @@ class Sampling:
         step = self.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.minimum(np.arange(low, high) * step, t_end)
-        lost = plan.lost_at
-        losses = (*lost[np.isfinite(lost)], *plan.links_lost[1])
+        losses = (*plan.lost_at.tolist(), *plan.links_lost[1].tolist()) if plan.loses else ()
         passed = (at["time"] for at in plan.through)
         for exact in dict.fromkeys((plan.arrival, plan.t_end, stop, *passed, *losses)):
             if t < exact <= t_end:
-                grid = np.sort(np.append(grid[abs(grid - exact) > 1e-9 * step], exact))
+                near = 1e-9 * step
+                before, after = (
+                    grid.searchsorted(exact - near),
+                    grid.searchsorted(exact + near, "right"),
+                )
+                grid = np.concatenate([grid[:before], (exact,), grid[after:]])
         if not first:
             return grid
-        start = t if t == 0.0 else np.nextafter(t, math.inf)
-        return np.append(start, grid[grid > start])
+        start = t if t == 0.0 else math.nextafter(t, math.inf)
+        return np.concatenate([(start,), grid[grid.searchsorted(start, "right") :]])
 
 
 def times_asked(times: ArrayLike, end: float) -> Floats:

@@ -16,7 +16,6 @@ from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
-    # Imports the compiler, which only large formations need.
     from rigidfleet.kernel.large.solver import LargeSolver, Setup
 
 
@@ -29,14 +28,14 @@ def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
     if not plan.large:
         return small_workspace(plan.problem), None
-    from rigidfleet.kernel.large import elimination
+    from rigidfleet.kernel.large import ordering
     from rigidfleet.kernel.large.solver import Setup
 
     points, edges = plan.before.r if plan.slots is None else plan.slots, plan.edges
     order = None
     if plan.method == "elimination":
         steps = solvers.elimination_steps(len(points), edges)
-        order = None if steps is None else elimination.order(steps, plan.problem.graph.edges)
+        order = None if steps is None else ordering.order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     solver = large_solver(
         plan.problem, Setup(order, solvers.Dissection(points, edges), *plan.residual(), axes)

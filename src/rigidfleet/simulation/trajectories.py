@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.errors import ResultError
+from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
 from rigidfleet.math import series
@@ -301,26 +302,27 @@ def of_curve(
     return _result(mission, record, at, state, yaws, facts)
 
 
-def of_curves(
-    curves: Sequence[Piecewise], interpolation: str, *, away: bool = False, **judged: Any
-) -> Result:
-    """A result of curves with times of their own; before and after its own, a vehicle stays where it is.
+def of_curves(read: Trajectories, **judged: Any) -> Result:
+    """A result of trajectories that were read; before and after its own times, a vehicle stays or is not judged.
 
     Parameters
     ----------
-    interpolation, judged : see `of_curve`
-    away : a vehicle is not judged before and after its own times
+    judged : see `judged_as`
 
     Raises
     ------
     ResultError, MissionError
         As for `of_curve`.
     """
-    knots = common_knots(curves)
+    curves, knots = read.curves, common_knots(read.curves)
     _refuse_too_many(len(curves), len(knots))
     ends = knots[np.searchsorted(knots, [curve.time[[0, -1]] - 2.0 * SAME for curve in curves])]
-    spans = ends.tolist() if away and np.ptp(ends, axis=0).any() else ()
-    return of_curve(join(curves), interpolation, spans=spans, **judged)
+    spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else ()
+    result = of_curve(
+        join(curves), read.assumed, names=read.names, spans=spans, since=read.since, **judged
+    )
+    result.statistics |= {"notes": list(read.notes), "read": list(read.read)}
+    return result
 
 
 def _refuse_too_many(n: int, times: int) -> None:

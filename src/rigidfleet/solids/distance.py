@@ -10,14 +10,13 @@ Points are in the solid's own axes, unless a docstring says otherwise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.solids.records import CYLINDER, HEIGHTS, ROUNDED
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Floats
 
 #: A number [m], or an array of them.
 Numbers = Any
@@ -362,23 +361,6 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
         on = (low <= top) & (z >= low) & ((z >= top - _DEEP) | (s.kind[b] == HEIGHTS))
         height = choose(on, np.maximum(height, top), height)
     return height
-
-
-# -- many boxes ----------------------------------------------------------------------------------------
-
-#: Least distances to boxes, and these boxes (N, K), of agents (K, N, 3) with radii (N,), to boxes (B, 6).
-Nearest = Callable[[Floats, Floats, Floats], tuple[Floats, Ints]]
-_compiled: list[Nearest] = []
-
-
-def use(nearest: Nearest) -> None:
-    """Find the nearest boxes by a compiled pass from now on: that of the kernel, once it is loaded."""
-    _compiled[:] = [nearest]
-
-
-def nearest_boxes() -> Nearest | None:
-    """The compiled pass, which finds the same bits as `from_box`; None if there is none yet."""
-    return _compiled[0] if _compiled else None
 
 
 #: The functions that the kernel compiles, each after those that it calls.

@@ -202,16 +202,6 @@ def join(parts: Sequence[Solids]) -> Solids:
     )
 
 
-def boxes_of(parts: Sequence[Solids]) -> Floats | None:
-    """Corners (B, 6) [m] of B records of one solid each; None unless all are boxes, at rest and not turned."""
-    for s in parts:
-        if s.kind.item(0) != ROUNDED or s.rounding.item(0) or s.turned.item(0) or s.moves:
-            return None
-        if s.there.tolist() != [[*ALWAYS]]:
-            return None
-    return np.concatenate([s.size for s in parts]) if parts else None
-
-
 def corners(low: ArrayLike, high: ArrayLike) -> Floats:
     """Corners (8, 3) of a box from ``low`` to ``high`` (3,): those with the lowest x first, and so on."""
     return np.array(list(product(*np.transpose([low, high]))))

@@ -11,6 +11,7 @@ from rigidfleet.sweep.dataset import load
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.runner import SweepProgress, fly
+from rigidfleet.sweep.shards import merge
 from rigidfleet.sweep.store import Table, read
 
-__all__ = ["METRICS", "Sweep", "SweepProgress", "Table", "fly", "load", "read"]
+__all__ = ["METRICS", "Sweep", "SweepProgress", "Table", "fly", "load", "merge", "read"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from os.path import commonprefix
@@ -286,8 +287,13 @@ class Sweep:
 
         ``values`` are those of the run, if they are known.
         """
+        return self._document_of(self.mission, run, values)
+
+    def _document_of(
+        self, mission: Mission, run: int, values: Sequence[Any] | None = None
+    ) -> dict[str, Any]:
         varied = {column.keys for column in self.columns}
-        document = self.mission.to_dict()
+        document = mission.to_dict()
         for column, value in zip(self.columns, values or self.values(run), strict=True):
             apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
@@ -307,7 +313,26 @@ class Sweep:
         MissionError
             It has errors.
         """
+        if self._mission_with_ways is not self.mission:
+            with suppress(MissionError):  # errors are told of the mission as written
+                return Mission.from_plain(
+                    self._document_of(self._mission_with_ways, run, values), f"run {run}"
+                )
         return Mission.from_plain(self.varied(run, values), f"run {run}")
+
+    @cached_property
+    def _mission_with_ways(self) -> Mission:
+        """The mission with phases for its transitions and ways if nothing that varies matters to them, else as written.
+
+        Then they are searched once for all runs. The start is such a key, too.
+        """
+        from rigidfleet.planning.timing import expand_mission, matters_to_plan
+
+        if any(matters_to_plan(self.mission, column.keys) for column in self.columns):
+            return self.mission
+        with suppress(MissionError):  # without a way, each run says so
+            return expand_mission(self.mission)
+        return self.mission
 
     def _data(self) -> dict[str, Any]:
         return {

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rigidfleet.errors import MissionError
+from rigidfleet.kernel.compiler import levels
 
 #: Reasons other than failed checks, of runs without a verdict: the varied mission has errors; the program failed; the
 #: user's controller failed.
@@ -25,6 +26,7 @@ class RunRecord:
     codes : value of every column of the sweep, encoded by `Variation.code`
     metrics : value of each of `METRICS`; NaN if it does not apply
     wall : wall time of the run [s]
+    level : level of the machine code that flew it; between levels the last bits of a row differ
     """
 
     run: int
@@ -34,6 +36,7 @@ class RunRecord:
     codes: tuple[float, ...]
     metrics: dict[str, float]
     wall: float
+    level: str = field(default_factory=levels.level)
 
 
 def refusal(error: MissionError) -> tuple[str, str]:

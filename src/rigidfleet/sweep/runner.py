@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from rigidfleet._common.processes import cores
-from rigidfleet.errors import RigidfleetError
+from rigidfleet.errors import RigidfleetError, wrong_type
 from rigidfleet.sweep import workers as pools
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.record import RunRecord
 from rigidfleet.sweep.run import GROUP, fly_runs
+from rigidfleet.sweep.shards import own_runs, shard_folder
 from rigidfleet.sweep.store import Store, Table, read
+from rigidfleet.typing import Bools
 
 #: Approximate duration of a chunk [s]: the work that kill -9 loses per worker, and the interval of progress.
 _CHUNK = 1.0
@@ -30,6 +34,12 @@ _AHEAD = 2
 _LOOK = 1.0
 #: Number of deaths of workers, without a finished chunk in between, after which the sweep stops.
 _DEATHS = 3
+#: Maximum time without any worker of a cluster [s]: they may wait in a queue for their machines.
+_ALONE = 300.0
+
+#: Says what progress says, and warns of what was lost; silent unless the program that uses the library listens.
+_log = logging.getLogger("rigidfleet.sweep")
+_log.addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True)
@@ -39,7 +49,7 @@ class SweepProgress:
     Attributes
     ----------
     done : number of runs in the store
-    runs : number of runs of the sweep
+    runs : number of runs of the sweep, or of its shard
     flown : number of runs flown since the sweep was started or resumed
     failed : number of these that failed
     wall : time since then [s]
@@ -54,15 +64,19 @@ class SweepProgress:
     workers: int
 
 
+_Listener = Callable[[SweepProgress], None] | None
+
+
 def fly(
     sweep: Sweep,
     folder: str | Path,
     *,
     workers: int | None = None,
     cluster: str | None = None,
+    shard: str = "",
     replace: bool = False,
-    progress: Callable[[SweepProgress], None] | None = None,
-    pool: Callable[[], pools.Pool] | None = None,
+    progress: _Listener = None,
+    pool: Executor | None = None,
 ) -> Table:
     """Fly the runs of a sweep that are missing in a folder, and return all of its rows.
 
@@ -72,61 +86,67 @@ def fly(
     workers : number of processes on this machine; default: number of cores. Work of a few seconds is done in this
         process. A script that starts processes needs `if __name__ == "__main__":`
     cluster : address of a Dask scheduler, whose workers fly the runs
+    shard : "3/40": fly only the third of forty parts, into a store of its own in the folder; `merge` makes one store
     replace : overwrite a sweep that is in the folder
     progress : called after each chunk, and each second at least
-    pool : instead of workers: returns processes that are kept for several sweeps, called if there is anything to fly
+    pool : an executor of `concurrent.futures` whose workers, as many as ``workers`` says, fly the runs; it stays open
 
     Raises
     ------
     ResultError
         The folder contains another sweep or cannot be written.
     RigidfleetError
-        The cluster does not answer, workers keep dying, or the controller cannot be imported.
+        The cluster does not answer or ends, workers keep dying, the controller cannot be imported, or there is no such
+        shard. Finished runs are in the store, and the same call resumes the sweep.
     KeyboardInterrupt
         On Ctrl-C. Finished runs are in the store, and the same call resumes the sweep.
     """
-    folder = Path(folder)
-    with Store(folder, sweep, replace=replace) as store:
-        flight = _Sweeping(sweep, store, progress)
+    if not isinstance(pool, Executor | None):
+        raise wrong_type("an Executor of concurrent.futures as pool", pool)
+    own, folder = own_runs(shard, sweep.runs), shard_folder(Path(folder), shard)
+    count = cores() if workers is None else workers
+    with Store(folder, sweep, shard, replace) as store:
+        flight = _Sweeping(sweep, store, progress, own)
         if cluster is not None:
-            with pools.cluster(cluster) as there:
-                flight.hand_out(there)
+            with pools.cluster(cluster) as (executor, capacity):
+                flight.hand_out(executor, capacity)
         elif pool is not None:
-            if flight.missing:
-                flight.hand_out(pool())
+            flight.hand_out(pool, lambda: count)
         else:
-            count = cores() if workers is None else workers
             flight.alone(until_worth=count > 1)
             deaths = 0
             while flight.missing:
                 before = flight.flown
                 flight.report(count)
                 try:
-                    with pools.processes(count) as there:
-                        flight.hand_out(there)
-                except BrokenExecutor as error:
+                    with pools.processes(count) as executor:
+                        flight.hand_out(executor, lambda: count)
+                except RigidfleetError as error:
+                    if not isinstance(error.__cause__, BrokenExecutor):
+                        raise
                     deaths = 1 if flight.flown > before else deaths + 1
                     if deaths >= _DEATHS:
                         raise RigidfleetError(
                             "the workers keep dying. Finished runs are saved. If memory is short, use fewer --workers;"
                             " in a script, check for a missing `if __name__ == '__main__':`."
                         ) from error
+        _log.info(f"{flight.words()}; done")
     return read(folder)
 
 
 class _Sweeping:
     """State of a sweep that is running."""
 
-    def __init__(
-        self, sweep: Sweep, store: Store, progress: Callable[[SweepProgress], None] | None
-    ) -> None:
+    def __init__(self, sweep: Sweep, store: Store, progress: _Listener, own: Bools) -> None:
         self.sweep, self.store, self.progress = sweep, store, progress
         self.finished_runs = store.finished_runs()
+        self.runs = int(own.sum())
         # A group is flown as a whole, so that its records do not depend on when the sweep was stopped.
-        self.missing = deque(np.unique(np.flatnonzero(~self.finished_runs) // GROUP).tolist())
-        self.flown, self.failed = 0, 0
-        self.begun = perf_counter()
+        self.missing = deque(np.unique(np.flatnonzero(own & ~self.finished_runs) // GROUP).tolist())
+        self.flown, self.failed, self.workers = 0, 0, 1
+        self.begun = self.changed = perf_counter()
         self.pace = 0.0  # [s] a run
+        _log.info(f"{self.words()}; begun")
         self.report(1)
 
     def alone(self, *, until_worth: bool) -> None:
@@ -137,23 +157,42 @@ class _Sweeping:
             self.keep(fly_runs(self.sweep, self.take(1)))
             self.report(1)
 
-    def hand_out(self, pool: pools.Pool) -> None:
-        """Fly all missing runs by a pool of workers. Runs that do not come back are missing again."""
-        executor, capacity = pool
+    def hand_out(self, executor: Executor, capacity: Callable[[], int]) -> None:
+        """Fly all missing runs by an executor with a number of workers. Runs that do not come back are missing again.
+
+        Raises
+        ------
+        RigidfleetError
+            The executor failed, by the error that is the cause.
+        """
+
+        def outcome(call: Callable[..., Any], *arguments: Any) -> Any:
+            try:
+                return call(*arguments)
+            except RigidfleetError:
+                raise
+            except Exception as error:
+                raise self.failure(pools.why_failed(error)) from error
+
         flying: dict[Future[list[RunRecord]], list[int]] = {}
+        taken: list[int] = []
         sweep = self.sweep.json(), self.sweep.version
         try:
             while self.missing or flying:
-                workers = capacity()
-                while self.missing and len(flying) < _AHEAD * workers:
-                    runs = self.take(workers)
-                    flying[executor.submit(pools.fly_chunk, *sweep, runs)] = runs
+                workers = outcome(capacity)
+                while self.missing and len(flying) < _AHEAD * max(1, workers):
+                    taken = self.take(max(1, workers))
+                    flying[outcome(executor.submit, pools.fly_chunk, *sweep, taken)] = taken
+                    taken = []
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
-                    self.keep(future.result())
+                    self.keep(outcome(future.result))
                     del flying[future]
                 self.report(workers)
         finally:
-            lost = {run // GROUP for runs in flying.values() for run in runs}
+            for future, runs in flying.items():
+                future.cancel()
+                _log.warning(f"{self.words()}; lost in flight: {len(runs)}, from {runs[0]} on")
+            lost = {run // GROUP for runs in (*flying.values(), taken) for run in runs}
             self.missing.extendleft(sorted(lost, reverse=True))
 
     def take(self, workers: int) -> list[int]:
@@ -171,10 +210,25 @@ class _Sweeping:
         self.flown += len(rows)
         self.failed += sum(not row.passed for row in rows)
         self.pace = max(median(row.wall for row in rows), 1e-9)
+        _log.info(f"{self.words()}, {self.failed} of {self.flown} flown failed")
+
+    def failure(self, why: str) -> RigidfleetError:
+        """An error by which the sweep ends before all runs are flown."""
+        return RigidfleetError(f"{why} {self.words()} are saved; the same command goes on.")
+
+    def words(self) -> str:
+        """Runs that are saved, and where."""
+        return f"{self.store.path.parent}: {self.finished_runs.sum()} of {self.runs} runs"
 
     def report(self, workers: int) -> None:
         """Tell the progress."""
+        if workers != self.workers:
+            level = logging.WARNING if workers < self.workers else logging.INFO
+            _log.log(level, f"{self.words()}; workers: {workers}, before {self.workers}")
+            self.workers, self.changed = workers, perf_counter()
+        if not workers and perf_counter() - self.changed > _ALONE:
+            raise self.failure(f"no worker came for {_ALONE:g} s. Start some by `dask worker`.")
         if self.progress is not None:
             done, wall = int(self.finished_runs.sum()), perf_counter() - self.begun
-            now = SweepProgress(done, self.sweep.runs, self.flown, self.failed, wall, workers)
+            now = SweepProgress(done, self.runs, self.flown, self.failed, wall, workers)
             self.progress(now)

@@ -11,11 +11,13 @@ import json
 import math
 import shutil
 import sqlite3
+from collections import Counter
 from collections.abc import Generator, Iterable
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +36,10 @@ _LOCK = "sweep.lock"
 _FORMAT = 3
 #: Space on a disk that SQLite needs to work, and reports as errors of all kinds if it has less [bytes].
 _ROOM = 1 << 20
-_COLUMNS = ("passed", "reason", "detail", "wall", "codes", *METRICS)
-_KINDS = {"passed": "INTEGER", "reason": "TEXT", "detail": "TEXT", "codes": "BLOB"}
+_COLUMNS = ("run", "passed", "reason", "detail", "wall", "level", "codes", *METRICS)
+_KINDS = {"passed": "INTEGER", "reason": "TEXT", "detail": "TEXT", "level": "TEXT", "codes": "BLOB"}
+#: Of a row in the order of the columns: what depends on the sweep alone, not on who flew it.
+outcome_of = itemgetter(*(k for k, x in enumerate(_COLUMNS) if x not in ("wall", "level")))
 #: Little-endian, so that the file can be read on every machine.
 _CODES = np.dtype("<f8")
 
@@ -53,6 +57,7 @@ class Table:
     codes : value of each column (n, D), encoded by `Variation.code`
     metrics : values (n,) of each metric; NaN if it does not apply
     wall : wall time of each run (n,) [s]
+    levels : number of runs by the level of machine code that flew them, if it is known
     """
 
     sweep: Sweep
@@ -63,6 +68,7 @@ class Table:
     codes: Floats
     metrics: dict[str, Floats]
     wall: Floats
+    levels: dict[str, int] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -71,22 +77,22 @@ class Table:
 
 
 class Store:
-    """Store of one sweep, open for writing; a context manager.
+    """Store of one sweep, or of one ``shard`` of it unless that is "", open for writing; a context manager.
 
     Raises
     ------
     ResultError
-        The folder contains another sweep or a damaged file, or it cannot be written.
+        The folder contains another sweep or shard or a damaged file, or it cannot be written.
     """
 
-    def __init__(self, folder: Path, sweep: Sweep, *, replace: bool = False) -> None:
-        self.path = folder / FILE
+    def __init__(self, folder: Path, sweep: Sweep, shard: str, replace: bool) -> None:
+        self.path, self.shard = folder / FILE, shard
         with _as_result_errors(self.path), ExitStack() as opened:
             folder.mkdir(parents=True, exist_ok=True)
             lock = sqlite3.connect(folder / _LOCK, timeout=0.0, isolation_level=None)
             opened.enter_context(closing(lock)).execute("BEGIN EXCLUSIVE")
             if replace:
-                for end in ("-wal", "-shm", ""):
+                for end in ("-wal", "-shm", "-journal", ""):
                     self.path.with_name(FILE + end).unlink(missing_ok=True)
             self.db = sqlite3.connect(self.path, isolation_level=None)
             opened.enter_context(closing(self.db))
@@ -101,19 +107,21 @@ class Store:
 
     def add(self, rows: Iterable[RunRecord]) -> None:
         """Store records, all of them or none. A record replaces an earlier one of the same run."""
-        entries = [
+        self.insert(
             (
-                row.run, int(row.passed), row.reason, row.detail, row.wall,
+                row.run, int(row.passed), row.reason, row.detail, row.wall, row.level,
                 np.array(row.codes, dtype=_CODES).tobytes(),
                 *(None if math.isnan(x) else x for x in (row.metrics[name] for name in METRICS)),
             )
             for row in rows
-        ]  # fmt: skip
-        columns = ("run", *_COLUMNS)
-        names, marks = ", ".join(f'"{name}"' for name in columns), ", ".join("?" * len(columns))
+        )  # fmt: skip
+
+    def insert(self, rows: Iterable[tuple[Any, ...]]) -> None:
+        """Store rows as `contents` returns them, all of them or none."""
+        names, marks = ", ".join(f'"{name}"' for name in _COLUMNS), ", ".join("?" * len(_COLUMNS))
         with _as_result_errors(self.path), self.db:
             self.db.execute("BEGIN IMMEDIATE")
-            self.db.executemany(f"INSERT OR REPLACE INTO runs ({names}) VALUES ({marks})", entries)
+            self.db.executemany(f"INSERT OR REPLACE INTO runs ({names}) VALUES ({marks})", rows)
 
     def finished_runs(self) -> Bools:
         """Mask (runs,) of the finished runs."""
@@ -125,7 +133,8 @@ class Store:
 
     def _open(self, sweep: Sweep) -> None:
         self.runs = sweep.runs
-        self.db.execute("PRAGMA journal_mode = WAL")
+        # A log needs memory that processes share, which a network's disk has not; shards often lie on one.
+        self.db.execute(f"PRAGMA journal_mode = {'DELETE' if self.shard else 'WAL'}")
         self.db.execute("PRAGMA synchronous = NORMAL")
         identity = json.dumps(sweep.identity, ensure_ascii=False, sort_keys=True)
         with self.db:
@@ -138,13 +147,22 @@ class Store:
                 self.db.execute(f'ALTER TABLE runs ADD "{name}" {_KINDS.get(name, "REAL")}')
             there = dict(self.db.execute("SELECT key, value FROM sweep"))
             if there and there.get("identity") != identity:
-                raise ResultError(f"{self.path.parent}: {_difference(there, identity)}")
+                other = differences(json.loads(there.get("identity", "{}")), json.loads(identity))
+                raise ResultError(
+                    f"{self.path.parent}: contains another sweep; it differs in: {other}. Use --force to overwrite, or"
+                    " --out to choose another folder."
+                )
+            if there and (shard := there.get("shard", "")) != self.shard:
+                raise ResultError(
+                    f"{self.path.parent}: contains {shard or 'all'} of this sweep, not {self.shard or 'all'}. Go on by"
+                    f" `rigidfleet sweep {self.path.parents[2]} --shard {shard or '1/1'}`, or use --force to overwrite."
+                )
             if there and (n := json.loads(there["sweep"])["runs"]) > sweep.runs:
                 raise ResultError(
                     f"{self.path.parent}: has this sweep with {n} runs, more than {sweep.runs}. Use --runs {n} or more,"
                     " --force to overwrite, or --out to choose another folder."
                 )
-            entries = {"identity": identity, "sweep": sweep.json()}
+            entries = {"identity": identity, "sweep": sweep.json(), "shard": self.shard}
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
 
 
@@ -179,14 +197,9 @@ def read(folder: str | Path) -> Table:
     ResultError
         The folder does not contain a sweep.
     """
-    folder = Path(folder)
-    sweep = read_sweep(folder)
-    with _open_to_read(folder) as db:
-        known = _column_names(db)
-        names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
-        rows = db.execute(f"SELECT run, {names} FROM runs ORDER BY run").fetchall()
-    run, passed, reason, detail, wall, codes, *metrics = list(zip(*rows, strict=True)) or [
-        () for _ in ("run", *_COLUMNS)
+    sweep, _, rows = contents(Path(folder))
+    run, passed, reason, detail, wall, level, codes, *metrics = list(zip(*rows, strict=True)) or [
+        () for _ in _COLUMNS
     ]
     return Table(
         sweep,
@@ -197,7 +210,27 @@ def read(folder: str | Path) -> Table:
         np.frombuffer(b"".join(codes), dtype=_CODES).reshape(len(run), len(sweep.columns)),
         {name: np.array(x, dtype=np.float64) for name, x in zip(METRICS, metrics, strict=True)},
         np.array(wall, dtype=np.float64),
+        dict(Counter(filter(None, level))),
     )
+
+
+def contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:
+    """Sweep of a folder, what all shards of one sweep have in common, and the rows, in the order of the columns.
+
+    Raises
+    ------
+    ResultError
+        The folder does not contain a sweep.
+    """
+    with _open_to_read(folder) as db:
+        entries = dict(db.execute("SELECT key, value FROM sweep"))
+        sweep = Sweep.from_json(entries["sweep"])
+        shards = int(entries.get("shard", "").partition("/")[2] or 1)
+        common = {"number of runs": sweep.runs, "number of shards": shards}
+        known = _column_names(db)
+        names = ", ".join(f'"{name}"' if name in known else "NULL" for name in _COLUMNS)
+        rows = db.execute(f"SELECT {names} FROM runs ORDER BY run").fetchall()
+        return sweep, json.loads(entries["identity"]) | common, rows
 
 
 @contextmanager
@@ -251,17 +284,12 @@ def _as_result_errors(path: Path) -> Generator[None]:
         raise unwritable(path.parent, error) from error
 
 
-def _difference(there: dict[str, str], identity: str) -> str:
-    """Message about the differences between a stored sweep and another definition."""
-    old, new = json.loads(there["identity"]), json.loads(identity)
+def differences(old: dict[str, Any], new: dict[str, Any]) -> str:
+    """Names of what differs between two sweeps, as `Sweep.identity` and `contents` have it."""
     names = {
         "vary": "variations",
         "evaluate": "what is evaluated",
         "code": "file of the controller",
     }
     keys = [key for key in {**new, **old} if old.get(key) != new.get(key)]
-    other = [names.get(key, key.replace("_", " ")) for key in keys]
-    return (
-        f"contains another sweep; it differs in: {', '.join(other)}. Use --force to overwrite, or --out to choose"
-        " another folder."
-    )
+    return ", ".join(names.get(key, key.replace("_", " ")) for key in keys)

@@ -89,6 +89,7 @@ class Summary(Shown):
     by_value : success rate for each value of a variation that is not numeric
     random_numbers : "shared": all runs have the same ones; "own": each run has its own; "varied": their seeds vary;
         "none": no random numbers act
+    levels : number of runs by the level of machine code that flew them, if it is known
     """
 
     name: str
@@ -102,6 +103,7 @@ class Summary(Shown):
     drivers: list[Driver]
     by_value: dict[str, dict[str, Rate]]
     random_numbers: str
+    levels: dict[str, int]
 
     def to_dict(self) -> dict[str, Any]:
         """The summary as plain data."""
@@ -130,6 +132,9 @@ class Summary(Shown):
             words = {"shared": "the same in all runs", "own": "of each run its own"}
             numbers = words.get(self.random_numbers, "by varied seeds")
             parts.append(Line(f"Random numbers: {numbers}."))
+        if len(self.levels) > 1:
+            levels = ", ".join(f"{count} by {level}" for level, count in self.levels.items())
+            parts.append(Line(f"Levels of machine code, whose last bits differ: {levels}.", "note"))
         for name, rates in self.by_value.items():
             rows = [Row((word, f"{100 * r.rate:.3g} %", r.interval)) for word, r in rates.items()]
             parts.append(FactTable((name, "passed", "95 % interval"), rows))
@@ -199,6 +204,7 @@ def summarise(table: store.Table) -> Summary:
         drivers(table),
         by_value,
         numbers if sweep.random else "none",
+        table.levels,
     )
 
 

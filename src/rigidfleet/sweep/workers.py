@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import gc
+import logging
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext, SpawnProcess
@@ -23,8 +24,6 @@ from rigidfleet.sweep.run import fly_runs
 if TYPE_CHECKING:
     from rigidfleet.kernel.engine.native import Inheritance
 
-#: An executor, and a function that returns how many chunks it can fly at the same time.
-Pool = tuple[Executor, Callable[[], int]]
 #: Maximum time to wait for a scheduler [s].
 _CONNECT = 20.0
 
@@ -47,7 +46,7 @@ def fly_chunk(sweep: str, version: str, runs: Sequence[int]) -> list[RunRecord]:
 
 
 @contextmanager
-def processes(count: int) -> Generator[Pool]:
+def processes(count: int) -> Generator[Executor]:
     """Start persistent processes on this machine. They end with this process, even if it is killed.
 
     They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
@@ -62,7 +61,7 @@ def processes(count: int) -> Generator[Pool]:
     with safe_path():  # for multiprocessing's resource tracker
         pool = ProcessPoolExecutor(count, context, _begin_worker, (own,))
     try:
-        yield pool, lambda: count
+        yield pool
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in set(multiprocessing.active_children()) - before:
@@ -136,8 +135,8 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def cluster(address: str) -> Generator[Pool]:
-    """Use the workers of a Dask cluster. Their number may change.
+def cluster(address: str) -> Generator[tuple[Executor, Callable[[], int]]]:
+    """Use the workers of a Dask cluster: an executor, and a function that returns how many there are at the moment.
 
     Raises
     ------
@@ -158,9 +157,22 @@ def cluster(address: str) -> Generator[Pool]:
             f"--cluster {address}: no scheduler answers ({why}). Start one by `dask scheduler` and give the address"
             " that it prints, for example tcp://HOST:8786."
         ) from None
-    with client:
-        executor = client.get_executor(pure=False)
-        try:
-            yield executor, lambda: max(1, sum(client.nthreads().values()))
-        finally:
-            executor.shutdown(wait=False)
+    executor = client.get_executor(pure=False)
+    try:
+        yield executor, lambda: sum(client.nthreads().values())
+    finally:
+        log = logging.getLogger("distributed.client")
+        before = log.level
+        log.setLevel(logging.CRITICAL + 1)  # as it closes without a scheduler, it logs a traceback
+        executor.shutdown(wait=False)
+        client.close()
+        log.setLevel(before)
+
+
+def why_failed(error: Exception) -> str:
+    """Why work that was handed to an executor did not come back, and what to do."""
+    if isinstance(error, CancelledError | OSError):
+        return "the scheduler of the cluster ended, or the connection to it."
+    if isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker":  # Dask's
+        return "workers died in the middle of runs. If memory is short, use fewer of them."
+    return f"a worker failed: {type(error).__name__}: {error}."

@@ -123,7 +123,7 @@ class Screen:
         """The smallest margins of each law with some gains."""
         smallest: dict[str, Margins] = {}
         for name, m in self._margins_of_parts(gains):
-            smallest[name] = _smaller_margins(smallest[name], m) if name in smallest else m
+            smallest[name] = smallest[name].common(m) if name in smallest else m
         return smallest
 
     def slack(self, gains: Gains) -> float:
@@ -164,14 +164,6 @@ def _distinct_parts(laws: Sequence[tuple[str, ClosedLoops]]) -> list[_Part]:
             if key not in parts or looped.growth < parts[key].growth:
                 parts[key] = _Part(name, loop, looped.law, looped.growth)
     return sorted(parts.values(), key=lambda part: part.loop.S.size)  # the quick ones first
-
-
-def _smaller_margins(a: Margins, b: Margins) -> Margins:
-    """The smaller margins of two loops."""
-    if not (a.stable and b.stable):
-        return Margins(stable=False)
-    gain = max(a.gain[0], b.gain[0]), min(a.gain[1], b.gain[1])
-    return Margins(True, gain, min(a.phase, b.phase), min(a.delay, b.delay))
 
 
 def _least_ratio(now: Margins, was: Margins) -> float:

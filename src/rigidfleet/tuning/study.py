@@ -15,6 +15,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from time import perf_counter
@@ -31,7 +32,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
-from rigidfleet.sweep.workers import Pool, processes
+from rigidfleet.sweep.workers import processes
 from rigidfleet.tuning.gains import Gains, GainSpace, Screen, feasible_points, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown, Tuned
 from rigidfleet.typing import Floats
@@ -240,10 +241,8 @@ class _StudySweeps:
 
         # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
         first, self.first = self.first, False
-        several = self.count > 1 and not first
-        table = fly(
-            sweep, folder, workers=1, progress=tell, pool=self._processes if several else None
-        )
+        pool = self._processes() if self.count > 1 and not first else None
+        table = fly(sweep, folder, workers=self.count if pool else 1, progress=tell, pool=pool)
         self.done, self.flown, self.failed = (
             self.done + last.done, self.flown + last.flown, self.failed + last.failed
         )  # fmt: skip
@@ -251,7 +250,7 @@ class _StudySweeps:
             self.count = 1
         return _measurements(table, candidates, len(seeds))
 
-    def _processes(self) -> Pool:
+    def _processes(self) -> Executor:
         if self.pool is None:
             self.pool = self.stack.enter_context(processes(self.count))
         return self.pool

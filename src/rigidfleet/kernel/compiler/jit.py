@@ -4,6 +4,7 @@ Numba's own cache does not notice a change in a callee that lives in another fil
 folder is keyed here by a digest of all sources of the kernel.
 """
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from numba.core.ccallback import CFunc
 
 from rigidfleet._common.files import replacing
 from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, open_safely
+from rigidfleet.kernel.compiler.levels import KEY, level, runnable_level
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -39,6 +41,9 @@ OPTIONS: dict[str, Any] = {
 #: Whether Numba only translates (see `rigidfleet.kernel.engine.native`); code is then neither cached nor inlined.
 _OPTIMISES = numba.config.OPT > 0
 _CACHED = OPTIONS | {"no_cfunc_wrapper": True}
+if os.environ.get(KEY):  # whatever Numba compiles in this process is then of this level, too
+    numba.config.CPU_NAME = runnable_level() if _OPTIMISES else level()
+    numba.config.CPU_FEATURES = ""
 
 
 def jit(function: F) -> F:

@@ -29,6 +29,7 @@ from numba.extending import (
 )
 from numpy.typing import NDArray
 
+from rigidfleet.kernel.compiler import jit  # noqa: F401 -- sets for which processor Numba compiles
 from rigidfleet.typing import Floats
 
 #: Number of lanes of a value.
@@ -38,7 +39,9 @@ _FAST = ("contract", "arcp", "nsz")
 VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
 _INDEX = ir.IntType(32)
 # Whether the machine can estimate eight roots or quotients at once, to 14 bits, and this is enabled.
-_ESTIMATES = bool(binding.get_host_cpu_features().get("avx512f")) and not config.CPU_NAME
+_ESTIMATES = config.CPU_NAME == "x86-64-v4" or (
+    not config.CPU_NAME and bool(binding.get_host_cpu_features().get("avx512f"))
+)
 
 
 class _Lanes(types.Type):

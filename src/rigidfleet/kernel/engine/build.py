@@ -16,11 +16,25 @@ from typing import Any
 import llvmlite.binding as llvm
 from numba import cfunc, typeof, types
 
-from rigidfleet.kernel import dopri5, measurement, monitor, nearest, recorder, recursion
+from rigidfleet.kernel import (
+    block_cholesky,
+    dopri5,
+    elimination,
+    fleet,
+    measurement,
+    monitor,
+    recorder,
+    recursion,
+)
+from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.compiler import gathering, numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
 from rigidfleet.kernel.engine import objects, packing
+from rigidfleet.kernel.measured import Measured
+from rigidfleet.kernel.problem import Problem, Workspace
+from rigidfleet.kernel.records import IntegratorState, Monitor, Record, Recursion, Segment
+from rigidfleet.solids.records import Solids
 
 #: Functions that every evaluation calls, to be inlined; calls would take a tenth of a small formation's time.
 _HOT = (
@@ -38,6 +52,8 @@ _HOT_SAMPLED = (
 THREE = {"N": 3, "m": 3, "P": 3, "A": 3}
 #: No extents: code for any number of agents.
 ANY: Mapping[str, int] = {}
+#: Functions of the solver of large formations that return a number.
+_RETURNING = {"solve", "count_blocks", "factor", "inner", "conjugate_gradients"}
 #: Passes that simplify each translated function before inlining.
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
@@ -48,7 +64,9 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
     record, and monitor. The ``second`` process, if there is one, makes what is `apart`.
     """
-    problem, workspace, integrator, segment, record, *_ = _pointers()
+    problem, workspace, integrator, segment, record = map(
+        _at, (Problem, Workspace, IntegratorState, Segment, Record)
+    )
 
     def integrate_segment(p, w, state, s):
         call = segment(s)
@@ -77,8 +95,8 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
 def apart() -> list[bytes]:
     """Object codes of monitor, measurement, clearances, recursions and packing, which share little with the rest."""
-    problem, workspace, integrator, _, _, watching, *_, measured, spectrum, boxes, recursing = (
-        _pointers()
+    problem, workspace, integrator, watching = map(
+        _at, (Problem, Workspace, IntegratorState, Monitor)
     )
 
     def bound_moves(p, state, watch):
@@ -107,15 +125,13 @@ def apart() -> list[bytes]:
         bound_moves,
         watch_distances,
         watch_forces,
-        caller(measurement.measure, measured),
-        caller(measurement.spectrum, spectrum),
-        caller(nearest.nearest_boxes, boxes),
-        caller(recursion.follow, recursing),
+        caller(measurement.measure, _at(Measured)),
+        caller(recursion.follow, _at(Recursion)),
         gather,
     )
     entries = list(objects.ENTRIES["flight"].items())[2:-1]
     return [
-        _object(*_module(function, name, words), loops=name == "nearest")
+        _object(*_module(function, name, words))
         for function, (name, words) in zip(functions, entries, strict=True)
     ]
 
@@ -124,7 +140,10 @@ def sampled_code() -> list[bytes]:
     """Object code of the two C functions of sampled flights."""
     from rigidfleet.kernel import quadrotor, sampled_flight
 
-    problem, workspace, *_, flight, state, segment, evaluation, _, _, _, _, _ = _pointers()
+    problem, workspace, flight, state = map(
+        _at, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
+    )
+    segment, evaluation = map(_at, (fleet.SampledSegment, fleet.Evaluation))
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -143,7 +162,10 @@ def avoidance_code() -> list[bytes]:
     """Object code of avoidance in flight."""
     from rigidfleet.kernel import guard
 
-    problem, workspace, *_, flight, state, _, _, avoidance, _, _, _, _ = _pointers()
+    problem, workspace, flight, state = map(
+        _at, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
+    )
+    avoidance = _at(AvoidanceArrays)
 
     def avoid(f, s, address, _):
         a = avoidance(address)
@@ -152,17 +174,58 @@ def avoidance_code() -> list[bytes]:
     return [_object(*_module(avoid, "avoid", objects.ENTRIES["avoidance"]["avoid"]), hot=())]
 
 
+def solids_code() -> list[bytes]:
+    """Object code of the monitor of obstacles that move or are no plain boxes."""
+    from rigidfleet.kernel.obstacles import watch_step
+
+    row_of = monitor.row_of
+    problem, integrator, watching, solids = map(_at, (Problem, IntegratorState, Monitor, Solids))
+
+    def watch_solids(first, end, p, state, watch, s):
+        at, trail = integrator(state), integrator(state).trail
+        for step in range(first, end):
+            row = row_of(step, at)
+            start, length = trail.clock[row, 0], trail.clock[row, 1]
+            watch_step(trail.points[row], start, length, problem(p), solids(s), watching(watch))
+        return 0
+
+    return [_object(*_module(watch_solids, "watch_solids", 6), hot=())]
+
+
+def large_code() -> list[bytes]:
+    """Object code of the functions of the solver of large formations."""
+    codes = []
+    for name, kind in packing.OF_LARGE.items():
+        source = name.removesuffix("_single")
+        function = getattr(elimination, source, None) or getattr(block_cholesky, source)
+        fields = ", ".join(f"x.{field}" for field in kind._fields)
+        call = f"return 0.0 + f({fields})" if source in _RETURNING else f"f({fields}); return 0.0"
+        scope = {"at": _at(kind), "f": function}
+        exec(f"def entry(address):\n    x = at(address)\n    {call}", scope)
+        codes.append(_object(*_module(scope["entry"], name, 1, types.float64), hot=()))
+    return codes
+
+
 #: The makers of the libraries beside the first, and of the part that a second process makes of that.
-LIBRARIES = {"sampled": sampled_code, "avoidance": avoidance_code, "apart": apart}
+LIBRARIES = {
+    "sampled": sampled_code,
+    "avoidance": avoidance_code,
+    "solids": solids_code,
+    "large": large_code,
+    "apart": apart,
+}
 
 
-def _pointers() -> list[Any]:
-    return [pointer(typeof(x)) for x in packing.examples()]
+def _at(kind: type) -> Any:
+    """The compiled function that converts an int64 to the address of a named tuple of this type."""
+    return pointer(typeof(packing.example_of(kind)))
 
 
-def _module(function: Any, name: str, arguments: int) -> tuple[str, str, str]:
+def _module(
+    function: Any, name: str, arguments: int, result: Any = types.int64
+) -> tuple[str, str, str]:
     """Input of `_object`: the module of a C function of so many addresses, its symbol, and its ``name``."""
-    made = cfunc(types.int64(*(types.int64,) * arguments), **OPTIONS)(function)
+    made = cfunc(result(*(types.int64,) * arguments), **OPTIONS)(function)
     return made.inspect_llvm(), made.native_name, name
 
 
@@ -172,15 +235,10 @@ def _object(
     name: str,
     hot: tuple[str, ...] = _HOT,
     sizes: Mapping[str, int] = ANY,
-    *,
-    loops: bool = False,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`.
-
-    ``loops``: make vectors of its loops.
-    """
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`."""
     module = _simplify(with_sizes(text, sizes), symbol, name, hot)
-    builder = _passes(3, loops=loops)
+    builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
         if function.is_declaration and function.name.startswith(("numba_", "NRT_", "Py")):
@@ -210,10 +268,10 @@ def _simplify(text: str, symbol: str, name: str, hot: tuple[str, ...] = _HOT) ->
     return module
 
 
-def _passes(level: int, *, loops: bool = False) -> Any:
+def _passes(level: int) -> Any:
     options = llvm.create_pipeline_tuning_options(speed_level=level)
     # Most loops are short, and the integrator's sums use vectors already
-    options.loop_vectorization = loops
+    options.loop_vectorization = False
     return llvm.create_pass_builder(objects.target_machine(), options)
 
 

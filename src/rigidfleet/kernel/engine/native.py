@@ -1,40 +1,52 @@
 """The compiled kernel, called without the compiler.
 
-`rigidfleet.kernel.engine.build` compiles the integrator, the recorder and the monitor once to machine code. The code is
-stored in a cache and loaded from there, because importing Numba alone takes longer than flying most missions. It reads
-and writes through addresses of named tuples, laid out as `rigidfleet.kernel.compiler.pointers` says.
+Importing Numba alone takes longer than flying most missions. So the wheel has machine code of the integrator, the
+recorder and the monitor, made of the same sources: a shared object for each level of x86-64. Where there is none,
+`rigidfleet.kernel.engine.build` compiles them once, into a cache. The code reads and writes through addresses of named
+tuples, laid out as `rigidfleet.kernel.compiler.pointers` says.
 """
 
 from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
-import subprocess
-import sys
 import threading
-from collections.abc import Sequence
-from contextlib import suppress
+import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-import llvmlite.binding as llvm
 import numpy as np
 
 from rigidfleet._common.files import replacing
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, open_safely, warned
+from rigidfleet.kernel.compiler.cache import (
+    cache_directory,
+    not_kept,
+    open_safely,
+    sources_digest,
+    warned,
+)
+from rigidfleet.kernel.compiler.levels import HOST, level, runnable_level
 from rigidfleet.kernel.engine.objects import (
-    ELSEWHERE,
     ENTRIES,
-    build_process,
     concatenate,
+    objects_of,
     separate,
+    shared_object,
     symbol,
     target_machine,
 )
-from rigidfleet.kernel.engine.packing import NOTHING, UNRECORDED, Packed, pack, pack_anew, use
-from rigidfleet.kernel.measured import Measured, nearest_of, spectrum_of
+from rigidfleet.kernel.engine.packing import (
+    NOTHING,
+    OF_LARGE,
+    UNRECORDED,
+    Packed,
+    pack,
+    pack_anew,
+    use,
+)
+from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import (
     Problem,
     Workspace,
@@ -47,8 +59,8 @@ from rigidfleet.kernel.records import (
     Segment,
     recorder,
 )
-from rigidfleet.solids import distance
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.solids.records import Solids
+from rigidfleet.typing import Floats
 
 
 def integrate(
@@ -123,7 +135,7 @@ class Watch:
         # The recorder evaluates the law, at the monitor's own time and state.
         n = monitor.states.shape[1]
         segment = Segment(0.0, False, 0, monitor.time, monitor.states, np.empty(n))
-        self._kept = pack_anew(segment), pack_anew(UNRECORDED)
+        self._kept = pack_anew(segment), pack(UNRECORDED)
         self.monitor = monitor._replace(
             recorder=recorder_address(), segment=self._kept[0].address, record=self._kept[1].address
         )
@@ -138,6 +150,13 @@ class Watch:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
         of = pack(problem).address, pack(state).address, self.address
         _code().watch_distances(first, end, *of)
+
+    def clearances(
+        self, problem: Problem, state: IntegratorState, first: int, end: int, solids: Solids
+    ) -> None:
+        """Search the same steps for clearances to all ``solids``, see `rigidfleet.kernel.obstacles`."""
+        of = pack(problem).address, pack(state).address, self.address
+        _library("solids").watch_solids(first, end, *of, pack(solids).address)
 
     def forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
@@ -179,20 +198,6 @@ def measure(measured: Measured) -> None:
     _call(_code().measure, pack_anew(measured))
 
 
-def least_singular_values(r: Floats, edges: Ints) -> Floats:
-    """Smallest non-zero singular value (K,) of J at r (K, N, 3), see `rigidfleet.kernel.measurement.spectrum`."""
-    spectrum = spectrum_of(r, edges)
-    _call(_code().spectrum, pack_anew(spectrum))
-    return spectrum.values
-
-
-def nearest_boxes(r: Floats, radius: Floats, boxes: Floats) -> tuple[Floats, Ints]:
-    """Least distances to boxes, and these boxes (N, K), see `rigidfleet.kernel.nearest.nearest_boxes`."""
-    nearest = nearest_of(r, radius, boxes)
-    _call(_code().nearest, pack_anew(nearest))
-    return nearest.least, nearest.nearest
-
-
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
     _call(_code().follow, pack_anew(Recursion(x, a, backward)))
@@ -201,6 +206,11 @@ def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
 def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
     """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
     _call(_code().follow, pack_anew(Recursion(x, a, False, y, first, b)))
+
+
+def call_large(name: str, *arguments: Any) -> float:
+    """Call a function of `rigidfleet.kernel.elimination` or `rigidfleet.kernel.block_cholesky` with its arguments."""
+    return _call(getattr(_library("large"), name), pack_anew(OF_LARGE[name]._make(arguments)))
 
 
 class Library(SimpleNamespace):
@@ -244,35 +254,51 @@ def _library(part: str) -> Library:
 
 
 def _load(part: str) -> Library:
+    for file in _shipped_code(sources_digest()):
+        return _link(part, *_of_shared_object(file))
     if (parts := _read(part)) is not None:
-        return _link(part, parts)
+        return _link(part, *_of_objects(parts))
+    if _shipped_code("*"):
+        warnings.warn(
+            "the kernel's sources were changed since its machine code was made: they are compiled again",
+            RuntimeWarning,
+            stacklevel=2,
+        )
     parts = _compile(part)
-    return _link(part, parts, None if _write(parts, part) else parts)
+    return _link(part, *_of_objects(parts), None if _write(parts, part) else parts)
 
 
-def _link(part: str, parts: Sequence[bytes], unkept: list[bytes] | None = None) -> Library:
-    """Make a library of the objects of a part."""
-    engine, word = _engine(parts), ctypes.c_int64
-    addresses = {name: engine.get_function_address(symbol(name)) for name in ENTRIES[part]}
+def _link(
+    part: str, engine: Any, address_of: Callable[[str], int], unkept: list[bytes] | None = None
+) -> Library:
+    """Make a library of the functions of a part, whose code the ``engine`` keeps alive."""
+    word = ctypes.c_int64
+    result = ctypes.c_double if part == "large" else word
+    addresses = {name: address_of(symbol(name)) for name in ENTRIES[part]}
     calls = {
-        name: ctypes.CFUNCTYPE(word, *(word,) * words)(addresses[name])
+        name: ctypes.CFUNCTYPE(result, *(word,) * words)(addresses[name])
         for name, words in ENTRIES[part].items()
     }
     if part == "flight":
         use(calls["gather"], engine)
-        distance.use(nearest_boxes)
     return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 
-def _engine(parts: Sequence[bytes]) -> Any:
-    """Load objects of machine code."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
+def _of_shared_object(file: Path) -> tuple[Any, Callable[[str], int]]:
+    """Load a shared object."""
+    engine = ctypes.CDLL(str(file))
+    return engine, lambda name: ctypes.cast(engine[name], ctypes.c_void_p).value or 0
+
+
+def _of_objects(parts: Sequence[bytes]) -> tuple[Any, Callable[[str], int]]:
+    """Load objects of machine code as a linker would, which not every machine has."""
+    import llvmlite.binding as llvm
+
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target_machine())
     for part in parts:
         engine.add_object_file(llvm.ObjectFileRef.from_data(part))
     engine.finalize_object()
-    return engine
+    return engine, engine.get_function_address
 
 
 class Inheritance(NamedTuple):
@@ -293,39 +319,44 @@ def inherit(inheritance: Inheritance) -> None:
     if inheritance.warned:
         warned.set()
     for part, code in inheritance.code.items():
-        _loaded[part] = _link(part, code, code)
+        _loaded[part] = _link(part, *_of_objects(code), code)
 
 
 def _compile(part: str) -> list[bytes]:
-    """Compile the kernel, or another library (``part``), in a separate process if possible.
-
-    In that process Numba only translates. Otherwise it would optimise each function before all are optimised
-    together, and take twice as long.
-    """
-    # Suppress Numba's coloured messages about the versions that it tries.
-    quiet = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
-    if sys.executable:
-        with suppress(OSError):
-            done = subprocess.run(
-                build_process(part), env=os.environ | quiet, cwd=ELSEWHERE, capture_output=True, check=False
-            )  # fmt: skip
-            if done.returncode == 0 and (parts := separate(done.stdout)) is not None:
-                return parts
+    """Compile the kernel, or another library (``part``), in a separate process if possible."""
+    if (parts := objects_of(part, level())) is not None:
+        return parts
     from rigidfleet.kernel.engine import build
 
     return build.LIBRARIES.get(part, build.machine_code)()
 
 
+def _shipped_code(digest: str) -> list[Path]:
+    """Shared objects of this level that came with the package, made of sources with a digest, or of any ("*").
+
+    Raises
+    ------
+    RigidfleetError
+        The environment fixes a level that this machine cannot run.
+    """
+    file = shared_object(runnable_level(), digest)
+    return list(file.parent.glob(file.name))
+
+
 def _file(part: str) -> Path:
-    """The cache file of a part of the machine code for this kind of machine.
+    """The cache file of a part of the machine code, for this level or this kind of machine.
 
     Raises
     ------
     OSError
         As `cache_directory` does.
     """
-    machine = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
-    return cache_directory() / f"{part}-{hashlib.sha256(machine.encode()).hexdigest()[:16]}.o"
+    if (machine := level()) == HOST:
+        import llvmlite.binding as llvm
+
+        host = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
+        machine = hashlib.sha256(host.encode()).hexdigest()[:16]
+    return cache_directory() / f"{part}-{machine}.o"
 
 
 def _read(part: str) -> list[bytes] | None:
@@ -349,7 +380,9 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
 
 
 def is_compiled() -> bool:
-    """Return whether the machine code is in the cache, so that nothing has to be compiled."""
+    """Return whether there is machine code, shipped or in the cache, so that nothing has to be compiled."""
+    if _shipped_code(sources_digest()):
+        return True
     try:
         with open_safely(_file("flight")):
             return True

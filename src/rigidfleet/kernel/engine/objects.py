@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import llvmlite.binding as llvm
+from rigidfleet.kernel.compiler.levels import HOST, KEY, level
 
 #: The functions of each library of machine code, by name, with how many words they take: integers, or addresses of
-#: named tuples. They return a word. Flights of points load the first library, those of vehicles the second, too, and
-#: those with avoidance the third. Each function is in its own object.
+#: named tuples. They return a word. Flights of points load the first library, those of vehicles the second, too, those
+#: with avoidance the third, those with obstacles that move or are no plain boxes the fourth. Functions of the solver of
+#: large formations take the address of their arguments, and return a double. Each function is in its own object.
 ENTRIES = {
     "flight": {
         "integrate": 4,  # problem, workspace, integrator, segment
@@ -22,15 +25,20 @@ ENTRIES = {
         "watch_distances": 5,  # first, end, problem, integrator, monitor
         "watch_forces": 5,  # last, problem, workspace, integrator, monitor
         "measure": 1,
-        "spectrum": 1,
-        "nearest": 1,
         "follow": 1,
         "gather": 4,  # objects, count, asked, words
         "integrate_three": 4,  # the first, for three agents with three edges
     },
     "sampled": {"fly_ticks": 5, "evaluate": 2},
     "avoidance": {"avoid": 4},  # flight, state, avoidance, 0
-}
+    "solids": {"watch_solids": 6},  # first, end, problem, integrator, monitor, solids
+    "large": dict.fromkeys(
+        (
+            "solve", "pull_back", "elimination_tree", "count_blocks", "fill_blocks", "assemble", "factor", "apply_J",
+            "apply_Jt", "inner", "project", "conjugate_gradients", "conjugate_gradients_single",
+        ), 1
+    ),
+}  # fmt: skip
 
 
 def symbol(name: str) -> str:
@@ -61,9 +69,41 @@ def build_process(part: str = "flight") -> list[str]:
     return [sys.executable, *flags, "-P", "-c", _BUILD.format(part), *path, home]
 
 
+def shared_object(of: str, digest: str) -> Path:
+    """Where the package has the machine code of a level, made of sources with this digest."""
+    return Path(__file__).with_name(f"{of}-{digest}.so")
+
+
+def objects_of(part: str, of: str) -> list[bytes] | None:
+    """Objects of a part for a level, made by a process of its own; None if there can be no such process, or it fails.
+
+    In that process Numba only translates. Otherwise it would optimise each function before all are optimised
+    together, and take twice as long.
+    """
+    # Numba's coloured messages about the versions that it tries are suppressed.
+    settings = {"NUMBA_OPT": "0", "NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING": "1"}
+    if of != HOST:
+        settings[KEY] = of
+    if sys.executable:
+        with suppress(OSError):
+            done = subprocess.run(
+                build_process(part), env=os.environ | settings, cwd=ELSEWHERE, capture_output=True, check=False
+            )  # fmt: skip
+            if done.returncode == 0:
+                return separate(done.stdout)
+    return None
+
+
 def target_machine() -> Any:
-    """The target of the machine code: this machine."""
-    return llvm.Target.from_default_triple().create_target_machine(
+    """The target of the machine code: the level of this process, or this machine."""
+    import llvmlite.binding as llvm  # loads the compiler
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_default_triple()
+    if (cpu := level()) != HOST:  # code that a linker takes, too
+        return target.create_target_machine(cpu=cpu, opt=3, reloc="pic", codemodel="small")
+    return target.create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
     )  # fmt: skip
 

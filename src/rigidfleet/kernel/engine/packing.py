@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import struct
 import threading
+from collections import namedtuple
 from collections.abc import Callable, Iterator
 from functools import cache
 from operator import attrgetter
@@ -14,14 +15,7 @@ import numpy as np
 
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance
-from rigidfleet.kernel.measured import (
-    Measured,
-    Nearest,
-    SingularValues,
-    measurement_of,
-    nearest_of,
-    spectrum_of,
-)
+from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.problem import (
     CONSTANT,
     ITERATED,
@@ -42,6 +36,8 @@ from rigidfleet.kernel.problem import workspace as kernel_workspace
 from rigidfleet.kernel.records import (
     IntegratorState,
     Monitor,
+    Order,
+    Pattern,
     Record,
     Recursion,
     Segment,
@@ -49,6 +45,7 @@ from rigidfleet.kernel.records import (
     monitor,
     recorder,
 )
+from rigidfleet.solids.records import Solids, half_space, single
 
 
 class Packed(NamedTuple):
@@ -227,7 +224,12 @@ def forget() -> None:
 
 @cache
 def _layout(kind: type) -> _Layout:
-    return _Layout(next(x for x in examples() if isinstance(x, kind)))
+    return _Layout(example_of(kind))
+
+
+def example_of(kind: type) -> Any:
+    """The example of a type of named tuple."""
+    return next(x for x in (*examples(), *_examples_of_large()) if isinstance(x, kind))
 
 
 @cache
@@ -244,9 +246,8 @@ def examples() -> tuple[
     fleet.Evaluation,
     AvoidanceArrays,
     Measured,
-    SingularValues,
-    Nearest,
     Recursion,
+    Solids,
 ]:
     """One minimal example of each named tuple; its fields have the types that all have."""
     one, none, places, frame = np.ones(1), np.zeros(0), np.zeros((1, 3)), np.eye(3)
@@ -280,10 +281,47 @@ def examples() -> tuple[
         measurement_of(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
                  r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
-        spectrum_of(rows, np.zeros((0, 2), dtype=np.int64)), nearest_of(rows, one, nowhere),
-        Recursion(np.zeros((0, 1)), none, False),
+        Recursion(np.zeros((0, 1)), none, False), single(half_space(0.0)),
     )  # fmt: skip
 
+
+@cache
+def _examples_of_large() -> tuple[Any, ...]:
+    """Examples of the arguments of each function of the solver of large formations, as named tuples."""
+    k, a, b, frame = np.zeros(1, dtype=np.int64), np.zeros((1, 3)), np.zeros(1), np.eye(3)
+    edges = np.zeros((1, 2), dtype=np.uint32)
+    order = Order(
+        edges[:, 0].copy(), *np.zeros((2, 1, 3), dtype=np.uint32), np.zeros((1, 3), dtype=np.int8)
+    )
+    matrix = {"u": a, "edges": edges, "m": b, "mbar": 1.0, "mu": 1.0}
+    blocks, many = np.zeros((1, 9)), np.zeros((1, 1, 3))
+    tree = {"first": k, "left": k, "parent": k, "mark": k}
+    gradients = {
+        **matrix, "turned": frame, "place": k, "column": k, "row": k, "L": blocks, "g": a, "x": a, "within": 1.0,
+        "most": 1, "work": many,
+    }  # fmt: skip
+    rows = {"column": k, "row": k, "first": k, "left": k, "block": k}
+    arguments: dict[str, dict[str, Any]] = {
+        "solve": {"u": a, "b": b, "r": a, "m": b, "M": 1.0, "order": order, "known": False, "cm": b, "I": frame,
+                  "I_inv": frame, "a": a, "f_C": a},
+        "pull_back": {"u": a, "order": order, "f": a, "multiplier": b},
+        "elimination_tree": tree,
+        "count_blocks": tree | {"count": k, "most": 1},
+        "fill_blocks": tree | {"free": k, "out": Pattern(*(k,) * 7)},
+        "assemble": matrix | {"place": k, "column": k, "of_edge": k, "L": blocks},
+        "factor": rows | {"L": blocks, "at": k},
+        "apply_J": {"u": a, "edges": edges, "a": a, "scale": 1.0, "out": b},
+        "apply_Jt": {"u": a, "edges": edges, "b": b, "scale": 1.0, "out": a},
+        "inner": {"a": a, "b": a},
+        "project": matrix | {"g": a, "past": many, "gram": frame, "x": a},
+        "conjugate_gradients": gradients,
+        "conjugate_gradients_single": gradients | {"L": blocks.astype(np.float32)},
+    }  # fmt: skip
+    return tuple(namedtuple(name, fields)(**fields) for name, fields in arguments.items())
+
+
+#: The types of these named tuples, by the function's name.
+OF_LARGE = {type(x).__name__: type(x) for x in _examples_of_large()}
 
 NOTHING = np.zeros(0)
 

@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.large import block_cholesky, elimination
+from rigidfleet.kernel.engine.native import call_large
+from rigidfleet.kernel.large.ordering import pattern
 from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace, workspace
+from rigidfleet.kernel.records import LOST_PIVOT, Order, Pattern
 from rigidfleet.typing import Edges, Floats, Ints
 
 #: A stored factor is renewed when the iterations in excess of a new factor's have taken as long as making one. It is
@@ -54,7 +56,7 @@ class Counts:
 class Setup(NamedTuple):
     """How a `LargeSolver` solves: what all solvers of the same equations share."""
 
-    elimination: elimination.Order | None
+    elimination: Order | None
     #: Asked for the order (N,) in which the sparse factor eliminates agents, if it is needed.
     order: Callable[[], Ints]
     tolerance: float  # relative residual of conjugate gradients
@@ -85,9 +87,8 @@ class LargeSolver:
         self.mu, self.iterations = (law.mu, law.iterations) if iterated else (_EXACT_MU, 2)
         self.a, self.rest = np.zeros((n, 3)), np.zeros(len(self.edges))
         self.least = self.mu * self.mbar * self.setup.floor * math.sqrt(n)
-        self.pattern: block_cholesky.Pattern | None = (
-            None  # not needed as long as elimination succeeds
-        )
+        # Not needed as long as elimination succeeds
+        self.pattern: Pattern | None = None
         self.pulled = True  # whether the workspace has the multipliers of the last evaluation
         self._calls = [_callable(method) for method in (self._solve, self._pull)]
         self.address, self.multipliers = (
@@ -135,10 +136,11 @@ class LargeSolver:
         """Solve for the forces or multipliers of ``workspace.b``; NaN if there is no solution."""
         w, vehicles, order = self.workspace, self.vehicles, self.setup.elimination
         if order is not None:
-            pivot = elimination.solve(
-                w.u, w.b, w.r, vehicles.m, vehicles.M, order, self.setup.axes, w.cm[0], w.I, w.I_inv, self.a, w.f_C,
+            pivot = call_large(
+                "solve", w.u, w.b, w.r, vehicles.m, vehicles.M, order, self.setup.axes, w.cm[0], w.I, w.I_inv, self.a,
+                w.f_C,
             )  # fmt: skip
-            self.pulled = not pivot > elimination.LOST
+            self.pulled = not pivot > LOST_PIVOT
             if not self.pulled:
                 return
             self.counts.fallbacks += 1
@@ -147,7 +149,7 @@ class LargeSolver:
             self._fail()
         elif order is not None:
             w.f_C[:] = 0.0
-            block_cholesky.apply_Jt(w.u, self.edges, w.multiplier, 1.0, w.f_C)
+            call_large("apply_Jt", w.u, self.edges, w.multiplier, 1.0, w.f_C)
 
     def pull(self) -> None:
         """Find the multipliers of the last evaluation, if elimination has not found them yet."""
@@ -155,7 +157,7 @@ class LargeSolver:
             self.pulled = True
             w, order = self.workspace, self.setup.elimination
             self.a[:] = w.f_C
-            elimination.pull_back(w.u, order, self.a, w.multiplier)
+            call_large("pull_back", w.u, order, self.a, w.multiplier)
 
     def _on_vertex_graph(self) -> bool:
         """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
@@ -173,27 +175,27 @@ class LargeSolver:
         iterated = self.law.solver == ITERATED
         for k in range(self.iterations):
             self.g[:] = 0.0
-            block_cholesky.apply_Jt(w.u, edges, self.rest, self.mbar, self.g)
+            call_large("apply_Jt", w.u, edges, self.rest, self.mbar, self.g)
             x = self._system(k)
             if x is None:
                 return False
-            block_cholesky.apply_J(w.u, edges, x, -1.0, self.rest)
+            call_large("apply_J", w.u, edges, x, -1.0, self.rest)
             if iterated:
                 y += (self.mbar / self.mu) * self.rest
             else:
                 a += x
         for k in range(0 if iterated else self.iterations):
             self.g[:] = m[:, None] * a
-            block_cholesky.apply_Jt(w.u, edges, y, -1.0, self.g)
+            call_large("apply_Jt", w.u, edges, y, -1.0, self.g)
             x = self._system(self.iterations + k)
             if x is None:
                 return False
-            block_cholesky.apply_J(w.u, edges, x, self.mbar, y)
+            call_large("apply_J", w.u, edges, x, self.mbar, y)
         return True
 
     def _prepare(self) -> None:
         n, edges = len(self.a), self.edges
-        self.pattern = block_cholesky.pattern(n, edges, self.setup.order(), _FILL)
+        self.pattern = pattern(n, edges, self.setup.order(), _FILL)
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
         # Seven digits are enough for preconditioning, unless the damping of the rigid motions is tiny.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
@@ -206,9 +208,8 @@ class LargeSolver:
         count = np.diff(self.pattern.column).astype(float)
         self.worth = 0.75 * float((count**2).sum() / count.sum())
         self.fresh, self.wasted = 0, 0.0  # iterations with a new factor, and the excess since
-        self.axes: Floats | None = (
-            None  # axes of the marker agents when the factor was made; None: no factor
-        )
+        # Axes of the marker agents when the factor was made; None: no factor
+        self.axes: Floats | None = None
 
     def _system(self, number: int) -> Floats | None:
         """The solution x (N, 3) of K x = g for the given system of an evaluation; None if there is none.
@@ -218,12 +219,11 @@ class LargeSolver:
         w, x, past = self.workspace, self.x, self.past[number]
         # A residual r causes an error r/mu of the force.
         within = max(
-            self.setup.tolerance * math.sqrt(block_cholesky.inner(self.g, self.g)), self.least
+            self.setup.tolerance * math.sqrt(call_large("inner", self.g, self.g)), self.least
         )
         self.counts.solves += 1
-        block_cholesky.project(
-            w.u, self.edges, self.vehicles.m, self.mbar, self.mu, self.g, past, self.gram, x
-        )
+        m, mbar, mu = self.vehicles.m, self.mbar, self.mu
+        call_large("project", w.u, self.edges, m, mbar, mu, self.g, past, self.gram, x)
         while True:
             new = self.axes is None or self.wasted > self.worth
             if new:
@@ -249,12 +249,13 @@ class LargeSolver:
     def _gradients(self, x: Floats, within: float, most: int) -> int:
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
-        taken = block_cholesky.conjugate_gradients(
-            w.u, self.edges, m, self.mbar, self.mu, self.turned, p.place, p.column, p.row,
-            self.kept, self.g, x, within, most, self.work,
+        digits = "" if self.kept is self.L else "_single"
+        taken = call_large(
+            f"conjugate_gradients{digits}", w.u, self.edges, m, self.mbar, self.mu, self.turned, p.place, p.column,
+            p.row, self.kept, self.g, x, within, most, self.work,
         )  # fmt: skip
-        self.counts.iterations += min(taken, most)
-        return taken
+        self.counts.iterations += min(int(taken), most)
+        return int(taken)
 
     def _turn(self) -> None:
         """Find the rotation of the formation since the factor was made."""
@@ -269,18 +270,10 @@ class LargeSolver:
         self.axes, self.turned = self.now, np.eye(3)
         mu = self.mu
         for _ in range(12):
-            block_cholesky.assemble(
-                w.u,
-                self.edges,
-                m,
-                self.mbar,
-                mu,
-                p.place,
-                p.column,
-                p.of_edge,
-                self.L,
+            call_large(
+                "assemble", w.u, self.edges, m, self.mbar, mu, p.place, p.column, p.of_edge, self.L
             )
-            if block_cholesky.factor(p.column, p.row, p.first, p.left, p.block, self.L, self.place):
+            if call_large("factor", p.column, p.row, p.first, p.left, p.block, self.L, self.place):
                 self.kept[:] = self.L
                 return
             mu = max(10.0 * mu, 1e-3)

@@ -27,9 +27,8 @@ from rigidfleet.web.replay.scene import describe, observe, sight_points, typical
 __all__ = ["Replay", "html_page", "replay"]
 
 _RATE = 30.0  # greatest sampling rate [Hz]; the page draws smooth curves through the samples
-_SAMPLES = (
-    3_000_000  # greatest number for all agents together; longer flights have a lower sampling rate
-)
+#: Greatest number for all agents together; longer flights have a lower sampling rate.
+_SAMPLES = 3_000_000
 _HEIGHT = 600  # height in a notebook [px]
 _EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
 #: Number of vehicles beyond which each is a dot, unless it is near; columns that dots do without.

@@ -10,8 +10,8 @@ from importlib import resources
 from typing import Any
 
 from rigidfleet._common.plain import plain
+from rigidfleet._common.templates import templates
 from rigidfleet.web.policy import content_policy
-from rigidfleet.web.template import templates
 
 _IMPORT = re.compile(r'^import \{[^}]*\} from "([^"]+)";\n', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async function|function|class|const) )", re.MULTILINE)

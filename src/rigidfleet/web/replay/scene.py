@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rigidfleet.math import attitude as att
 from rigidfleet.plotting import agent_colours
 from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits
 from rigidfleet.result import quantities
@@ -21,9 +22,8 @@ if TYPE_CHECKING:
     from rigidfleet.result import Result
 
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
-_BOXES = (
-    200  # greatest number of obstacles that an overview fits one by one; more are fitted together
-)
+#: Greatest number of obstacles that an overview fits one by one; more are fitted together.
+_BOXES = 200
 #: Distance from the flight up to which obstacles that move are in sight, as a share of its length; places looked at.
 _BESIDE, _PLACES = 0.15, 100
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
@@ -115,7 +115,7 @@ def _attitude_columns(result: Result) -> dict[str, PackedColumn]:
         assert force is not None
         assert saturated is not None
         share = np.where(known[:, None], force / np.where(known, limits, 1.0)[:, None], 0.0)
-        columns["turn"] = PackedColumn(_continuous_signs(q), 1e-3)
+        columns["turn"] = PackedColumn(att.unwrap_quaternion(q.swapaxes(0, 1)).swapaxes(0, 1), 1e-3)
         columns["rotors"] = PackedColumn(share, 0.01)
         columns["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
     return columns
@@ -139,12 +139,6 @@ def _light_columns(result: Result) -> dict[str, PackedColumn]:
     if not has_lights(result):
         return {}
     return {"light": PackedColumn(lights(result, result.time), 1 / 255)}
-
-
-def _continuous_signs(q: Floats) -> Floats:
-    """Quaternions (K, N, 4) with signs such that neighbours in time can be mixed."""
-    turned = (q[1:] * q[:-1]).sum(axis=2) < 0.0
-    return q * np.cumprod(np.where(np.pad(turned, ((1, 0), (0, 0))), -1.0, 1.0), axis=0)[..., None]
 
 
 def sight_points(

@@ -6,61 +6,8 @@ gradients for many later evaluations.
 """
 
 import math
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.typing import Ints
-
-
-class Pattern(NamedTuple):
-    """Positions of the blocks of L: by columns, the diagonal first, and by rows."""
-
-    place: Ints  # (N,) column of each agent
-    column: Ints  # (N + 1,) first block of each column
-    row: Ints  # (B,) row of each block
-    first: Ints  # (N + 1,) of each row, the blocks left of the diagonal:
-    left: Ints  # (B - N,) their columns
-    block: Ints  # (B - N,) and which blocks they are
-    of_edge: Ints  # (m,) block of each edge
-
-
-def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
-    """Pattern of L with agents eliminated in ``order`` (N,).
-
-    If there are more than ``most`` blocks per agent, fill is omitted: the pattern is that of K.
-    """
-    place = np.empty(n, dtype=np.int64)
-    place[order] = np.arange(n)
-    ends = np.unique(np.sort(place[edges], axis=1), axis=0)
-    before = ends[np.lexsort((ends[:, 0], ends[:, 1]))]  # by rows
-    first = np.searchsorted(before[:, 1], np.arange(n + 1)).astype(np.int64)
-    left = np.ascontiguousarray(before[:, 0])
-    parent, mark, count = (np.full(n, -1) for _ in range(3))
-    elimination_tree(first, left, parent, mark)
-    mark[:], count[:] = -1, 1
-    fill = count_blocks(first, left, parent, mark, count, int(most * n))
-    if not fill:
-        parent[:] = -1  # no fill is inherited
-        mark[:], count[:] = -1, 1
-        count_blocks(first, left, parent, mark, count, 1 << 62)
-    column = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    blocks = int(column[-1])
-    blocks_of = Pattern(
-        place, column, np.empty(blocks, np.int64), np.empty(n + 1, np.int64),
-        np.empty(blocks - n, np.int64), np.empty(blocks - n, np.int64), np.empty(len(edges), np.int64),
-    )  # fmt: skip
-    mark[:] = -1
-    next_ = column[:-1].copy()
-    fill_blocks(first, left, parent, mark, next_, blocks_of)
-    key = (
-        np.repeat(np.arange(n), np.diff(column)) * n + blocks_of.row
-    )  # sorted, as rows are in a column
-    low, high = np.sort(place[edges], axis=1).T
-    blocks_of.of_edge[:] = np.searchsorted(key, low * n + high)
-    return blocks_of
 
 
 @jit

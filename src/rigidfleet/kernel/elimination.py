@@ -7,41 +7,15 @@ factored: a forward pass finds a_p, and a backward pass the multipliers, if they
 """
 
 import math
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
+from rigidfleet.kernel.records import LOST_PIVOT
 from rigidfleet.kernel.rigid_body import centre_of_mass, inertia, inertia_inverse
-from rigidfleet.typing import Edges, Ints
-
-# Triple product of three unit vectors below which a pivot counts as lost.
-LOST = 1e-6
-
-
-class Order(NamedTuple):
-    """The order of elimination: agents, each with its edges to three before it; missing entries are 0."""
-
-    agent: Edges  # (N,)
-    edge: Edges  # (N, 3): none, one, two, then three each
-    other: Edges  # (N, 3) the agents at their other ends
-    sign: NDArray[np.int8]  # (N, 3) 1 where u of the edge points towards the agent, else -1
-
-
-def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
-    """Prepare an order from steps (N, 4), an agent and its edges (-1: none), and edges (m, 2)."""
-    agent, edge = steps[:, 0], np.maximum(steps[:, 1:], 0)
-    ends = edges[edge].astype(np.int64)
-    first = ends[:, :, 0] == agent[:, None]
-    narrow = lambda x: np.ascontiguousarray(x, dtype=np.uint32)  # noqa: E731
-    other = np.where(first, ends[:, :, 1], ends[:, :, 0])
-    return Order(narrow(agent), narrow(edge), narrow(other), np.where(first, 1, -1).astype(np.int8))
 
 
 @jit
 def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
-    """Compute f_C (N, 3) of the exact law for b (m,) and return the smallest pivot; if LOST, write nothing.
+    """Compute f_C (N, 3) of the exact law for b (m,) and return the smallest pivot; if lost, write nothing.
 
     The agents are at r (N, 3), with unit vectors u (m, 3). The centre of mass cm, the inertia I about it and its
     inverse are computed unless ``known``; a (N, 3) is scratch.
@@ -51,7 +25,7 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
         inertia(r, m, cm, I)
         inertia_inverse(I, I_inv)
     pivot = particular(u, b, order, a)
-    if pivot > LOST:
+    if pivot > LOST_PIVOT:
         balance(r, m, M, cm, I_inv, a, f_C)
     return pivot
 

@@ -1,0 +1,89 @@
+"""Shards: parts of a sweep that are flown on their own, as by a job array, and merged to one store."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.errors import ResultError, RigidfleetError
+from rigidfleet.sweep.run import GROUP
+from rigidfleet.sweep.store import FILE, Store, Table, contents, differences, outcome_of, read
+from rigidfleet.typing import Bools, Ints
+
+#: Folder of the shards in the folder of their sweep.
+_SHARDS = "shards"
+_MOVE = "Move the wrong one out of the folder."
+
+
+def own_runs(shard: str, runs: int) -> Bools:
+    """Mask (runs,) of the runs of a shard, "3/40": every 40th group, so that shards grow with their sweep; "": all.
+
+    Raises
+    ------
+    RigidfleetError
+        There is no such shard.
+    """
+    match = re.fullmatch(r"([1-9]\d{0,8})/([1-9]\d{0,8})", shard or "1/1")
+    if match is None or int(match[1]) > int(match[2]):
+        raise RigidfleetError(f"--shard {shard}: write K/N with K from 1 to N, such as 3/40.")
+    return _shard_of_runs(runs, int(match[2])) == int(match[1])
+
+
+def shard_folder(folder: Path, shard: str) -> Path:
+    """Folder of a shard in that of its sweep; the latter, if the shard is ""."""
+    return folder / _SHARDS / shard.replace("/", "-of-") if shard else folder
+
+
+def shard_folders(folder: Path) -> list[Path]:
+    """Folders of the shards that are in the folder of a sweep."""
+    return sorted(path.parent for path in folder.glob(f"{_SHARDS}/*/{FILE}"))
+
+
+def merge(folder: str | Path, *, replace: bool = False) -> Table:
+    """Make one store of the shards in the folder of a sweep, and return its rows: those of one run, bit for bit.
+
+    Parameters
+    ----------
+    folder : shards are all stores in folders of its folder `shards`, whatever their names
+    replace : overwrite another sweep that is in the folder
+
+    Raises
+    ------
+    ResultError
+        A shard is missing or partly flown, belongs to another sweep, or differs from another copy of it; the folder
+        contains another sweep or cannot be written. Nothing is written then.
+    """
+    folder = Path(folder)
+    paths = shard_folders(folder) or [folder / _SHARDS]
+    sweep, common, _ = contents(paths[0])
+    rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
+    for path in paths:
+        _, own, part = contents(path)
+        if own != common:
+            other = differences(common, own)
+            raise ResultError(f"{path}: does not fit {paths[0]}; it differs in: {other}. {_MOVE}")
+        for row in part:
+            where, same = rows.setdefault(row[0], (path, row))
+            if outcome_of(row) != outcome_of(same):
+                raise ResultError(f"{path}: run {row[0]} is not as in {where}. {_MOVE}")
+    shards = _shard_of_runs(sweep.runs, count := common["number of shards"])
+    total, flown = (np.bincount(x, minlength=count + 1) for x in (shards, shards[[*rows]]))
+    if lacking := np.flatnonzero(flown < total).tolist():
+        words = [
+            f"{k} (has {flown[k]} of {total[k]} runs)" if flown[k] else str(k) for k in lacking
+        ]
+        raise ResultError(
+            f"{folder}: of {count} shards, these are missing or partly flown: {', '.join(words)}. Fly each, as by"
+            f" `rigidfleet sweep {folder} --shard {lacking[0]}/{count}`, and merge again."
+        )
+    with Store(folder, sweep, "", replace) as store:
+        store.insert(row for _, row in rows.values())
+    return read(folder)
+
+
+def _shard_of_runs(runs: int, count: int) -> Ints:
+    """Number (runs,), from 1, of the shard that flies each run, of ``count`` shards."""
+    return np.arange(runs) // GROUP % count + 1
