@@ -245,7 +245,7 @@ def test_what_a_link_loses_depends_on_nothing_else():
 
     whole = lost(mission({"loss": 0.4}))
     slots, edges = CUBE[:4], [edge for edge in EDGES if max(edge) <= 4] + [[1, 3]]
-    tables = {
+    tables: dict[str, Any] = {
         "agents": {"position": (slots + [0, 0, 20]).tolist(), "vehicle": "p"},
         "formations": {"cube": {"slots": slots.tolist(), "edges": edges}},
     }
