@@ -5,9 +5,11 @@ linker, the wheel has none, and the first flight compiles the kernel. So does an
 change.
 """
 
+import atexit
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -50,6 +52,7 @@ class MachineCode(BuildHookInterface):
         from rigidfleet.kernel.engine import objects
 
         folder, package = Path(tempfile.mkdtemp()), Path(objects.__file__).parents[2]
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)  # the wheel is written later
         self.app.display_info(f"Compiling the flight kernel for {' and '.join(LEVELS)}")
         jobs = list(product(LEVELS, objects.ENTRIES))
         # Each of these processes takes up to 600 MB.
@@ -59,12 +62,12 @@ class MachineCode(BuildHookInterface):
             )
         include = {}
         try:
-            for level in LEVELS:
-                target = objects.shared_object(level, sources_digest())
-                codes = [code for part in objects.ENTRIES for code in made[level, part] or ()]
-                include[link(codes, folder / target.name)] = str(target.relative_to(package.parent))
             if None in made.values():
                 raise OSError("the kernel does not compile here")
+            for level in LEVELS:
+                target = objects.shared_object(level, sources_digest())
+                codes = [code for part in objects.ENTRIES for code in made[level, part]]
+                include[link(codes, folder / target.name)] = str(target.relative_to(package.parent))
         except (OSError, subprocess.CalledProcessError) as error:
             self.app.display_warning(f"The wheel has no machine code: {error}")
             return

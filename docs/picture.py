@@ -66,7 +66,7 @@ def others() -> None:
     """The picture of a flight that others made, judged as its page says."""
     files = IMAGES.parents[1] / "tests" / "data" / "sequence_trajectories"
     read = read_trajectories(files)
-    result = of_curves(read.curves, read.assumed, separation=0.3, name=files.name)
+    result = of_curves(read, separation=0.3, name=files.name)
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["clearance"])
         _save_with_few_colours(path, "seven-crazyflies")

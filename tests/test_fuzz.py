@@ -322,5 +322,7 @@ def test_the_fuzzer_finds_what_there_is(tmp_path: Path, monkeypatch: pytest.Monk
         (tmp_path / "rigidfleet" / "cli" / "app.py").write_text(f"def main(_):\n    {body}\n")
         monkeypatch.setenv("PYTHONPATH", str(tmp_path))
         monkeypatch.setenv("MUTATIONS_SECONDS", "1")
+        # Bodies of one length, written within one second, would share their compiled code.
+        monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
         (case,) = input_fuzzer.attack("check", 0, 1)
         assert words in case["fault"]

@@ -853,7 +853,7 @@ if sys.argv[1] == "other":
     numba_internals.TESTED = ()
     assert not numba_internals.known()
     from rigidfleet.kernel.engine import build, native
-    native._loaded["flight"] = native._link("flight", build.machine_code())
+    native._loaded["flight"] = native._link("flight", *native._of_objects(build.machine_code()))
 import rigidfleet as rf
 print(hashlib.sha256(rf.simulate("establish-triangle").position.tobytes()).hexdigest())
 """

@@ -67,9 +67,8 @@ class Files:
             The folder cannot be written.
         """
         folder = self.folder.absolute()
-        while (
-            not os.path.lexists(folder) and folder != folder.parent
-        ):  # as on a drive that is not there
+        # The root is missing, too, on a drive that is not there
+        while not os.path.lexists(folder) and folder != folder.parent:
             folder = folder.parent
         try:
             TemporaryFile(dir=folder).close()

@@ -1,8 +1,8 @@
 """Flights as the files that other programs fly, show or record.
 
 `export` writes a flight in one of `FORMATS`, reads its own output back, and says how far it is from what was exported.
-Each module of this package writes and reads the formats of one family: a ``write`` function returns the bytes of a
-files of one or all vehicles, and its ``read`` function the ways in them.
+Each module of this package writes and reads the formats of one family: a ``write`` function yields the bytes of
+each file, of one or all vehicles, and its ``read`` function returns the ways in them.
 """
 
 from __future__ import annotations

@@ -58,10 +58,10 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
     """
     folder = Path(folder)
     paths = shard_folders(folder) or [folder / _SHARDS]
-    sweep, common, _ = contents(paths[0])
+    stored = [contents(path) for path in paths]
+    sweep, common, _ = stored[0]
     rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
-    for path in paths:
-        _, own, part = contents(path)
+    for path, (_, own, part) in zip(paths, stored, strict=True):
         if own != common:
             other = differences(common, own)
             raise ResultError(f"{path}: does not fit {paths[0]}; it differs in: {other}. {_MOVE}")

@@ -166,6 +166,12 @@ class Store:
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
 
 
+def _definition(db: sqlite3.Connection) -> tuple[Sweep, dict[str, str]]:
+    """The sweep of a store, and all that is kept of its definition."""
+    entries = dict(db.execute("SELECT key, value FROM sweep"))
+    return Sweep.from_json(entries["sweep"]), entries
+
+
 def _column_names(db: sqlite3.Connection) -> set[str]:
     """Columns of a store: one that an earlier version wrote may lack metrics."""
     return {name for _, name, *_ in db.execute("PRAGMA table_info(runs)")}
@@ -185,8 +191,7 @@ def read_sweep(folder: Path) -> Sweep:
         The folder does not contain a sweep.
     """
     with _open_to_read(folder) as db:
-        entries = dict(db.execute("SELECT key, value FROM sweep"))
-        return Sweep.from_json(entries["sweep"])
+        return _definition(db)[0]
 
 
 def read(folder: str | Path) -> Table:
@@ -223,8 +228,7 @@ def contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]
         The folder does not contain a sweep.
     """
     with _open_to_read(folder) as db:
-        entries = dict(db.execute("SELECT key, value FROM sweep"))
-        sweep = Sweep.from_json(entries["sweep"])
+        sweep, entries = _definition(db)
         shards = int(entries.get("shard", "").partition("/")[2] or 1)
         common = {"number of runs": sweep.runs, "number of shards": shards}
         known = _column_names(db)

@@ -1,7 +1,7 @@
 """The cache of compiled code, which never runs code that another user may have written.
 
 Machine code and Numba's pickles can do whatever their author likes. They are stored and read only in a folder that this
-user alone can write. Code that came with the package (`rigidfleet.kernel.engine.shipped`) needs none.
+user alone can write. Code that came with the package (`objects.shared_object`) needs none.
 """
 
 from __future__ import annotations
