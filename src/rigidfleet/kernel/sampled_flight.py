@@ -32,8 +32,9 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
+from rigidfleet.kernel.mail import PULL, SATURATED, SLOT, TRACKED, A, R, U, V
 from rigidfleet.kernel.neighbours import estimate_acceleration, hold_edges, solve_own_edges
-from rigidfleet.kernel.network import PULL, SATURATED, A, R, U, V, receive, send
+from rigidfleet.kernel.network import receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
 from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
@@ -235,6 +236,9 @@ def post(k, p, w, flight, state):
             message[R + q], message[V + q] = w.r[i, q], w.v[i, q]
             message[A + q] = mail.commanded[i, q] + mail.estimate[i, 3 + q]
             message[U + q] = m * state.f_u[i, q]
+            message[SLOT + q], message[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
+            message[SLOT + 6 + q] = w.a_ref[i, q]
+        message[TRACKED] = 1.0 if p.control.kind == TRACKING else 0.0
         message[SATURATED] = 1.0 if state.saturated[i] else 0.0
         for q in range(mail.pull.shape[1]):
             message[PULL + q] = mail.pull[i, q]

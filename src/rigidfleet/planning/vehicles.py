@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.network import Network, no_network
+from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
 from rigidfleet.math.margins import Lag, LoopGains, overshoot
@@ -185,7 +185,7 @@ def _sensing(mission: Mission) -> fleet.Sensing:
     return fleet.Sensing(max(1, round(rate / noise.rate)), np.full(n, round(noise.delay * rate)))
 
 
-def network_of(mission: Mission) -> Network:
+def network_of(mission: Mission) -> Links:
     """The network of a mission in whole ticks of the attitude control; one that nobody uses if it has none."""
     net, n, rate = mission.network, mission.n_agents, mission.autopilot.rate
     if net is None:
@@ -202,7 +202,7 @@ def network_of(mission: Mission) -> Network:
         [*(sorted(x - 1 for x in one.between) or (-1, -1)), one.start * rate, one.end * rate]
         for one in net.outages
     ] + [[*(x - 1 for x in one.between), one.time * rate, np.inf] for one in net.lost]
-    return Network(
+    return Links(
         every=max(1, round(rate / net.sent_rate(n))),
         delay=max(1, round(net.delay * rate)),
         jitter=round(net.jitter * rate),
