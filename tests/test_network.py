@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import rigidfleet as rf
+from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.engine import native, sampled
@@ -292,3 +293,19 @@ def test_what_a_network_cannot_be_is_refused(network, tables, key, words):
     assert finding.key == key
     assert words in finding.problem
     assert finding.remedy
+
+
+def test_a_result_with_links_of_before_loads(tmp_path):
+    """A result whose mission has [disturbances.links] loads with the same numbers in [network]; a file is refused."""
+    m = mission({"delay": 0.02, "loss": 0.3, "seed": 5}, time=5.0)
+    result = rf.simulate(m)
+    data = m.to_dict()
+    links = data.pop("network")
+    links["dropped"] = links.pop("loss")
+    data["disturbances"] = {"links": links}
+    result.mission_text = to_toml(data)
+    file = tmp_path / "earlier.nc"
+    result.save(file)
+    assert rf.Result.load(file).mission.network == m.network
+    with pytest.raises(MissionError, match=r"it is now called '\[network\]'"):
+        rf.Mission.from_dict(data)

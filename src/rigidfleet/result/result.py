@@ -382,10 +382,10 @@ class Result(Shown):
         ResultError
             This version of rigidfleet does not accept the mission, or the mission does not match the arrays.
         """
-        from rigidfleet.mission import Mission
+        from rigidfleet.mission.loading import recorded_mission
 
         try:
-            mission = Mission.from_toml(self.mission_text, "mission of the result")
+            mission = recorded_mission(self.mission_text, "mission of the result")
         except MissionError as error:
             made = self.versions.get("rigidfleet", "an unknown version")
             message = (
