@@ -12,7 +12,7 @@ const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
 const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], LIMIT = [0.86, 0.05, 0.10], YIELDS = [0.90, 0.60, 0.0];
 const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
-const HEARD = 0.3; // share of the silence that lets go of an edge from which it is drawn broken
+const HEARD = 0.5; // share of the silence that lets go of an edge from which it is drawn broken
 const TRAIL = 8; // length of trails [s]
 const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
 const ORDER = [0, 3, 2, 1]; // rotors of `ROTORS` in the columns: front left, front right, rear right, rear left
