@@ -194,9 +194,7 @@ def network_of(mission: Mission) -> Links:
     both = np.concatenate([e for pairs in edges for e in (pairs, pairs[:, ::-1])])
     links = np.unique(both, axis=0).astype(np.int64)
     place = {pair: l for l, pair in enumerate(map(tuple, links.tolist()))}
-    # In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
-    recovers = 1.0 - net.loss if net.burst is None else 1.0 / net.burst
-    worsens = net.loss * recovers / (1.0 - net.loss)
+    worsens, recovers = fading(net.loss, net.burst)
     seed = net.seed & 0xFFFFFFFF, net.seed >> 32 & 0xFFFFFFFF
     out = [
         [*(sorted(x - 1 for x in one.between) or (-1, -1)), one.start * rate, one.end * rate]
@@ -217,6 +215,15 @@ def network_of(mission: Mission) -> Links:
         outages=np.array(out, dtype=np.float64).reshape(-1, 4),
         lag=_ESTIMATE,
     )
+
+
+def fading(loss: float, burst: float | None) -> tuple[float, float]:
+    """Probabilities with which a link begins and ends to lose messages, by the share lost and the mean burst.
+
+    In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
+    """
+    recovers = 1.0 - loss if burst is None else 1.0 / burst
+    return loss * recovers / (1.0 - loss), recovers
 
 
 class TickTables:
