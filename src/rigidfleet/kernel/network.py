@@ -64,6 +64,7 @@ class Mail(NamedTuple):
     estimate: Floats  # (N, 6) of velocity [m/s], and of acceleration by what is not known [m/s^2]
     commanded: Floats  # (N, 3) acceleration by the desired force [m/s^2]
     pull: Floats  # (N, 3 (R - 1)) acceleration by each iterate of the constraint force [m/s^2]
+    mute: Bools  # (N,) whether a vehicle that follows a law of its own has nothing to say
     count: Ints  # (3, L) see `SENT`
     oldest: Ints  # (L,) greatest age of what i used of j [ticks]
     matrix: Floats  # (W, W) work, W the greatest number of links of a vehicle
@@ -105,7 +106,7 @@ def send(k, S, silent, net, mail):
     """Broadcast at tick k what is posted, over each link of vehicles at S (N, 17) that are not ``silent`` (N,)."""
     for l in range(net.links.shape[0]):
         i, j = net.links[l, 0], net.links[l, 1]
-        if silent[j]:
+        if silent[j] or mail.mute[j]:
             continue
         mail.count[SENT, l] += 1
         draw = chance(net.seed, _FADES, net.links[l], k)
@@ -166,7 +167,7 @@ def empty_mail(net: Network, iterations: int) -> Mail:
         np.zeros((depth, n, columns)), np.zeros((depth, links, shares)), np.full((links, depth), _NEVER),
         np.full(links, _NEVER), message, message.copy(), share, share.copy(), np.zeros(links, dtype=np.bool_),
         np.zeros(links, dtype=np.bool_), np.zeros(links), np.full(links, _NEVER), share.copy(), np.zeros((n, 6)),
-        np.zeros((n, 3)), np.zeros((n, 3 * iterations)),
+        np.zeros((n, 3)), np.zeros((n, 3 * iterations)), np.zeros(n, dtype=np.bool_),
         np.zeros((3, links), dtype=np.int64), np.zeros(links, dtype=np.int64), np.zeros((most, most)),
         np.zeros((most, 10)),
     )  # fmt: skip

@@ -15,6 +15,7 @@ from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.control import local_law
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
+    ANSWERED,
     CONSTRAINT_FORCE,
     ERROR,
     FORCE,
@@ -22,6 +23,7 @@ from rigidfleet.kernel.fleet import (
     LAW_TIME,
     LAWS,
     LOAD,
+    OWN,
     SAMPLES,
     STEPS,
     TICKS,
@@ -36,7 +38,7 @@ from rigidfleet.kernel.neighbours import estimate_acceleration, hold_edges, solv
 from rigidfleet.kernel.network import PULL, SATURATED, A, R, U, V, receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
-from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
 from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
@@ -147,8 +149,8 @@ def expect_drag(i, v, share, vehicles, state):
 
 @jit
 def take_force(k, i, dt, p, w, flight, state):
-    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
-    vehicles, guidance = flight.vehicles, flight.guidance
+    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it, if it is not its own."""
+    vehicles, guidance, own = flight.vehicles, flight.guidance, flight.commands.kind == OWN
     m, pull = p.vehicles.m[i], 0.0
     for q in range(3):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
@@ -157,9 +159,9 @@ def take_force(k, i, dt, p, w, flight, state):
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
-        if guidance.drag[i] > 0.0:
+        if guidance.drag[i] > 0.0 and not own:
             expect_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
-        for q in range(3):
+        for q in range(0 if own else 3):
             if not state.saturated[i]:
                 known = state.seen[i, q] + path_at(k, i, q, flight.tables)
                 state.error[i, q] += dt * (known - w.r_ref[i, q])
@@ -179,13 +181,8 @@ def worse(i, kind, value, t, state):
 
 
 @jit
-def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
-    """Desired force of each vehicle from its own measured state, the plan and its neighbours' messages.
-
-    ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
-    """
-    net, mail, tick = flight.network, state.mail, flight.steps * flight.h
-    state.work.law_time[0] = t
+def know(k, t, p, w, flight, state):
+    """What each vehicle knows at tick k, time t [s], beside messages: its measured state and the plan, into w."""
     known_states(k, w, flight, state)
     if p.reference.kind == SHAPE or p.control.kind == TRACKING:
         blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
@@ -198,6 +195,18 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
     distance_references(
         t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
     )
+
+
+@jit
+def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
+    """Desired force of each vehicle from its own measured state, the plan and its neighbours' messages.
+
+    ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
+    Vehicles that follow laws of their own have answered in ``state.f_u`` with their whole force.
+    """
+    net, mail, tick = flight.network, state.mail, flight.steps * flight.h
+    state.work.law_time[0] = t
+    know(k, t, p, w, flight, state)
     state.integral[:] = 0.0
     last = mail.multiplier.shape[1] - 1
     for i in range(state.S.shape[0]):
@@ -205,7 +214,11 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             continue
         estimate_acceleration(i, dt, w.v[i], net, mail)
         hold_edges(i, k, flight.every, net, mail)
-        solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
+        if flight.commands.kind == OWN:
+            for q in range(3):
+                w.f_u[i, q], w.f_C[i, q] = state.f_u[i, q], 0.0
+        else:
+            solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         take_force(k, i, dt, p, w, flight, state)
         for q in range(3):
             mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
@@ -292,7 +305,7 @@ def tick(k, t, p, w, flight, state, call):
     measure(k, flight, state)
     if flight.network.every > 0:
         receive(k, flight.network, state.mail)
-    due = flight.commands.kind == FORCE and k % flight.every == 0
+    due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
     if due and not desire(k, t, p, w, flight, state, call):
         return False
     for i in range(state.S.shape[0]):
@@ -460,17 +473,28 @@ def advance_fleet(t, h, p, flight, state):
 
 
 @jit
+def look(k, t, p, w, flight, state):
+    """Measure at tick k, time t [s]; where vehicles follow laws of their own, have ready what they know there."""
+    measure(k, flight, state)
+    if flight.commands.kind == OWN:
+        receive(k, flight.network, state.mail)
+        know(k, t, p, w, flight, state)
+
+
+@jit
 def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 
     Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
     gives no force (a singular law) or a user's function none: states and time are then those before. A pause changes no
     bit of the flight, unless ``t_end`` lies between two steps, where it divides one. With no steps to do, a flight at a
-    tick measures what the law will know there; to measure once more changes nothing.
+    tick measures what the law will know there; to measure once more changes nothing. Where vehicles follow laws of
+    their own, it returns ASKS before each of their ticks, with what they know in w and the mail: their forces go into
+    ``state.f_u``, and tick + 1 into ``state.count``.
     """
     count, clock = state.count, state.clock
     if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
-        measure(count[TICKS], flight, state)
+        look(count[TICKS], clock[TIME], p, w, flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[TIME], count[STEPS]
@@ -482,6 +506,9 @@ def fly_ticks(p, w, flight, state, call):
         if step % flight.steps == 0 and count[TICKS] == k:
             if k >= flight.tables.last:
                 return PAUSED
+            if flight.commands.kind == OWN and k % flight.every == 0 and count[ANSWERED] <= k:
+                look(k, t, p, w, flight, state)
+                return ASKS
             if not tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1
