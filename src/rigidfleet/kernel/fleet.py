@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.kernel.network import Mail, Network, empty_mail, no_network
+from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
 from rigidfleet.solids.records import Solids, join
@@ -217,7 +217,7 @@ class SampledFlight(NamedTuple):
     vehicles: Quadrotors
     air: Air
     sensing: Sensing
-    network: Network  # how vehicles know each other
+    network: Links  # how vehicles know each other
     guidance: Guidance
     tables: TickInputs
     commands: Commands

@@ -34,8 +34,14 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
-from rigidfleet.kernel.neighbours import estimate_acceleration, hold_edges, solve_own_edges
-from rigidfleet.kernel.network import PULL, SATURATED, A, R, U, V, receive, send
+from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
+from rigidfleet.kernel.neighbours import (
+    bring_forward,
+    estimate_acceleration,
+    hold_edges,
+    solve_own_edges,
+)
+from rigidfleet.kernel.network import receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
 from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
@@ -248,12 +254,41 @@ def post(k, p, w, flight, state):
             message[R + q], message[V + q] = w.r[i, q], w.v[i, q]
             message[A + q] = mail.commanded[i, q] + mail.estimate[i, 3 + q]
             message[U + q] = m * state.f_u[i, q]
+            message[SLOT + q], message[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
+            message[SLOT + 6 + q] = w.a_ref[i, q]
+        message[TRACKED] = 1.0 if p.control.kind == TRACKING else 0.0
         message[SATURATED] = 1.0 if state.saturated[i] else 0.0
         for q in range(mail.pull.shape[1]):
             message[PULL + q] = mail.pull[i, q]
     for l in range(mail.multiplier.shape[0]):
         for q in range(mail.multiplier.shape[1]):
             mail.posted[row, l, q] = mail.multiplier[l, q]
+
+
+@jit
+def is_foreseen(j, k, p, w, flight, mail):
+    """Whether neighbours guess at tick k where vehicle j is, in w.r, well enough by its last broadcast."""
+    net, since, square = flight.network, k - mail.said[j], 0.0
+    if net.event == 0.0 or mail.said[j] == NONE or since >= net.longest:
+        return False
+    age, tracks = since * flight.steps * flight.h, p.control.kind == TRACKING
+    for q in range(3):
+        place, _, _ = bring_forward(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
+        square += (w.r[j, q] - place) ** 2
+    return square < net.event**2
+
+
+@jit
+def fall_silent(k, p, w, flight, state):
+    """Decide which vehicles do not broadcast what they have posted at tick k; keep what the others send."""
+    mail = state.mail
+    for j in range(state.S.shape[0]):
+        quiet = flight.vehicles.lost[j] or mail.mute[j]
+        mail.silent[j] = quiet or is_foreseen(j, k, p, w, flight, mail)
+        if not mail.silent[j]:
+            mail.said[j] = k
+            for q in range(mail.last.shape[1]):
+                mail.last[j, q] = mail.post[k % mail.due.shape[1], j, q]
 
 
 @jit
@@ -315,7 +350,8 @@ def tick(k, t, p, w, flight, state, call):
     if flight.network.every > 0:
         post(k, p, w, flight, state)
         if k % flight.network.every == 0:
-            send(k, state.S, flight.vehicles.lost, flight.network, state.mail)
+            fall_silent(k, p, w, flight, state)
+            send(k, state.S, flight.network, state.mail)
     return True
 
 

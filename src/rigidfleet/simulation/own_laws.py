@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError
 from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
+from rigidfleet.kernel.mail import NONE
 from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
 from rigidfleet.typing import Floats
 
@@ -89,6 +90,8 @@ class OwnLaws:
         self.said: deque[list[Any]] = deque(maxlen=(net.delay + net.jitter) // flight.every + 2)
         #: Of each link, the tick at which the newest message was written, and what it says.
         self.newest: list[tuple[int, Any]] = [(-1, None)] * len(pairs)
+        #: Of each link with an edge, its length [m] and the rate of that [m/s].
+        self.lengths: dict[int, tuple[float, float]] = {}
         self.numbers = 0  # in the longest message
 
     def ask(
@@ -121,7 +124,7 @@ class OwnLaws:
         slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
         known = np.stack([w.r, w.v, *slots])
         masses, lost = problem.vehicles.m.tolist(), flight.vehicles.lost.tolist()
-        edges, d, d_dot = state.mail.edge.tolist(), w.d.tolist(), w.d_dot.tolist()
+        self._take_lengths(state.mail.edge.tolist(), w.d.tolist(), w.d_dot.tolist())
         views: list[View | None] = []
         for i, links in enumerate(self.links):
             if lost[i]:
@@ -129,12 +132,12 @@ class OwnLaws:
                 continue
             r, v, r_ref, v_ref, a_ref = known[:, i].copy()
             rotors = () if self.points[i] else np.split(S[i, 6:].copy(), (4, 7))
-            held = [(j, edges[l]) for l, j in links if edges[l] >= 0]
+            held = [(j, *self.lengths[l]) for l, j in links if l in self.lengths]
             heard = [(j, *self.newest[l]) for l, j in links if self.newest[l][0] >= 0]
             views.append(
                 View(
                     i, t, dt, phase, masses[i], g, r, v, r_ref, v_ref, a_ref,
-                    {j: d[c] for j, c in held}, {j: d_dot[c] for j, c in held},
+                    {j: d for j, d, _ in held}, {j: rate for j, _, rate in held},
                     {j: Message(content, (k - written) * self.tick) for j, written, content in heard},
                     self.memories[i], *rotors,
                 )
@@ -175,6 +178,16 @@ class OwnLaws:
                 written = stamps[l] // self.every
                 if stamps[l] >= 0 and written * self.every > self.newest[l][0]:
                     self.newest[l] = written * self.every, self.said[written - now][j]
+
+    def _take_lengths(
+        self, edges: Sequence[int], d: Sequence[float], d_dot: Sequence[float]
+    ) -> None:
+        """Lengths of the phase's edges; what has lost its other end keeps its last one, as nobody has told."""
+        for l, c in enumerate(edges):
+            if c >= 0:
+                self.lengths[l] = d[c], d_dot[c]
+            elif c == NONE:
+                self.lengths.pop(l, None)
 
     def _force(self, i: int, force: ArrayLike, state: SampledState) -> Floats:
         remedy = ": return a force (3,) [N], weight included, and a message"

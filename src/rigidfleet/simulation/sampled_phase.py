@@ -12,7 +12,7 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.network import assign_edges
+from rigidfleet.kernel.mail import assign_edges
 from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
@@ -113,7 +113,10 @@ class SampledPhase(Stepper):
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
-        assign_edges(self.flight.network, begun.mail, plan.edges, integral)
+        lose = (
+            self.first_tick is not None
+        )  # edges that end within a phase are those of what is lost
+        assign_edges(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
