@@ -92,6 +92,8 @@ class OwnLaws:
         self.newest: list[tuple[int, Any]] = [(-1, None)] * len(pairs)
         #: Of each link with an edge, its length [m] and the rate of that [m/s].
         self.lengths: dict[int, tuple[float, float]] = {}
+        #: The views last made, with their tick and problem: who looks before the flight asks has the same ones.
+        self.last: tuple[int, Problem, list[View | None]] | None = None
         self.numbers = 0  # in the longest message
 
     def ask(
@@ -119,6 +121,8 @@ class OwnLaws:
     ) -> list[View | None]:
         """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
         k, S, tracks = int(state.count[TICKS]), state.S, problem.control.kind == TRACKING
+        if self.last is not None and self.last[0] == k and self.last[1] is problem:
+            return self.last[2]
         t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
         self._open(k, state.mail.stamp.tolist())
         slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
@@ -142,6 +146,7 @@ class OwnLaws:
                     self.memories[i], *rotors,
                 )
             )  # fmt: skip
+        self.last = k, problem, views
         return views
 
     def take(self, answers: Sequence[Any], flight: SampledFlight, state: SampledState) -> None:
