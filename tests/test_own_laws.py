@@ -298,3 +298,73 @@ def test_the_verdict_is_on_the_own_law():
     assert passed.passed, passed.summary
     assert not failed.by_name["speed"].passed
     assert passed.uncalled == ""
+
+
+# -- in sweeps -------------------------------------------------------------------------------------------
+
+LAW = """
+class Own:
+    def __init__(self):
+        self.agent = None
+
+    def __call__(self, me):
+        assert self.agent in (None, me.agent)  # an object a vehicle
+        self.agent = me.agent
+        return follow(me)
+
+
+def follow(me):
+    a = me.reference_acceleration - 2.0 * (me.position - me.reference_position) - 2.8 * me.velocity
+    a[2] += me.gravity
+    return me.mass * a, me.position
+"""
+
+
+def test_a_sweep_flies_own_laws_by_name(tmp_path, monkeypatch):
+    """Rows are those of `simulate` with the law, over runs that vary what links lose."""
+    from rigidfleet.assessment import assess
+    from rigidfleet.sweep import Sweep, fly
+    from rigidfleet.sweep.metrics import measure
+
+    (tmp_path / "a_law_of_each.py").write_text(LAW)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    m = mission({"delay": 0.02})
+    sweep = Sweep.of(m, ["network.loss = grid(0.0, 0.5)"], agent="a_law_of_each:Own")
+    table = fly(sweep, "swept", workers=1)
+    for k in range(2):
+        flown = rf.simulate(sweep.mission_of(k), agent=sweep.law[0])
+        assert measure(flown, assess(flown))["thrust"] == table.metrics["thrust"][k]
+    assert Sweep.from_json(sweep.json()).version == sweep.version
+    assert "a_law_of_each:Own" in sweep.version
+
+
+@pytest.mark.parametrize(
+    ("network", "keys", "key", "words"),
+    [
+        (None, {}, "agent", "needs a network"),
+        ({}, {"controller": "a_law_of_each:follow"}, "agent", "does not go with a controller"),
+        ({}, {"agent": "a_law_of_each:no"}, "agent", "cannot be imported"),
+        ({}, {"rate": 20.0}, "rate", "is that of a controller"),
+        ({}, {"evaluate": "final"}, "agent", "does not act on final states"),
+    ],
+)
+def test_what_a_sweep_of_own_laws_cannot_be_is_refused(
+    tmp_path, monkeypatch, network, keys, key, words
+):
+    """Each in a finding of its key."""
+    from rigidfleet.errors import SweepError
+    from rigidfleet.sweep import Sweep
+
+    (tmp_path / "a_law_of_each.py").write_text(LAW)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(SweepError) as refused:
+        Sweep.of(
+            mission(network),
+            ["agents.mass.1 = uniform(1, 2)"],
+            runs=2,
+            **({"agent": "a_law_of_each:follow"} | keys),
+        )
+    assert any(
+        finding.key == key and words in finding.problem for finding in refused.value.findings
+    )
