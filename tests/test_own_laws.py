@@ -188,6 +188,10 @@ def test_with_jitter_and_loss_the_newest_message_is_kept():
     contents = np.array([v.t - v.inbox[1].content for v in views if v.agent == 0 and 1 in v.inbox])
     np.testing.assert_allclose(ages, contents, atol=1e-9)
     assert ages.max() > 0.1 > ages.min()
+    assert result.oldest_message is not None
+    assert result.oldest_message[0, 0] == pytest.approx(ages.max())
+    assert result.messages is not None
+    assert (result.messages[..., 0] == 200).all()
     assert result.statistics["message_numbers"] == 1
 
 

@@ -295,6 +295,7 @@ class SampledSegment(NamedTuple):
     layers: Ints  # (K, N)
     integral: Floats  # (K, m) of the constraints
     frame: Floats  # (K, 4)
+    stamp: Ints  # (K, L) tick at which the newest message of each link was sent
 
 
 class Evaluation(NamedTuple):
@@ -487,13 +488,14 @@ def _work(n: int, m: int) -> SampledWork:
 
 
 def segment(
-    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS
+    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS, links: int = 0
 ) -> SampledSegment:
-    """A flight to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
+    """A flight of n vehicles with m edges to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
     at = np.ascontiguousarray(times, dtype=float)
     k = len(at)
     return SampledSegment(
         t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
         np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
         np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, m)), np.empty((k, 4)),
+        np.empty((k, links), dtype=np.int64),
     )  # fmt: skip

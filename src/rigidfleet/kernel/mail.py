@@ -91,7 +91,7 @@ def empty_mail(net: Links, iterations: int) -> Mail:
     columns, shares = PULL + 3 * iterations, iterations + 1
     most = int(np.diff(net.first).max(initial=0))
     message, share = np.zeros((links, columns)), np.zeros((links, shares))
-    if not links:
+    if not net.every:  # no network
         n = 0
     return Mail(
         np.zeros((depth, n, columns)), np.zeros((depth, links, shares)), np.full((links, depth), NONE),

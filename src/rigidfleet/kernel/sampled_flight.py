@@ -432,6 +432,8 @@ def write_samples(t, h, p, flight, state, call):
                 state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]
             )
         normalise(call.frame[c])
+        for l in range(call.stamp.shape[1]):
+            call.stamp[c, l] = state.mail.stamp[l]
         count[SAMPLES] = c + 1
 
 

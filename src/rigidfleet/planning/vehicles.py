@@ -196,9 +196,7 @@ def network_of(mission: Mission) -> Links:
     both = np.concatenate([e for pairs in edges for e in (pairs, pairs[:, ::-1])])
     links = np.unique(both, axis=0).astype(np.int64)
     place = {pair: l for l, pair in enumerate(map(tuple, links.tolist()))}
-    # In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
-    recovers = 1.0 - net.loss if net.burst is None else 1.0 / net.burst
-    worsens = net.loss * recovers / (1.0 - net.loss)
+    worsens, recovers = fading(net.loss, net.burst)
     every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
     # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
@@ -226,6 +224,15 @@ def network_of(mission: Mission) -> Links:
         longest=max(longest // every * every, 1),
         lag=_ESTIMATE,
     )
+
+
+def fading(loss: float, burst: float | None) -> tuple[float, float]:
+    """Probabilities with which a link begins and ends to lose messages, by the share lost and the mean burst.
+
+    In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
+    """
+    recovers = 1.0 - loss if burst is None else 1.0 / burst
+    return loss * recovers / (1.0 - loss), recovers
 
 
 class TickTables:

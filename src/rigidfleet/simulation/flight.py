@@ -47,6 +47,7 @@ from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import Counts
+    from rigidfleet.kernel.mail import Links, Mail
 
 __all__ = [
     "AttitudeCommand", "Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "RotorCommand",
@@ -516,6 +517,16 @@ class Flight:
             self._ended = None
         return self.record(self.pieces, None if own else self._asked)
 
+    @property
+    def network(self) -> tuple[Links, Mail] | None:
+        """The network of the vehicles, and what was sent on it; None without one."""
+        return None if self._vehicles is None else self._vehicles.network
+
+    def lose(self, loss: float) -> None:
+        """Let links lose a share of the messages from now on, if there are any."""
+        if self._vehicles is not None:
+            self._vehicles.lose(loss)
+
     def record(
         self,
         pieces: list[Piece],
@@ -547,7 +558,9 @@ class Flight:
         if mission.avoidance is not None and self.external is not None:
             statistics["pushed"] = True  # by a force that avoidance does not know
         ending = self.ending if ending is None else ending
-        result = assemble(mission, phases, pieces, ending=ending, statistics=statistics)
+        result = assemble(
+            mission, phases, pieces, ending=ending, statistics=statistics, network=self.network
+        )
         result.mission = mission  # keeps the slots assigned and edges that it has computed
         return result
 

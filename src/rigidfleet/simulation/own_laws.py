@@ -125,6 +125,12 @@ class OwnLaws:
             return self.last[2]
         t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
         self._open(k, state.mail.stamp.tolist())
+        np.maximum(
+            state.mail.oldest,
+            k - state.mail.stamp,
+            out=state.mail.oldest,
+            where=state.mail.stamp >= 0,
+        )
         slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
         known = np.stack([w.r, w.v, *slots])
         masses, lost = problem.vehicles.m.tolist(), flight.vehicles.lost.tolist()

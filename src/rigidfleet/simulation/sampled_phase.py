@@ -12,13 +12,20 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.mail import assign_edges
+from rigidfleet.kernel.mail import Links, Mail, assign_edges
 from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
-from rigidfleet.planning.vehicles import TickTables, YawTurn, first_yaw, sampled_flight, turn_from
+from rigidfleet.planning.vehicles import (
+    TickTables,
+    YawTurn,
+    fading,
+    first_yaw,
+    sampled_flight,
+    turn_from,
+)
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -59,7 +66,20 @@ class FleetState:
         self.state: fleet.SampledState | None = None  # of the phase before
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
         self.output_step = mission.output_step
+        self.burst = None if mission.network is None else mission.network.burst
         self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
+
+    @property
+    def network(self) -> tuple[Links, Mail] | None:
+        """The network, and what was sent on it; None without one, or before the flight."""
+        links = self.flight.network
+        return (links, self.state.mail) if links.every and self.state is not None else None
+
+    def lose(self, loss: float) -> None:
+        """Let links lose a share of the messages from now on."""
+        worsens, recovers = fading(loss, self.burst)
+        network = self.flight.network._replace(worsens=worsens, recovers=recovers)
+        self.flight = self.flight._replace(network=network)
 
 
 class SampledPhase(Stepper):
@@ -262,7 +282,10 @@ class SampledPhase(Stepper):
         self.flown = problem
         times = phase.times(t_end)
         phase.begun, arrays = True, self.vehicles.avoidance
-        call = fleet.segment(n, m, t_end, times, _STEPS)
+        network = self.vehicles.flight.network
+        self.flight = self.flight._replace(network=network)
+        links = len(network.links)
+        call = fleet.segment(n, m, t_end, times, _STEPS, links=links)
         sampled.count[fleet.SAMPLES] = 0
         status, laws = records.PAUSED, self.vehicles.laws
         try:
@@ -361,7 +384,7 @@ class SampledPhase(Stepper):
         planned = native.record(
             plan.problem, self.phase.workspace, times, np.concatenate(parts, axis=1)
         )
-        out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
+        out, kept = _as_flown(planned, call, done, self.flight, problem)
         self.phase.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
     def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
@@ -378,11 +401,11 @@ def _as_flown(
     planned: Record,
     call: fleet.SampledSegment,
     done: int,
-    vehicles: fleet.Quadrotors,
+    flight: fleet.SampledFlight,
     problem: Problem,
 ) -> tuple[Record, VehicleSamples]:
     """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
-    S, a = call.S[:done], call.dS[:done, :, 3:6]
+    S, a, vehicles = call.S[:done], call.dS[:done, :, 3:6], flight.vehicles
     curves = vehicles.thrust.T[..., None]
     rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
     T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
@@ -397,7 +420,10 @@ def _as_flown(
         a=a, f_E=rest, f_D=air, f_u=call.f_u[:done], f_C=call.f_C[:done],
         r_seen=seen[..., :3], v_seen=seen[..., 3:],
     )  # fmt: skip
+    stamp = call.stamp[:done]
+    sent = np.where(stamp < 0, np.nan, flight.start + stamp * flight.steps * flight.h)
     kept = VehicleSamples(
-        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done]
-    )
+        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done],
+        call.times[:done, None] - sent,
+    )  # fmt: skip
     return out, kept
