@@ -501,6 +501,16 @@ class Land(Vertical):
     lands: ClassVar[bool] = True
 
     kind: Literal["land"] = key("descend straight down to the ground")
+    places: Literal["below", "own"] = key(
+        "below: each vehicle lands where it is, often where another one stood; own: each goes to where it stood at the "
+        "start, straight or by levels, on ways that are proved, and then down",
+        "below",
+    )
+
+    @property
+    def spelled(self) -> bool:
+        """Whether there is one group, which lands where it is."""
+        return super().spelled and self.places == "below"
 
     @property
     def leads_to(self) -> str:
