@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
+from sample_missions import three_points, three_quadrotors
 from scipy.integrate import solve_ivp
 
 import rigidfleet as rf
@@ -17,7 +18,6 @@ from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
 from rigidfleet.simulation.together import simulate_together
 from rigidfleet.solids.polygons import Region, crossing
-from sample_missions import three_points, three_quadrotors
 
 L_SHAPE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], dtype=float)
 HOLE = np.array([[1, 1], [1, 3], [3, 3], [3, 1]], dtype=float)

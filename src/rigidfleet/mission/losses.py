@@ -70,7 +70,7 @@ def _abort(m: Draft) -> Breaches:
     options: Aborting | None = m.abort
     if options is not None:
         for k, agent in enumerate(options.agents):
-            yield from _loss(
+            yield from agents_exist(
                 m,
                 ("abort", "agents", k),
                 (agent,),
@@ -82,7 +82,7 @@ def _abort(m: Draft) -> Breaches:
     if begins >= m.end:
         problem = f"and the reaction of {options.reaction:g} s are not before the end of the mission at {m.end:g} s"
         yield Breach(("abort", "at"), problem, "give an earlier time or remove it")
-    for k, p in _under_way(m.phases, begins):
+    for k, p in under_way(m.phases, begins):
         if p.control != "tracking":
             problem = f"may be under way at the abort at {begins:g} s, but only tracked slots can slow down"
             remedy = "use control = 'tracking', or abort at another time"

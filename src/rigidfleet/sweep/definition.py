@@ -506,6 +506,9 @@ def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -
             collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
     if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
         collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
+    if drill.links and mission is not None and mission.network is None:
+        problem = "has no effect: without [network], one law knows all states"
+        collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
     grids = drill.grids(1 if mission is None else mission.n_agents)
     if not grids:
         collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
