@@ -20,13 +20,14 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
 STATES = 17
-#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors.
-FORCE, ATTITUDE, ROTORS = range(3)
+#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors;
+#: forces by laws of their own, which the flight asks for.
+FORCE, ATTITUDE, ROTORS, OWN = range(4)
 #: Places in `SampledState.clock`: the time, and that of the last evaluation of the law [s].
 TIME, LAW_TIME = range(2)
 #: Places in `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
-#: written, steps in the trail.
-STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
+#: written, steps in the trail, ticks up to which own laws have answered.
+STEPS, TICKS, LAWS, SAMPLES, TRAILED, ANSWERED = range(6)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
 #: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
 UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
@@ -234,7 +235,7 @@ class SampledState(NamedTuple):
 
     S: Floats  # (N, 17) true states
     clock: Floats  # (2,) see `TIME`
-    count: Ints  # (5,) see `STEPS`
+    count: Ints  # (6,) see `STEPS`
     integral: (
         Floats  # (m,) of the constraints [m s]; with a network, the mean of what both ends hold
     )
@@ -444,7 +445,7 @@ def begin(
         none = np.zeros(0)
         trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
-        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
+        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(ANSWERED + 1, dtype=np.int64),
         integral=np.zeros(m), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),

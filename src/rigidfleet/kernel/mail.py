@@ -42,6 +42,8 @@ class Links(NamedTuple):
     first: Ints  # (N + 1,) first link of each vehicle
     reverse: Ints  # (L,) link (j, i) of each link (i, j)
     outages: Floats  # (O, 4) vehicles, from 0 and -1 for all, and from and until which tick no message is sent
+    event: float  # distance [m] by which neighbours guess a vehicle wrongly before it sends; 0: it always sends
+    longest: int  # ticks after which it sends nevertheless
     lag: float  # time constant with which vehicles estimate the acceleration by what they do not know [s]
 
 
@@ -69,6 +71,10 @@ class Mail(NamedTuple):
     estimate: Floats  # (N, 6) of velocity [m/s], and of acceleration by what is not known [m/s^2]
     commanded: Floats  # (N, 3) acceleration by the desired force [m/s^2]
     pull: Floats  # (N, 3 (R - 1)) acceleration by each iterate of the constraint force [m/s^2]
+    mute: Bools  # (N,) whether a vehicle that follows a law of its own has nothing to say
+    silent: Bools  # (N,) whether a vehicle did not send when it could, the last time
+    said: Ints  # (N,) tick of each vehicle's last broadcast; `NONE`
+    last: Floats  # (N, Q) that message
     count: Ints  # (3, L) see `SENT`
     oldest: Ints  # (L,) greatest age of what i used of j [ticks]
     matrix: Floats  # (W, W) work, W the greatest number of links of a vehicle
@@ -80,7 +86,7 @@ def no_network(n: int) -> Links:
     none = np.zeros(0, dtype=np.int64)
     return Links(
         0, 1, 0, 0.0, 1.0, math.inf, 1, np.zeros(2, dtype=np.int64), np.zeros((0, 2), dtype=np.int64),
-        np.zeros(n + 1, dtype=np.int64), none, np.zeros((0, 4)), 1.0,
+        np.zeros(n + 1, dtype=np.int64), none, np.zeros((0, 4)), 0.0, 1, 1.0,
     )  # fmt: skip
 
 
@@ -96,7 +102,8 @@ def empty_mail(net: Links, iterations: int) -> Mail:
         np.zeros((depth, n, columns)), np.zeros((depth, links, shares)), np.full((links, depth), NONE),
         np.full(links, NONE), message, message.copy(), share, share.copy(), np.zeros(links, dtype=np.bool_),
         np.zeros(links, dtype=np.bool_), np.zeros(links), np.full(links, NONE), np.zeros(links), share.copy(),
-        np.zeros((n, 6)), np.zeros((n, 3)), np.zeros((n, 3 * iterations)),
+        np.zeros((n, 6)), np.zeros((n, 3)), np.zeros((n, 3 * iterations)), np.zeros(n, dtype=np.bool_),
+        np.zeros(n, dtype=np.bool_), np.full(n, NONE), np.zeros((n, columns)),
         np.zeros((3, links), dtype=np.int64), np.zeros(links, dtype=np.int64), np.zeros((most, most)),
         np.zeros((most, 6)),
     )  # fmt: skip

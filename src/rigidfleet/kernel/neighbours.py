@@ -161,7 +161,8 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
             for q in range(3):
                 dot += rows[a, _UNIT + q] * rows[b, _UNIT + q]
             matrix[a, b] = mbar * inverse[i] * dot
-        matrix[a, a] = mbar * (inverse[i] + inverse[j]) + mu
+        # An edge that slips gives way: without a grip it would have no force, and the others all of it.
+        matrix[a, a] = (mbar * (inverse[i] + inverse[j]) + mu) / mail.grip[int(rows[a, _LINK])]
     if d == 0 or not cholesky(matrix[:d, :d]):
         # Nobody to hold on to; or, without damping, no force at this shape: the law of all edges has none either.
         if d > 0:
@@ -183,7 +184,7 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
             mail.pull[i, 3 * n + q] = 0.0
         for a in range(d):
             l = int(rows[a, _LINK])
-            mail.multiplier[l, n] = mail.grip[l] * rows[a, _UNKNOWN]
+            mail.multiplier[l, n] = rows[a, _UNKNOWN]
             for q in range(3):
                 mail.pull[i, 3 * n + q] += mail.multiplier[l, n] * rows[a, _UNIT + q] * inverse[i]
     for q in range(3):

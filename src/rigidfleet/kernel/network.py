@@ -42,11 +42,11 @@ def is_out(k, i, j, outages):
 
 
 @jit
-def send(k, S, silent, net, mail):
-    """Broadcast at tick k what is posted, over each link of vehicles at S (N, 17) that are not ``silent`` (N,)."""
+def send(k, S, net, mail):
+    """Broadcast at tick k what is posted, over each link of vehicles at S (N, 17) that are not silent."""
     for l in range(net.links.shape[0]):
         i, j = net.links[l, 0], net.links[l, 1]
-        if silent[j]:
+        if mail.silent[j]:
             continue
         mail.count[SENT, l] += 1
         draw = chance(net.seed, _FADES, net.links[l], k)

@@ -47,6 +47,8 @@ _LEFT = 0.2
 _TURN_TIME = 3.0
 #: Time constant with which vehicles in a network estimate the acceleration by what they do not know [s].
 _ESTIMATE = 0.15
+#: Probability with which all messages that a vehicle owes its neighbours within the time of silence are lost.
+_ALL_LOST = 1e-3
 
 
 def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.SampledFlight:
@@ -195,24 +197,31 @@ def network_of(mission: Mission) -> Links:
     links = np.unique(both, axis=0).astype(np.int64)
     place = {pair: l for l, pair in enumerate(map(tuple, links.tolist()))}
     worsens, recovers = fading(net.loss, net.burst)
+    every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
+    delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
+    # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
+    tries = math.ceil(math.log(_ALL_LOST) / math.log(1.0 - recovers)) if recovers < 1.0 else 1
+    longest = (silence - delay - jitter) // max(tries, 2)
     seed = net.seed & 0xFFFFFFFF, net.seed >> 32 & 0xFFFFFFFF
     out = [
         [*(sorted(x - 1 for x in one.between) or (-1, -1)), one.start * rate, one.end * rate]
         for one in net.outages
     ] + [[*(x - 1 for x in one.between), one.time * rate, np.inf] for one in net.lost]
     return Links(
-        every=max(1, round(rate / net.sent_rate(n))),
-        delay=max(1, round(net.delay * rate)),
-        jitter=round(net.jitter * rate),
+        every=every,
+        delay=delay,
+        jitter=jitter,
         worsens=worsens,
         recovers=recovers,
         range=net.range if net.range is not None else np.inf,
-        silence=max(1, round(net.silence * rate)),
+        silence=silence,
         seed=np.array(seed, dtype=np.int64),
         links=links,
         first=np.searchsorted(links[:, 0], np.arange(n + 1)).astype(np.int64),
         reverse=np.array([place[j, i] for i, j in links.tolist()], dtype=np.int64),
         outages=np.array(out, dtype=np.float64).reshape(-1, 4),
+        event=net.event or 0.0,
+        longest=max(longest // every * every, 1),
         lag=_ESTIMATE,
     )
 

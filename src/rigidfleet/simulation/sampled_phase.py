@@ -36,6 +36,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
+from rigidfleet.simulation.own_laws import Law, OwnLaws, View
 from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
 from rigidfleet.typing import Floats
 
@@ -50,8 +51,12 @@ _FAR = 1e9
 class FleetState:
     """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
 
-    def __init__(self, mission: Mission, max_step: float) -> None:
+    def __init__(self, mission: Mission, max_step: float, agent: Law | type | None = None) -> None:
         self.flight = sampled_flight(mission, max_step)
+        self.laws = None if agent is None else OwnLaws(agent, self.flight)
+        if self.laws is not None:
+            commands = self.flight.commands._replace(kind=fleet.OWN)
+            self.flight = self.flight._replace(commands=commands)
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
@@ -192,12 +197,10 @@ class SampledPhase(Stepper):
 
     def seen_by_controller(self, observation: Observation) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
-        phase, S = self.phase, self.sampled.S
+        S = self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
-            self._supply()
-            now = fleet.segment(len(S), len(phase.plan.edges), phase.t, max_steps=0)  # to measure
-            fly_ticks(phase.plan.problem, phase.workspace, self.flight, self.sampled, now)
+            self._look()
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
             # About the path of that tick, if there are any
             seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
@@ -205,6 +208,23 @@ class SampledPhase(Stepper):
             observation, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
             rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
+
+    def _look(self) -> None:
+        """Measure what the law will know if a tick is due."""
+        self._supply()
+        now = fleet.segment(
+            len(self.sampled.S), len(self.phase.plan.edges), self.phase.t, max_steps=0
+        )
+        fly_ticks(self.phase.plan.problem, self.phase.workspace, self.flight, self.sampled, now)
+
+    def views(self) -> list[View | None]:
+        """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
+        self._look()
+        phase, laws = self.phase, self.vehicles.laws
+        assert laws is not None
+        return laws.views(
+            phase.plan.phase.name, phase.plan.problem, phase.workspace, self.flight, self.sampled
+        )
 
     def drop_command(self) -> None:
         """Drop the last command of vehicles."""
@@ -267,12 +287,17 @@ class SampledPhase(Stepper):
         links = len(network.links)
         call = fleet.segment(n, m, t_end, times, _STEPS, links=links)
         sampled.count[fleet.SAMPLES] = 0
-        status = records.PAUSED
+        status, laws = records.PAUSED, self.vehicles.laws
         try:
-            while status == records.PAUSED:
-                self._supply()
+            while status in (records.PAUSED, records.ASKS):
+                if status == records.PAUSED:
+                    self._supply()
+                elif laws is not None:
+                    laws.ask(plan.phase.name, problem, phase.workspace, self.flight, sampled)
                 status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, arrays)
                 self._follow()
+                if status == records.ASKS:
+                    continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     phase.state.clock[records.TIME] = t_end
                 if phase.external is not None:
