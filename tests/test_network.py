@@ -357,3 +357,25 @@ def test_live_flying_loses_messages():
     sent, _, lost = (messages - before).sum(axis=(0, 1))
     assert before[..., LOST].sum() == 0
     assert 0.85 < lost / sent < 0.95
+
+
+def test_a_lost_vehicle_is_noticed_by_silence_alone():
+    """Neighbours hold on to what they last heard, let go after the silence, and no force jumps on the way."""
+    m = mission(
+        {},
+        vehicles={"p": {"model": "point", "mass": 1.0, "thrust_limit": 100.0, "drag": 1e-3}},
+        disturbances={
+            "gusts": {"model": "first-order", "intensity": 1e3, "time_scale": 2.0, "seed": 3},
+            "lost": [{"agent": 8, "time": 6.0}],
+        },
+        tracking={"Q": [1.0, 0.0], "R": 1.0},
+        output_step=0.02,
+    )
+    result = rf.simulate(m)
+    force, t = result.constraint_force[:, :7], result.time
+    steps = np.linalg.norm(np.diff(force, axis=0), axis=2).max(axis=1)
+    known = (t > 5.0) & (t < 6.0), (t > 6.0) & (t < 7.5)
+    assert np.linalg.norm(force, axis=2)[known[1]].max() > 1.0
+    assert steps[known[1][1:]].max() < 1.5 * steps[known[0][1:]].max()
+    words = "for want of messages, first at 6.50 s: 3-8, 4-8, 5-8, 6-8, 7-8"
+    assert any(words in note for note in rf.assess(result).notes)

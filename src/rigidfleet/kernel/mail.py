@@ -14,6 +14,11 @@ from rigidfleet.typing import Bools, Floats, Ints
 #: vehicle is saturated, whether it tracks a slot, position, velocity and acceleration of that slot (which whoever knows
 #: the plan need not be sent), and the acceleration by each iterate of the constraint force [m/s^2], three columns each.
 R, V, A, U, SATURATED, TRACKED, SLOT, PULL = 0, 3, 6, 9, 12, 13, 14, 23
+#: Share that a vehicle believes of what its neighbour does not know yet of it.
+FRESH = 0.5
+#: Share of the difference of two integrals that one message takes away, and how much longer it takes with each further
+#: message under way: more would overshoot.
+TOGETHER, UNDER_WAY = 0.1, 0.3
 #: Rows of `Mail.count`: messages sent, heard, lost.
 SENT, HEARD, LOST = range(3)
 #: No message, no edge.

@@ -18,14 +18,22 @@ import math
 
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
-from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
+from rigidfleet.kernel.mail import (
+    FRESH,
+    NONE,
+    PULL,
+    SATURATED,
+    SLOT,
+    TOGETHER,
+    TRACKED,
+    UNDER_WAY,
+    A,
+    R,
+    U,
+    V,
+)
 from rigidfleet.kernel.problem import ITERATED, TRACKING
 
-#: Share that a vehicle believes of what its neighbour does not know yet of it.
-_FRESH = 0.5
-#: Share of the difference of two integrals that one message takes away, and how much longer it takes with each further
-#: message under way: more would overshoot.
-_TOGETHER, _UNDER_WAY = 0.1, 0.3
 # Columns of `Mail.rows`: unit vector, right side, multiplier, link.
 _UNIT, _RIGHT, _UNKNOWN, _LINK = 0, 3, 4, 5
 
@@ -48,7 +56,7 @@ def estimate_acceleration(i, dt, v, net, mail):
 def agree(l, messages, mail):
     """Draw i's integral of the edge of link l towards j's, both as when the newest message was sent."""
     share = mail.multiplier.shape[1] - 1
-    part = min(_TOGETHER, _UNDER_WAY / max(messages, 1.0))
+    part = min(TOGETHER, UNDER_WAY / max(messages, 1.0))
     mail.multiplier[l, share] -= part * (mail.ours[l, share] - mail.theirs[l, share])
 
 
@@ -103,8 +111,8 @@ def constraint_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
         theirs, speed, put = bring_forward(j, q, age, heard, tracks, w, k1, k2)
         mine, pace, _ = bring_forward(i, q, age, own, tracks, w, k1, k2)
         # Where both are by what both know, and half of what only i knows of itself.
-        x[q] = mine + _FRESH * (w.r[i, q] - mine) - theirs
-        pace += _FRESH * (w.v[i, q] - pace) - speed
+        x[q] = mine + FRESH * (w.r[i, q] - mine) - theirs
+        pace += FRESH * (w.v[i, q] - pace) - speed
         distance += x[q] * x[q]
         along += x[q] * pace
         square += pace * pace
@@ -153,7 +161,8 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
             for q in range(3):
                 dot += rows[a, _UNIT + q] * rows[b, _UNIT + q]
             matrix[a, b] = mbar * inverse[i] * dot
-        matrix[a, a] = mbar * (inverse[i] + inverse[j]) + mu
+        # An edge that slips gives way: without a grip it would have no force, and the others all of it.
+        matrix[a, a] = (mbar * (inverse[i] + inverse[j]) + mu) / mail.grip[int(rows[a, _LINK])]
     if d == 0 or not cholesky(matrix[:d, :d]):
         # Nobody to hold on to; or, without damping, no force at this shape: the law of all edges has none either.
         if d > 0:
@@ -175,7 +184,7 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
             mail.pull[i, 3 * n + q] = 0.0
         for a in range(d):
             l = int(rows[a, _LINK])
-            mail.multiplier[l, n] = mail.grip[l] * rows[a, _UNKNOWN]
+            mail.multiplier[l, n] = rows[a, _UNKNOWN]
             for q in range(3):
                 mail.pull[i, 3 * n + q] += mail.multiplier[l, n] * rows[a, _UNIT + q] * inverse[i]
     for q in range(3):

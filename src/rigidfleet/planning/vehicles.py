@@ -200,7 +200,7 @@ def network_of(mission: Mission) -> Links:
     every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
     # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
-    tries = math.ceil(math.log(_ALL_LOST) / math.log(1.0 - recovers)) if net.loss else 1
+    tries = math.ceil(math.log(_ALL_LOST) / math.log(1.0 - recovers)) if recovers < 1.0 else 1
     longest = (silence - delay - jitter) // max(tries, 2)
     seed = net.seed & 0xFFFFFFFF, net.seed >> 32 & 0xFFFFFFFF
     out = [
