@@ -315,8 +315,7 @@ def test_faults_that_are_flown_are_missions():
     with pytest.raises(rf.SweepError, match=r"without \[network\], one law knows all states"):
         Sweep.of(rf.Mission.from_dict(data), [], drill={"links": [5]})
     agents = data["agents"]
-    vehicle = {"model": "point", "mass": 1.0, "thrust_limit": agents.pop("thrust_limit")}
-    agents.pop("mass", None)
+    vehicle = {"model": "point"} | {key: agents.pop(key) for key in ("mass", "thrust_limit")}
     data |= {"vehicles": {"p": vehicle}, "network": {}}
     agents["vehicle"] = "p"
     mission, n = rf.Mission.from_dict(data), 12
