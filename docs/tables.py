@@ -187,6 +187,8 @@ def _bounds() -> str:
         ("pairs of agents that touch, if all are as large as the largest", f"{bounds.TOUCHING:,}"),
         ("phases", f"{bounds.PHASES:,}"),
         ("obstacles", f"{bounds.OBSTACLES:,}"),
+        ("fences, and places with people", f"{bounds.FENCES:,}"),
+        ("corners of one of them", f"{bounds.CORNERS:,}"),
         ("points of a hull", f"{bounds.HULL:,}"),
         ("heights of a height map", f"{bounds.HEIGHTS:,}"),
         ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),

@@ -426,6 +426,18 @@ def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     yield limit_check(q, e, limit, words)
 
 
+def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """The fence that a vehicle comes nearest to or crosses farthest, and the fall that ends nearest to people."""
+    if (e := measured.worst(q.name)) is not None:
+        from rigidfleet.mission.boundaries import boundary_in_words  # takes long to load
+
+        limit, (agent, place) = q.limit_of(measured.mission), e.who.split(", ", 1)
+        words = boundary_in_words(q.name, agent, place, e.value, e.when)
+        words += f" (limit {limit:g} m)" if q.key else ""
+        passed = limit is None or q.rank(e.value) <= q.rank(limit) + SLACK
+        yield limit_check(q, e, limit, words, passed=passed)
+
+
 def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """Check the vehicle nearest to its own thrust limit; report the greatest thrust if another vehicle has it."""
     if (e := measured.worst(q.name)) is None:
@@ -512,6 +524,7 @@ _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = 
     "clearance": _clearance_checks,
     "lost": _loss_checks,
     "geofence": _geofence_check,
+    **dict.fromkeys(("fence", "soft_fence", "people"), _boundary_check),
     "thrust": _thrust_checks,
     "rotor_force": _rotor_check,
     "saturation": _saturation_check,

@@ -23,6 +23,7 @@ from rigidfleet.mission.bounds import (
     GAIN,
     MASS,
 )
+from rigidfleet.mission.fences import Fence, People
 from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
@@ -552,6 +553,10 @@ class Limits(Part):
         "minimum separation from an agent straight below [m]: height minus radii (downwash)", None
     )
     geofence: Geofence | None = key("box that no agent may leave", None)
+    people: LengthOrZero = key(
+        "least distance, as seen from above, at which a vehicle that fails falls past people [m]: less its radius",
+        0.0,
+    )
     saturation: Share = key(
         "maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
         0.01,
@@ -816,6 +821,8 @@ class Contents(MissionHeader):
         "formations by name: [formations.NAME]", default_factory=dict
     )
     obstacles: tuple[Obstacle, ...] = key("obstacles: [[obstacles]]", ())
+    fences: tuple[Fence, ...] = key("fences of polygons: [[fences]]", ())
+    people: tuple[People, ...] = key("places where people are: [[people]]", ())
     limits: Limits = key(
         "limits that the verdict checks: [limits]", default_factory=Limits.model_construct
     )

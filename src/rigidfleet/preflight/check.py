@@ -23,7 +23,7 @@ from rigidfleet.preflight.formations import SEARCHED, check_formations, formatio
 from rigidfleet.preflight.gains import check_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
-from rigidfleet.preflight.obstacles import obstacle_remarks
+from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
@@ -89,6 +89,7 @@ def check(
         *disturbance_remarks(mission, preflight),
         *offset_remarks(mission, preflight),
         *obstacle_remarks(mission, preflight),
+        *boundary_remarks(mission, preflight),
         *limit_remarks(mission, preflight),
         *waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
