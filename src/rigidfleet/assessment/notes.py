@@ -37,9 +37,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first_time(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
-    from rigidfleet.mission.describe import landings_in_words  # takes long to load, as the mission
-
-    if words := landings_in_words(measured.mission, measured.result.position[-1]):
+    if words := measured.mission.landings_in_words(measured.result.position[-1]):
         yield words
     yield from avoidance_notes(measured)
     yield from _samples_note(measured)

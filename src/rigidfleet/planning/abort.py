@@ -31,7 +31,6 @@ from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import proximity, series
 from rigidfleet.math.piecewise import Piecewise, join, pad
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.describe import STANDING
 from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.planning.certificate import certificate_of, of_ways
@@ -413,10 +412,9 @@ class Homes:
         self.mission, self.plan, self.judge = mission, plan, _Judge(mission, lost)
         self.to = to or mission.aborting.to
         start = mission.fleet.position
-        below = mission.height_at(*start.T)
-        stands = start[:, 2] - mission.fleet.radius - below
-        self.stands = bool(np.isfinite(below).all() and stands.max() <= STANDING)
-        self.start = np.column_stack([start[:, :2], below + ABOVE + mission.fleet.radius])
+        below = mission.height_at(*start.T) + ABOVE + mission.fleet.radius
+        self.stands = bool(mission.standing(start).all() and np.isfinite(below).all())
+        self.start = np.column_stack([start[:, :2], below])
         self.known: dict[bytes, tuple[int, Ways]] = {}
         self.moves = any(x.solid.moves for x in self.judge.things)
 

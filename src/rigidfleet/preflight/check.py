@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
-from rigidfleet.mission.describe import landings_in_words
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import complete_times
@@ -98,7 +97,7 @@ def check(
         *waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
-    if planned and (words := landings_in_words(mission, planned[-1].position[-1])):
+    if planned and (words := mission.landings_in_words(planned[-1].position[-1])):
         preflight.remarks.append(Remark("note", "landing", words))
     if not known:
         why = "later positions depend on distances alone and are known only in flight"
