@@ -47,7 +47,7 @@ def disturbed(m: rf.Mission, seed: int = 0, **changes: Any) -> tuple[Any, ...]:
     """The product's flight with every edge held, SMALL off its slots at random; ``changes`` of its network."""
     problem, work, flight, state = laid_out(m)
     loss_free = flight._replace(network=flight.network._replace(worsens=0.0))
-    fly(problem, work, loss_free, state, 60 + flight.network.silence)
+    fly(problem, work, loss_free, state, 2 * (flight.network.delay + flight.network.silence) + 60)
     assert (state.mail.grip == 1.0).all()
     flight = flight._replace(network=flight.network._replace(silence=10**9, **changes))
     state.S[:, :3] += SMALL * np.random.default_rng(seed).normal(size=(len(state.S), 3))
