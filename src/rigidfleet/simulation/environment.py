@@ -96,6 +96,7 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         self.action_spaces = {
             name: Box(-1.0, 1.0, (3 + numbers,), np.float32) for name in self.possible_agents
         }
+        self.silence = np.zeros(numbers)
         self.rng = np.random.default_rng()
         self._actions: dict[str, Vector] = {}
 
@@ -164,14 +165,16 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         out, r, v = np.zeros(self.size, dtype=np.float32), view.position, view.velocity
         if not math.isnan(view.reference_position[0]):
             out[:3], out[3:_SELF] = r - view.reference_position, v - view.reference_velocity
-        heard = [(k, j) for k, j in enumerate(self.neighbours[view.agent]) if j in view.inbox]
-        if heard:
-            own, rows = np.concatenate([r, v, np.zeros(self.numbers)]), [k for k, _ in heard]
-            parts = out[_SELF:].reshape(-1, self.width)
-            parts[rows, :3] = [
-                (1.0, view.inbox[j].age, view.distance.get(j, 0.0)) for _, j in heard
+        if neighbours := self.neighbours[view.agent]:
+            own, inbox, lengths = np.concatenate([r, v, self.silence]), view.inbox, view.distance
+            heard = [inbox.get(j) for j in neighbours]
+            parts = out[_SELF : _SELF + len(heard) * self.width].reshape(len(heard), self.width)
+            parts[:, :3] = [
+                (1.0, message.age, lengths.get(j, 0.0)) if message else (0.0, 0.0, 0.0)
+                for j, message in zip(neighbours, heard, strict=True)
             ]
-            parts[rows, 3:] = np.array([view.inbox[j].content for _, j in heard]) - own
+            said = [message.content if message else own for message in heard]
+            parts[:, 3:] = np.concatenate(said).reshape(len(heard), -1) - own
         return out
 
     def answer(self, view: View, action: Sequence[float] | Vector) -> tuple[Floats, Floats]:
