@@ -343,6 +343,21 @@ def test_check_refuses_a_network_that_is_not_borne(network, words):
     assert (growth_flown(flown.T, 20.0) > 0.0).mean() > 0.5
 
 
+def test_lossy_passage_is_refused_and_fails():
+    """Its check names the losses; flown, its vehicles leave their slots. With 30 % lost, both pass."""
+    data = rf.load_mission("lossy-passage").to_dict()
+    before = rf.check("lossy-passage", search=False)
+    fails = [remark for remark in before.remarks if remark.level == "fails"]
+    assert {remark.topic for remark in fails} == {"network"}
+    assert all("94 % of its messages are lost" in remark.text for remark in fails)
+    verdict = rf.assess(rf.simulate("lossy-passage"))
+    assert "tracking_error" in {each.check for each in verdict.checks if not each.passed}
+    data["network"]["loss"] = 0.3
+    m = rf.Mission.from_dict(data)
+    assert rf.check(m, search=False).passed
+    assert rf.assess(rf.simulate(m)).passed
+
+
 def test_edges_beyond_the_range_are_named():
     """Diagonals of the cube are longer than a range of 5 m, and the rest is checked without them."""
     cube = checked({"range": 5.0})
