@@ -47,7 +47,7 @@ def disturbed(m: rf.Mission, seed: int = 0, **changes: Any) -> tuple[Any, ...]:
     """The product's flight with every edge held, SMALL off its slots at random; ``changes`` of its network."""
     problem, work, flight, state = laid_out(m)
     loss_free = flight._replace(network=flight.network._replace(worsens=0.0))
-    fly(problem, work, loss_free, state, 60 + flight.network.silence)
+    fly(problem, work, loss_free, state, 2 * (flight.network.delay + flight.network.silence) + 60)
     assert (state.mail.grip == 1.0).all()
     flight = flight._replace(network=flight.network._replace(silence=10**9, **changes))
     state.S[:, :3] += SMALL * np.random.default_rng(seed).normal(size=(len(state.S), 3))
@@ -341,6 +341,21 @@ def test_check_refuses_a_network_that_is_not_borne(network, words):
     assert words in remark.text
     flown = squares_flown(still(network), 8, 20.0)
     assert (growth_flown(flown.T, 20.0) > 0.0).mean() > 0.5
+
+
+def test_lossy_passage_is_refused_and_fails():
+    """Its check names the losses; flown, its vehicles leave their slots. With 30 % lost, both pass."""
+    data = rf.load_mission("lossy-passage").to_dict()
+    before = rf.check("lossy-passage", search=False)
+    fails = [remark for remark in before.remarks if remark.level == "fails"]
+    assert {remark.topic for remark in fails} == {"network"}
+    assert all("94 % of its messages are lost" in remark.text for remark in fails)
+    verdict = rf.assess(rf.simulate("lossy-passage"))
+    assert "tracking_error" in {each.check for each in verdict.checks if not each.passed}
+    data["network"]["loss"] = 0.3
+    m = rf.Mission.from_dict(data)
+    assert rf.check(m, search=False).passed
+    assert rf.assess(rf.simulate(m)).passed
 
 
 def test_edges_beyond_the_range_are_named():

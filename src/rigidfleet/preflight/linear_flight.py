@@ -297,16 +297,18 @@ def _motion_over(t: float, lags: Sequence[Lag], drag: Floats) -> Floats:
     kinds: dict[Any, Floats] = {}
     for lag, friction in zip(lags, drag.tolist(), strict=True):
         for axis in range(3):
-            A, tau = np.zeros((6, 6)), max(lag.tau, _QUICK)
+            A, tau, orders = np.zeros((6, 6)), max(lag.tau, _QUICK), _ORDERS
             A[0, 1], A[1, 1] = 1.0, -friction[axis]
             if lag.point:
-                A[1, 5] = 1.0
+                A[1, 5], orders = 1.0, 2
             elif axis == 2:
-                A[1, 2], A[2, 2], A[2, 5] = 1.0, -1.0 / tau, 1.0 / tau
+                A[1, 2], A[2, 2], A[2, 5], orders = 1.0, -1.0 / tau, 1.0 / tau, 3
             else:
                 A[1, 2] = A[2, 3] = A[3, 4] = 1.0
                 A[4, 2:] = -lag.k_R / tau, -lag.k_omega / tau, -1.0 / tau, lag.k_R / tau
-            kinds.setdefault((lag, axis == 2, friction[axis]), expm(t * A)[:5])
+            over = expm(t * A)[:_ORDERS]
+            over[orders:] = 0.0
+            kinds.setdefault((lag, axis == 2, friction[axis]), over)
     return np.array(
         [kinds[lag, axis == 2, drag[i, axis]] for i, lag in enumerate(lags) for axis in range(3)]
     )

@@ -35,9 +35,9 @@ _LATEST = 2.0
 #: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius.
 _PERIOD, _VECTORS, _ACCURACY = 1.0, 20, 1e-4
 #: Losses that are tried first; the limit is then found to the hundredth.
-_LOSSES = (0.2, 0.4, 0.6, 0.8, 0.9, 0.95)
+_LOSSES = (0.3, 0.6, 0.8, 0.95)
 #: Time for which second moments move [s].
-_TIME = 16.0
+_TIME = 12.0
 #: Growth [1/s] from which they count as unstable: more than the error of sampling.
 _GROWS = 0.02
 #: States that carry a moment: least and greatest number, and that of their links together; flights with the own
@@ -228,7 +228,7 @@ def loss_borne(flight: LinearFlight) -> float | None:
         high = float(tried[first]) if unstable.any() else high
         if high == math.inf:
             return low
-        tried = np.unique(np.round(np.linspace(low, high, 8), 2))
+        tried = np.unique(np.round(np.linspace(low, high, 6), 2))
         tried = tried[(tried > low) & (tried < high)]
     return low
 
