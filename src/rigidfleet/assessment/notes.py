@@ -37,6 +37,8 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first_time(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
+    if words := measured.mission.landings_in_words(measured.result.position[-1]):
+        yield words
     yield from avoidance_notes(measured)
     yield from _samples_note(measured)
     yield from _foreign_flight_notes(measured)
@@ -105,7 +107,7 @@ def _abandonment_notes(measured: Measurements) -> Iterator[str]:
     """Note each phase that was left for another one before it arrived."""
     result = measured.result
     yield from (check.message for check in abandonment_check(measured))
-    if result.mission.on_loss != "continue":
+    if result.mission.abandons_at < np.inf:
         return  # no phase of such a mission was begun by hand
     for phase, record in zip(result.mission.phases, result.phases, strict=False):
         if phase.meets and record.target is None and record.settled is None:

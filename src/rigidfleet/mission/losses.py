@@ -13,7 +13,7 @@ from rigidfleet.mission.formations import sound
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.mission.rules import Breach, Breaches, Draft
-from rigidfleet.mission.schema import Disturbances
+from rigidfleet.mission.schema import Aborting, Disturbances
 from rigidfleet.typing import Floats
 
 _TABLE = "disturbances"
@@ -32,6 +32,7 @@ _NO_GROUND = (
 def rules(m: Draft) -> Breaches:
     """Vehicles and links that can be lost, what can follow, and a ground for landings."""
     d: Disturbances | None = m.disturbances
+    yield from _abort(m)
     grounded = not m.right((), "obstacles") or any(map(is_ground, m.obstacles))
     for k, p in enumerate(m.phases):
         if p.grounded and not grounded:
@@ -62,6 +63,30 @@ def rules(m: Draft) -> Breaches:
         if not grounded:
             yield Breach((_TABLE, "on_loss"), *_NO_GROUND)
         yield from _landings(m, d, m.n, first)
+
+
+def _abort(m: Draft) -> Breaches:
+    """An abort is ordered in time, while slots are tracked."""
+    options: Aborting | None = m.abort
+    if options is not None:
+        for k, agent in enumerate(options.agents):
+            yield from agents_exist(
+                m,
+                ("abort", "agents", k),
+                (agent,),
+                "leaves twice" if agent in options.agents[:k] else "",
+            )
+    if options is None or options.at is None or m.end is None or m.findings:
+        return
+    begins = options.at + options.reaction
+    if begins >= m.end:
+        problem = f"and the reaction of {options.reaction:g} s are not before the end of the mission at {m.end:g} s"
+        yield Breach(("abort", "at"), problem, "give an earlier time or remove it")
+    for k, p in under_way(m.phases, begins):
+        if p.control != "tracking":
+            problem = f"may be under way at the abort at {begins:g} s, but only tracked slots can slow down"
+            remedy = "use control = 'tracking', or abort at another time"
+            yield Breach(("phases", k, "control"), problem, remedy, p.control)
 
 
 def _vehicles(m: Draft, d: Disturbances) -> Breaches:

@@ -23,6 +23,7 @@ from rigidfleet.mission.bounds import (
     GAIN,
     MASS,
 )
+from rigidfleet.mission.fences import Fence, People
 from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
@@ -553,6 +554,10 @@ class Limits(Part):
         "minimum separation from an agent straight below [m]: height minus radii (downwash)", None
     )
     geofence: Geofence | None = key("box that no agent may leave", None)
+    people: LengthOrZero = key(
+        "least distance, as seen from above, at which a vehicle that fails falls past people [m]: less its radius",
+        0.0,
+    )
     saturation: Share = key(
         "maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
         0.01,
@@ -713,9 +718,10 @@ class Disturbances(Part):
     lost: tuple[Lost, ...] = key(
         "vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`", ()
     )
-    on_loss: Literal["continue", "hold", "land"] = key(
+    on_loss: Literal["continue", "hold", "land", "abort"] = key(
         "what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "
-        "brake to a stop and hold the formation; land: brake to a stop and land straight down",
+        "brake to a stop and hold the formation; land: brake to a stop and land straight down; abort: go home by "
+        "[abort]",
         "continue",
     )
     hold_until: Time | None = key(
@@ -725,6 +731,28 @@ class Disturbances(Part):
     landing_formation: str | None = key(
         "level formation that on_loss 'land' takes before the descent; default: the one that is held",
         None,
+    )
+
+
+class Aborting(Part):
+    """How the flight is aborted, at any time: `check --abort` plans it, `run --abort-at` flies it."""
+
+    at: Annotated[float, Strict(), Field(ge=0)] | None = key(
+        "mission time at which an abort is ordered [s]; default: never", None
+    )
+    step: Time = key("time between the aborts that `check --abort` plans [s]", 1.0)
+    reaction: Annotated[float, Strict(), Field(ge=0, le=60)] = key(
+        "time after which all vehicles have the order, or notice a loss, and act at once [s]", 0.5
+    )
+    to: Literal["any", "own"] = key(
+        "any: to any landing place, by the least sum of squares; own: each to its own, straight or by levels one above "
+        "the other, or back along the plan. Places are those of the start, or a grid below if that is in the air",
+        "any",
+    )
+    agents: tuple[AgentNumber, ...] = key(
+        "numbers of the vehicles that go home, as soon as they come near no other one; the others fly the mission on. "
+        "Default: all go home",
+        (),
     )
 
 
@@ -826,6 +854,8 @@ class Contents(MissionHeader):
         "formations by name: [formations.NAME]", default_factory=dict
     )
     obstacles: tuple[Obstacle, ...] = key("obstacles: [[obstacles]]", ())
+    fences: tuple[Fence, ...] = key("fences of polygons: [[fences]]", ())
+    people: tuple[People, ...] = key("places where people are: [[people]]", ())
     limits: Limits = key(
         "limits that the verdict checks: [limits]", default_factory=Limits.model_construct
     )
@@ -840,6 +870,7 @@ class Contents(MissionHeader):
     disturbances: Disturbances | None = key(
         "wind, gusts, noise, mass errors, lost vehicles: [disturbances]", None
     )
+    abort: Aborting | None = key("how the flight is aborted: [abort]", None)
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = key(
         "phases of the flight, in order: [[phases]]"
     )

@@ -24,7 +24,7 @@ from rigidfleet.preflight.gains import check_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
 from rigidfleet.preflight.network import check_network, network_remarks
-from rigidfleet.preflight.obstacles import obstacle_remarks
+from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
     disturbance_remarks,
@@ -92,10 +92,13 @@ def check(
         *disturbance_remarks(mission, preflight),
         *offset_remarks(mission, preflight),
         *obstacle_remarks(mission, preflight),
+        *boundary_remarks(mission, preflight),
         *limit_remarks(mission, preflight),
         *waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
+    if planned and (words := mission.landings_in_words(planned[-1].position[-1])):
+        preflight.remarks.append(Remark("note", "landing", words))
     if not known:
         why = "later positions depend on distances alone and are known only in flight"
         if len(planned) < len(mission.phases) and samples_per_phase(mission) < FEWEST_SAMPLES:

@@ -153,15 +153,15 @@ class LinearFlight:
             y["commanded"] = y["commanded"] - drift * y["error"]
         state = [x[f"order {q}"] for q in range(orders)] + [y["commanded"]]
 
-        def moved(over: Floats, q: int) -> Any:
+        def after(over: Floats, q: int) -> Any:
             parts = [*range(orders), _ORDERS]
             return sum(
                 sparse.diags_array(over[:, q, p]) @ z for p, z in zip(parts, state, strict=True)
             )
 
-        y |= {f"order {q}": moved(motion, q) for q in range(orders)}
+        y |= {f"order {q}": after(motion, q) for q in range(orders)}
         for q in range(2 * bool(waits)):
-            y[f"seen {q} 0"] = moved(early, q)
+            y[f"seen {q} 0"] = after(early, q)
             y |= {f"seen {q} {k}": x[f"seen {q} {k - 1}"] for k in range(1, waits)}
         y |= dict(
             zip(

@@ -33,7 +33,7 @@ from rigidfleet.typing import Floats
 #: Delays beyond this are not looked at [s].
 _LATEST = 2.0
 #: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius.
-_PERIOD, _VECTORS, _ACCURACY = 1.5, 20, 1e-4
+_PERIOD, _VECTORS, _ACCURACY = 1.0, 20, 1e-4
 #: Losses that are tried first; the limit is then found to the hundredth.
 _LOSSES = (0.2, 0.4, 0.6, 0.8, 0.9, 0.95)
 #: Time for which second moments move [s].
@@ -57,7 +57,7 @@ def check_network(
     """
     checks: dict[str, FormationNetwork] = {}
     for name, flight, unheard in linear_flights(mission, way, lags):
-        check = _borne(mission, flight, unheard)
+        check = _formation_network(mission, flight, unheard)
         checks[name] = check if name not in checks else checks[name].lesser(check)
     return checks
 
@@ -91,7 +91,7 @@ def _law_ticks(mission: Mission) -> tuple[int, float]:
     return every, every / mission.autopilot.rate
 
 
-def _borne(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
+def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
     own, net, radio, (every, tick) = (
         mission.network,
         network_of(mission),
@@ -122,7 +122,7 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
 
     drift = np.linalg.qr(flight.drift(delay))[0] if flight.is_free else np.zeros((size, 0))
 
-    def moved(z: Floats) -> Floats:
+    def period_later(z: Floats) -> Floats:
         sent = z[flight.size :].reshape(messages).copy()
         _, x = flight.fly(z[: flight.size].reshape(-1, 1), sent, ticks, delay, _all(flight, delay))
         sent = np.roll(sent, -(ticks % delay), axis=0)
@@ -130,7 +130,7 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
         return z - drift @ (drift.T @ z)  # motions of the whole formation are projected out
 
     # No class of its own: what scipy declares of this one is not how it is made.
-    operator: Any = LinearOperator((size, size), matvec=moved, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
+    operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
     start = np.random.default_rng(0).normal(size=size)
     options: dict[str, Any] = {
         "k": 1,
@@ -154,7 +154,7 @@ def _all(flight: LinearFlight, delay: int) -> Arrivals:
 def last_stable_delay(flight: LinearFlight) -> int:
     """Last delay in ticks at which no motion grows; 0 if there is none, or the last one that is looked at."""
     most = max(1, math.ceil(_LATEST / flight.radio.tick))
-    low, high = 0, 1
+    low, high = 0, min(flight.radio.delay, most)
     while growth_at(flight, high) < GROWTH:
         if high == most:
             return most
@@ -186,11 +186,11 @@ def mean_square_growth(
         sign = rng.integers(0, 2, (L, len(kept))) * 2.0 - 1.0
         return kept * news + spread * sign * other
 
-    errors = _flown(flight, delay, len(kept), time, arrivals)
+    errors = _squares_of_errors(flight, delay, len(kept), time, arrivals)
     return _growth(errors.reshape(len(errors), len(losses), states).mean(axis=2), time)
 
 
-def _flown(
+def _squares_of_errors(
     flight: LinearFlight,
     depth: int,
     columns: int,
@@ -266,7 +266,7 @@ def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
         grip[:] = np.clip(np.where(silent, grip - step, grip + step), 0.0, 1.0)
         return total
 
-    return _growth(_flown(flight, delay + late, _FLIGHTS, _TIME, arrivals, grip), _TIME)
+    return _growth(_squares_of_errors(flight, delay + late, _FLIGHTS, _TIME, arrivals, grip), _TIME)
 
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:

@@ -19,7 +19,7 @@ import numpy as np
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, worst_values
 from rigidfleet._common.files import write_file
-from rigidfleet._common.quantities import quantity
+from rigidfleet._common.quantities import PLACES, quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -278,7 +278,7 @@ class Result(Shown):
                     alone = x.other not in rotors
                 else:
                     alone = not (-1 <= x.other < n and x.other != x.who)
-                    alone = alone and quantity(name).who != "obstacle"
+                    alone = alone and quantity(name).who not in PLACES
                 if alone or x.who not in agents:
                     raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:

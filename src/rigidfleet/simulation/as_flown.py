@@ -81,7 +81,8 @@ def _check_flown(phase: Phase) -> None:
         remedy = "use kind 'fly', or put it into the mission"
         raise MissionError([Finding("begin()", "kind", phase.kind, problem, remedy)])
     if not phase.spelled:
-        key = "stagger" if phase.vertical is not None else "transition"
+        vertical = phase.vertical
+        key = "transition" if vertical is None else "stagger" if vertical.stagger else "places"
         problem = "is flown as several phases, and cannot begin by hand"
         remedy = "begin one phase after the other, each with its agents or formation, or put it into the mission"
         raise MissionError([Finding("begin()", key, getattr(phase, key), problem, remedy)])

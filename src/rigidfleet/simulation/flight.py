@@ -19,10 +19,10 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
-from rigidfleet.planning.legs import at_start
-from rigidfleet.planning.losses import after_loss
+from rigidfleet.planning.legs import Leg, at_start
+from rigidfleet.planning.losses import answer_to, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
-from rigidfleet.planning.reference import PhaseState, Pose
+from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
@@ -265,8 +265,14 @@ class Flight:
         self._cut: set[int] = set()  # phases left before their end
         self._finished = False
         self._route = list(mission.phases)  # phases to fly; after a loss, those that it asks for
-        self._reacted = mission.on_loss == "continue"  # whether nothing (more) follows from a loss
+        self._reacted = (
+            mission.abandons_at == math.inf
+        )  # whether nothing (more) follows from a loss or abort
         self._following = 0  # index of the route's next phase
+        self._unproved = ""  # why no way home is proved, after an abort
+        self._plans: list[
+            PhasePlan
+        ] = []  # of the phases begun, if an abort may have to follow them
         self._started = self._reported = clock.perf_counter()
         self._count = np.zeros(3, dtype=np.int64)
         self._solves: dict[str, Counts] = {}
@@ -339,10 +345,14 @@ class Flight:
                 raise FlightError(
                     f"nothing of phase '{self.phases[-1].name}' has been flown: call advance before the next begin"
                 )
-            if not self._reacted and self.t >= self.mission.first_loss:
+            if not self._reacted and self.t >= self.mission.abandons_at:
                 self._leave(changed=True)
                 self._react()
             if self._following >= len(self._route):
+                if self._unproved:
+                    self.ending = (
+                        f"no way home is proved from where the flight was aborted: {self._unproved}"
+                    )
                 return False
             phase = self._route[self._following]
             self._following += 1
@@ -378,6 +388,8 @@ class Flight:
             self.ending = str(stop)
             return False
         self._asked.append(phase)
+        if self.mission.aborts:
+            self._plans.append(plan)
         # Nobody asks a controller of the user's to follow the plan.
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
@@ -624,7 +636,7 @@ class Flight:
         Phases begun by hand go on: who began them decides.
         """
         routed = self._given(self._asked[-1])
-        return self.mission.first_loss if routed and not self._reacted else math.inf
+        return self.mission.abandons_at if routed and not self._reacted else math.inf
 
     def _given(self, phase: Phase) -> bool:
         """Whether the route gives a phase that has begun last, or is about to."""
@@ -637,7 +649,16 @@ class Flight:
         if lost.any():
             self._extremes.lose(lost)
             self._now.lost = lost
-        legs = after_loss(self.mission, self._now)
+        plan: list[Leg] = []
+        if self.mission.aborts:  # along the plan, which goes on beyond the phase under way
+            for leg, record in zip(self._plans, self.phases, strict=True):
+                end = max(leg.end, record.t_end) if record.abandoned else record.t_end
+                plan.append(copy_with(leg, end=end))
+            k = self._following
+            plan += legs_from(self.mission, plan[-1].state_at(plan[-1].end), self._route[k:], k)
+        legs, self._unproved = answer_to(self.mission, self._now, plan)
+        if legs:
+            self._reached = legs[0].before
         self._route = [*self._asked, *(leg.phase for leg in legs)]
         self._following = len(self._asked)
 
@@ -653,7 +674,7 @@ class Flight:
         self._active = None
         if not active.flew:  # as if it had never begun: if it is the mission's, it is still to come
             self._following -= self._given(self._asked[-1])
-            del self.phases[-1], self._asked[-1]
+            del self.phases[-1], self._asked[-1], self._plans[-1:]
             return
         if not (active.has_settled or active.over or abandoned):
             self._cut.add(len(self.phases) - 1)

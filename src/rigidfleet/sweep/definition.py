@@ -28,7 +28,8 @@ from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part
-from rigidfleet.sweep import controllers, keypaths
+from rigidfleet.sweep import controllers, faults, keypaths
+from rigidfleet.sweep.faults import Drill
 from rigidfleet.sweep.variation import (
     KINDS,
     Gridded,
@@ -50,7 +51,7 @@ _RUNS = 10**8
 #: Tables with seeds of random numbers.
 _SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("network",), ("avoidance",)
 #: Keys that stores have since there are any: they are kept where they are not their defaults.
-_LATER = {"random_numbers", "controller", "rate", "agent"}
+_LATER = {"random_numbers", "controller", "rate", "agent", "drill"}
 
 
 class SweepHeader(Part):
@@ -88,6 +89,9 @@ class SweepHeader(Part):
         description="law of each vehicle's own, MODULE:NAME: a function of what it knows, or a class, of which each "
         "vehicle has a new object; for missions with [network]; default: the laws of the mission",
     )
+    drill: Drill | None = Field(
+        None, description="faults of the day, in turn, instead of what varies: [drill]"
+    )
 
     @property
     def own(self) -> tuple[str, str]:
@@ -121,6 +125,7 @@ class Sweep:
     seed : seed of the random numbers
     name : name of the sweep
     evaluate : what is evaluated of each run: "flight" or "final"
+    drill : the faults of a drill, which are its cases; None: what varies does so in the mission
     """
 
     def __init__(
@@ -128,7 +133,9 @@ class Sweep:
     ) -> None:
         self.mission, self.variations, self.header = mission, tuple(variations), header
         self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
-        self.runs = header.runs or math.prod(self.grid_sizes.values())
+        self.drill = header.drill
+        trials = self.drill.trials if self.drill else 1
+        self.runs = header.runs or trials * math.prod(self.grid_sizes.values())
         if self.runs > _RUNS:
             raise RigidfleetError(f"the grid has {self.runs:,} points: give runs, or fewer values.")
 
@@ -147,7 +154,7 @@ class Sweep:
         Parameters
         ----------
         vary : variations, each a line such as `agents.mass.* *= normal(1, 0.05)` or a table
-        name : name of the sweep; default: the name of the mission
+        name : name of the sweep; default: the name of the mission, of a drill with "-drill" behind it
         origin : name of the sweep in messages
         runs : number of runs; default: one per point of the grid
         seed : seed of the random numbers; default: 0
@@ -160,6 +167,7 @@ class Sweep:
         rate : rate at which the controller is called [Hz]; default: 50
         agent : a law of each vehicle's own, "MODULE:NAME" of a function, or of a class, of which each vehicle has a
             new object; see `simulate`
+        drill : faults of the day, as the table `[drill]` of a sweep file; nothing else varies then
 
         Raises
         ------
@@ -172,7 +180,9 @@ class Sweep:
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
         data = {"mission": mission.name, "vary": list(vary), **keys}
-        return cls(mission, *_check(data, origin, mission), name or mission.name)
+        variations, header = _check(data, origin, mission)
+        ending = "" if header.drill is None else "-drill"
+        return cls(mission, variations, header, name or mission.name + ending)
 
     @classmethod
     def load(cls, path: str | Path, *, more: Iterable[str] = (), **keys: Any) -> Self:
@@ -181,8 +191,8 @@ class Sweep:
         Parameters
         ----------
         more : lines of additional variations
-        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate,
-            agent
+        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate, agent,
+            drill
 
         Raises
         ------
@@ -199,12 +209,17 @@ class Sweep:
         if isinstance(named, str):
             shipped = named in mission_names()
             mission = load_mission(named if shipped else path.parent / named)
+        if isinstance(data.get("drill"), dict):
+            keys["drill"] = data["drill"] | (keys.get("drill") or {})
         data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
         controllers.add_search_folder(path.parent)
         variations, header = _check(data, origin, mission)
         assert mission is not None  # otherwise the check has raised
+        if header.drill:
+            drill = header.drill.from_folder(path.parent)
+            header = header.model_copy(update={"drill": drill})
         return cls(mission, variations, header, path.stem)
 
     @classmethod
@@ -225,7 +240,8 @@ class Sweep:
         """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
         data = self._data()
         del data["runs"], data["name"]
-        return data | {"version": __version__} | ({"code": self.law[1]} if self.law[0] else {})
+        files = {"code": self.law[1], "files": self.drill.digest if self.drill else ""}
+        return data | {"version": __version__} | {key: x for key, x in files.items() if x}
 
     @cached_property
     def law(self) -> tuple[Any, str]:
@@ -274,8 +290,12 @@ class Sweep:
             SweepColumn(v, keys, grid)
             for v in self.variations
             for grid in [v.grid if isinstance(v, Gridded) else None]
-            for keys in keypaths.expand(self.whole, v.path)
+            for keys in self._places(v.path)
         ]
+
+    def _places(self, path: str) -> list[Keys]:
+        """Keys of all places that match a path; a case of a drill is none of the mission."""
+        return [tuple(path.split("."))] if self.drill else keypaths.expand(self.whole, path)
 
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:
@@ -308,8 +328,11 @@ class Sweep:
         self, mission: Mission, run: int, values: Sequence[Any] | None = None
     ) -> dict[str, Any]:
         varied = {column.keys for column in self.columns}
-        document = mission.to_dict()
-        for column, value in zip(self.columns, values or self.values(run), strict=True):
+        document, values = mission.to_dict(), values or self.values(run)
+        if self.drill:
+            stream = faults.stream_of(self.seed, run, 2)
+            faults.disturb(document, *values[:2], stream, mission.n_agents, self._end)
+        for column, value in zip(self.columns, values, strict=True) if not self.drill else ():
             apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
             stream = np.random.SeedSequence(self.seed, spawn_key=(run, 1))
@@ -348,6 +371,14 @@ class Sweep:
         with suppress(MissionError):  # without a way, each run says so
             return expand_mission(self.mission)
         return self.mission
+
+    @cached_property
+    def _end(self) -> float:
+        """Time [s] at which the mission is expected to end."""
+        from rigidfleet.planning.legs import phase_spans
+        from rigidfleet.planning.timing import complete_times
+
+        return phase_spans(complete_times(self.mission))[-1][1]
 
     def _data(self) -> dict[str, Any]:
         return {
@@ -417,6 +448,11 @@ def _check(
     own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
     header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
+    if header is not None and header.drill is not None:
+        cases = _cases(collector, header.drill, mission)
+        if collector.findings:
+            raise SweepError(collector.findings)
+        return cases, header
     whole = None if mission is None else keypaths.whole_document(mission)
     variations: list[Variation] = []
     lacked: list[tuple[int, SweepColumn]] = []
@@ -461,6 +497,22 @@ def _check(
     if collector.findings or header is None:
         raise SweepError(collector.findings)
     return variations, header
+
+
+def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -> list[Variation]:
+    """The cases of a drill; nothing else varies."""
+    for key, default in (("vary", []), ("evaluate", "flight")):
+        if collector.data.get(key, default) != default:
+            collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
+    if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
+        collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
+    if drill.links and mission is not None and mission.network is None:
+        problem = "has no effect: without [network], one law knows all states"
+        collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
+    grids = drill.grids(1 if mission is None else mission.n_agents)
+    if not grids:
+        collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
+    return grids
 
 
 def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:
