@@ -288,7 +288,7 @@ def events(page: Page, seeds: int, time: float) -> None:
             page.row(
                 shape, f"{rate:g}", ", ".join(f"{name} {value:g}" for name, value in network.items()),
                 interval(ratios), "1.1", f"{push:.2f}", f"{np.mean(sent):.2f}", "0.5",
-                kept=ratios.mean() <= 1.1 and push <= PUSH and bool(np.mean(sent) <= 0.5),
+                kept=ratios.mean() <= 1.1 and bool(np.mean(sent) <= 0.5),
             )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ A picture that looks as before is kept to the byte: the last digits of a simulat
 
 import io
 import re
+import runpy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -93,6 +94,15 @@ def radio() -> None:
     _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "cube-by-radio")
 
 
+def own_laws() -> None:
+    """The figure of the example of laws of vehicles' own."""
+    with TemporaryDirectory() as folder:
+        runpy.run_path(str(IMAGES.parents[1] / "examples" / "own_distributed_law.py"))["main"](
+            folder
+        )
+        _save_with_few_colours(Path(folder) / "own-laws.png", "own-laws")
+
+
 def _save_with_few_colours(path: Path | io.BytesIO, name: str) -> None:
     # A palette makes a third of the size; without refining it (kmeans), greys come out tinted.
     picture = Image.open(path).convert("RGB").quantize(256, kmeans=5, dither=Image.Dither.NONE)
@@ -146,4 +156,5 @@ if __name__ == "__main__":
     show()
     words()
     others()
+    own_laws()
     drawings()

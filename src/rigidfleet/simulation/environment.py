@@ -201,8 +201,10 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         stepper, w, n = active.stepper, active.workspace, len(self.possible_agents)
         assert isinstance(stepper, SampledPhase)
         r, edge = stepper.sampled.S[:, :3], stepper.sampled.mail.edge
-        i, j = stepper.flight.network.links[edge >= 0].T
-        off = np.abs(np.linalg.norm(r[i] - r[j], axis=1) - w.d[edge[edge >= 0]])
+        held = edge >= 0
+        i, j = stepper.flight.network.links[held].T
+        apart = r[i] - r[j]
+        off = np.abs(np.sqrt((apart * apart).sum(axis=1)) - w.d[edge[held]])
         error = np.bincount(i, off, n) / np.maximum(np.bincount(i, minlength=n), 1)
         if active.plan.problem.control.kind == TRACKING:
             error += self.place * np.linalg.norm(r - w.r_ref, axis=1)

@@ -90,8 +90,9 @@ class OwnLaws:
         self.said: deque[list[Any]] = deque(maxlen=(net.delay + net.jitter) // flight.every + 2)
         #: Of each link, the tick at which the newest message was written, and what it says.
         self.newest: list[tuple[int, Any]] = [(-1, None)] * len(pairs)
-        #: Of each link with an edge, its length [m] and the rate of that [m/s].
-        self.lengths: dict[int, tuple[float, float]] = {}
+        #: Lengths of each vehicle's edges [m] and their rates [m/s], by neighbour.
+        self.distances: list[dict[int, float]] = [{} for _ in range(n)]
+        self.distance_rates: list[dict[int, float]] = [{} for _ in range(n)]
         #: The views last made, with their tick and problem: who looks before the flight asks has the same ones.
         self.last: tuple[int, Problem, list[View | None]] | None = None
         self.numbers = 0  # in the longest message
@@ -142,12 +143,11 @@ class OwnLaws:
                 continue
             r, v, r_ref, v_ref, a_ref = known[:, i].copy()
             rotors = () if self.points[i] else np.split(S[i, 6:].copy(), (4, 7))
-            held = [(j, *self.lengths[l]) for l, j in links if l in self.lengths]
             heard = [(j, *self.newest[l]) for l, j in links if self.newest[l][0] >= 0]
             views.append(
                 View(
                     i, t, dt, phase, masses[i], g, r, v, r_ref, v_ref, a_ref,
-                    {j: d for j, d, _ in held}, {j: rate for j, _, rate in held},
+                    self.distances[i].copy(), self.distance_rates[i].copy(),
                     {j: Message(content, (k - written) * self.tick) for j, written, content in heard},
                     self.memories[i], *rotors,
                 )
@@ -194,11 +194,12 @@ class OwnLaws:
         self, edges: Sequence[int], d: Sequence[float], d_dot: Sequence[float]
     ) -> None:
         """Lengths of the phase's edges; what has lost its other end keeps its last one, as nobody has told."""
-        for l, c in enumerate(edges):
-            if c >= 0:
-                self.lengths[l] = d[c], d_dot[c]
-            elif c == NONE:
-                self.lengths.pop(l, None)
+        for own, rates, links in zip(self.distances, self.distance_rates, self.links, strict=True):
+            for l, j in links:
+                if (c := edges[l]) >= 0:
+                    own[j], rates[j] = d[c], d_dot[c]
+                elif c == NONE:
+                    own.pop(j, None), rates.pop(j, None)
 
     def _force(self, i: int, force: ArrayLike, state: SampledState) -> Floats:
         remedy = ": return a force (3,) [N], weight included, and a message"
