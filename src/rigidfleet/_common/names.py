@@ -51,6 +51,8 @@ _WORDS = {
 _FRAMES = {"enu": "enu", "ned": "ned", "nwu": "nwu", "neu": "neu", "flu": "enu", "frd": "esd"}
 _IS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 _ABBREVIATED = {"pos": "", "p": "", "t": "", "vel": "v", "acc": "a"}
+#: Variables of Crazyflie's logs, by which cfclient names columns beside times in milliseconds: in m or mm, and degrees.
+CRAZYFLIE = re.compile(r"stateEstimate(Z?)\.(v?)([xyz]|yaw)")
 #: Words for places that are wanted, or for no places, beside those of a vehicle.
 ROLES = _IS["none"] - {"w", "b"} | _IS["wanted"]
 #: A letter alone, and what a quantity is nothing without: an acceleration without a velocity, ...
@@ -99,6 +101,9 @@ def unit_of(text: str) -> tuple[str, float] | None:
 @cache
 def meaning_of(name: str) -> ColumnMeaning:
     """The quantity, unit and vehicle of a column's name."""
+    if own := CRAZYFLIE.fullmatch(name):
+        unit = "deg" if own[3] == "yaw" else ("mm" if own[1] else "m") + "/s" * bool(own[2])
+        return ColumnMeaning(own[2] + own[3], unit)
     if bracket := re.fullmatch(r"(.*?)\s*[\[(](.*?)[\])]\s*", name):
         if bracket[2].strip().lower() in _FRAMES:
             return _meaning_without_unit(f"{bracket[1]}_{bracket[2]}")
@@ -164,6 +169,8 @@ def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
     that is not read, where others written alike are vehicles (`x_a`, `x_cf1`), or the quantity says nothing here.
     """
     kinds = [meaning_of(name) for name in names]
+    if any(map(CRAZYFLIE.fullmatch, names)):
+        kinds = [q._replace(unit=q.unit or "ms") if q.kind == "time" else q for q in kinds]
     known, place = {q.kind for q in kinds}, {name.lower(): k for k, name in enumerate(names)}
     alike: dict[str, dict[str, tuple[list[int], str]]] = {}
     for name in place:

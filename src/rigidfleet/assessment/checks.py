@@ -393,11 +393,14 @@ def _loss_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
 
 
 def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
-    """Report the phases that the flight left, or never began, because a vehicle or link was lost."""
+    """Report the phases that the flight left, or never began, after a loss or an order to abort."""
     mission, flown = measured.mission, measured.result.phases
-    when = mission.first_loss
-    if mission.on_loss == "continue" or not when < measured.result.time[-1]:
+    when = mission.abandons_at
+    if not when < measured.result.time[-1]:
         return
+    what, at = f"loss of {mission.first_lost}", mission.first_loss
+    if mission.on_loss == "continue" or at > when:
+        what, at = "order to abort", when - mission.aborting.reaction
     begun = sum(p.t_start < when for p in flown)
     left = [p.name for p in flown if p.abandoned]
     never = [phase.name for phase in mission.phases[begun:]]
@@ -408,7 +411,7 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
         parts.append(
             f"{', '.join(map(repr, never))} {'was' if len(never) == 1 else 'were'} not flown"
         )
-    words = f"after the loss of {mission.first_lost} at {when:.2f} s, {'; '.join(parts)}"
+    words = f"after the {what} at {at:.2f} s, {'; '.join(parts)}"
     yield CheckResult(
         "abandoned", True, words, float(len(left + never)), None, "", when=when, judged=False
     )

@@ -18,7 +18,7 @@ from rigidfleet.errors import RigidfleetError
 _OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
 _LIMITS = f"Further limits, KEY=VALUE, may be repeated: {', '.join(LIMITS_OF_CURVES)}."
 #: Options that say how files are read.
-_READ = ("interpolation", "spans", "gaps", "units", "axes")
+_READ = ("interpolation", "spans", "gaps", "units", "axes", "topic", "origin")
 
 
 def assess(
@@ -34,6 +34,8 @@ def assess(
     gaps: Literal["refuse", "bridge"] | None = None,
     units: str | None = None,
     axes: str | None = None,
+    topic: list[str] | None = None,
+    origin: tuple[float, float, float] | None = None,
     explain: bool = False,
     out: Path | None = None,
     figures: Literal["few", "all"] = "few",
@@ -46,8 +48,8 @@ def assess(
     ----------
     files : Path
         A result (NAME.nc), or trajectories: setpoints (CSV with columns time, x, y, z and, for several vehicles,
-        agent), Crazyswarm2's polynomials (CSV, one a vehicle), a Skybrush show (.skyc), ROS 2 poses (.mcap), or folders
-        of these.
+        agent), Crazyswarm2's polynomials (CSV, one a vehicle), a Skybrush show (.skyc), a recording of ROS 2 (.mcap,
+        .db3), a log of an autopilot (.ulg, .tlog, .bin), or folders of these.
     mission : str
         Judge trajectories by this mission's radii, limits and obstacles.
     separation : float
@@ -75,6 +77,12 @@ def assess(
     axes : str
         Where x, y and z of a table point: enu (east, north, up), ned, or three others of e, n, u, w, s and d. Default:
         enu.
+    topic : list
+        Topic or message of a log that has positions, such as XKF1 or '/cf*/pose'; may be repeated. Default: chosen, and
+        named in a note.
+    origin : str
+        Origin of positions of a log: latitude and longitude [deg], and height above mean sea level [m]. Default: the
+        mission's, that of the estimator, or the first place.
     explain : bool
         Say first what was read: vehicles, span, columns used and ignored, units and axes.
     out : Path
@@ -93,7 +101,7 @@ def assess(
     options: dict[str, Any] = {
         "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
         "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
-        "units": units, "axes": axes,
+        "units": units, "axes": axes, "topic": topic, "origin": origin,
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
     if len(files) == 1 and files[0].suffix == ".nc":
@@ -105,6 +113,7 @@ def assess(
         result = Result.load(files[0])
     else:
         from rigidfleet.foreign.files import read_trajectories
+        from rigidfleet.mission import as_mission
         from rigidfleet.simulation.trajectories import of_curves
 
         own = [key for key in _OWN if key in chosen]
@@ -112,10 +121,16 @@ def assess(
             words = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
             raise RigidfleetError(words)
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        read = read_trajectories(files, **{key: options[key] for key in _READ if key in chosen})
+        place = None if mission is None else as_mission(mission).geodetic_origin
+        if origin is None and place is not None:
+            options["origin"] = place.latitude_deg, place.longitude_deg, place.altitude
+        own = {key: options[key] for key in _READ if options[key] is not None}
+        read = read_trajectories(files, **own)
+        if origin is not None and not any("origin" in part for part in read.read):
+            raise RigidfleetError("--origin: no file says where on the Earth it is; remove it")
         result = of_curves(
             read, mission=mission, separation=separation, limits=_limits(limits or []) | higher,
-            radius=radius or 0.0, ground=ground, name=_name(files[0]),
+            radius=radius or 0.0, ground=ground, name=flight_name(files[0]),
         )  # fmt: skip
     verdict = judge(result)
     made = Files(out, result.mission.name) if out is not None else None
@@ -123,7 +138,7 @@ def assess(
         made.claim(replace=force)
     for part in verdict.read if explain and not json else ():
         for key, value in part.items():
-            words = ", ".join(value) if isinstance(value, list) else f"{value}"
+            words = ", ".join(map(str, value)) if isinstance(value, list) else f"{value}"
             line = f"{key.replace('_', ' ')}: {words}"
             console.out().print(line, highlight=False, markup=False, soft_wrap=True)
     console.show_verdict(verdict, json=json)
@@ -161,7 +176,7 @@ def _limits(limits: list[str]) -> dict[str, float]:
     return by_key
 
 
-def _name(file: Path) -> str:
+def flight_name(file: Path) -> str:
     """The name of a flight after its file: files may have any characters, and names of missions only plain ones."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", file.resolve().stem).strip("._-")
     return plain or "trajectories"

@@ -19,6 +19,19 @@ NAMES = ("x", "y", "z", "yaw")
 CHANNELS = len(NAMES)
 
 
+class LoggedStates(NamedTuple):
+    """What a log says beside positions, at the knots of its curve; None or NaN where it does not.
+
+    Attributes
+    ----------
+    velocity : (K, 3) [m/s]
+    deviation : (K, 3) standard deviations of the positions, by the estimator that wrote them [m]
+    """
+
+    velocity: Floats | None
+    deviation: Floats | None
+
+
 class Trajectories(NamedTuple):
     """Trajectories of N vehicles as piecewise polynomials.
 
@@ -31,6 +44,8 @@ class Trajectories(NamedTuple):
     read : what was taken for what, of files that are alike: their number, vehicles, rows, span, columns, units, axes
     away : whether a vehicle is not there before its curve begins and after it ends; else it stands at the curve's ends
     since : seconds since 1970 from which times count; 0 if they are no dates
+    measured : of each vehicle what its log says beside positions; empty if these are all
+    own_clocks : whether times of different files count from different zeros, which nobody knows
     """
 
     names: tuple[str, ...]
@@ -40,6 +55,8 @@ class Trajectories(NamedTuple):
     read: tuple[dict[str, Any], ...] = ({},)
     away: bool = False
     since: float = 0.0
+    measured: tuple[LoggedStates, ...] = ()
+    own_clocks: bool = False
 
 
 def curve_through_states(time: Floats, states: Floats, yaw: Floats | None = None) -> Piecewise:

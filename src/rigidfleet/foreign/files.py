@@ -1,8 +1,8 @@
 """Trajectories that others made: from files to polynomials of each vehicle.
 
 `read_trajectories` reads tables of setpoints, Crazyswarm2's tables of polynomials, Skybrush's shows, recordings of
-ROS 2 (MCAP), and folders of any of these. Nothing in a file is believed but positions over time: where it has samples,
-a curve through them is assumed and named; velocities that a table states are only compared with it.
+ROS 2, logs of autopilots, and folders of any of these. Nothing in a file is believed but positions over time: where it
+has samples, a curve through them is assumed and named; velocities that a table states are only compared with it.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from rigidfleet._common.files import why_not
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.errors import TrajectoryError
-from rigidfleet.foreign import poses, shows, texts
+from rigidfleet.foreign import logs, poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
 from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
@@ -35,14 +35,25 @@ Gaps = Literal["refuse", "bridge"]
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
-_ZIP, _MCAP, _HDF = b"PK", b"\x89MCAP0\r\n", b"\x89HDF"
-#: Suffixes of files of trajectories in a folder.
-_SUFFIXES = {".csv", ".skyc", ".mcap"}
+_ZIP, _HDF = b"PK", b"\x89HDF"
+#: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
+#: in a folder. Files ``.bin`` are logs only by their content.
+_RECORDINGS, _LOGS = {".mcap", ".db3"}, {".ulg", ".tlog"}
+_SUFFIXES = {".csv", ".skyc"} | _RECORDINGS | _LOGS
 #: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
 #: positions that are noted.
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
 #: Share of a number that is rounding, and the greatest number of things that a note lists.
 _ROUNDING, _LISTED = 1e-6, 5
+
+
+class _Options(NamedTuple):
+    """How files are read; see `read_trajectories`."""
+
+    interpolation: Interpolation
+    units: Units
+    topics: tuple[str, ...] = ()
+    origin: logs.Geodetic | None = None
 
 
 def read_trajectories(
@@ -53,14 +64,17 @@ def read_trajectories(
     gaps: Gaps = "refuse",
     units: str | None = None,
     axes: str | None = None,
+    topic: str | Sequence[str] = (),
+    origin: logs.Geodetic | None = None,
 ) -> Trajectories:
     """Read the trajectories of all vehicles of one or several files or folders.
 
     Parameters
     ----------
     files : a table of setpoints (CSV with a header, for one vehicle or with a column ``agent``), a table of polynomials
-        (Crazyswarm2's CSV, one vehicle), a show (``.skyc``), a recording of poses (``.mcap``), or a folder: each CSV in
-        it is a vehicle, and each folder in it a vehicle whose CSVs, in the order of their numbers, follow each other
+        (Crazyswarm2's CSV, one vehicle), a show (``.skyc``), a recording of ROS 2 (``.mcap``, ``.db3``), a log of an
+        autopilot (``.ulg``, ``.tlog``, ``.bin``), or a folder: each CSV or log in it is a vehicle, each folder in it a
+        vehicle whose CSVs, in the order of their numbers, follow each other; or a folder that rosbag2 wrote
     interpolation : between samples, ``cubic`` (the cubic spline through the positions, with continuous acceleration) or
         ``linear``; formats of polynomials say themselves what is between
     spans : what a vehicle does that has samples later than others, or no longer, by more than its usual step: it
@@ -69,6 +83,10 @@ def read_trajectories(
     gaps : whether a time between two samples of more than ten usual steps is an error, or is bridged by the curve
     units : of columns of a table that do not say theirs, of time, length and angle in any order: ``"ms,mm,deg"``
     axes : where x, y and z of a table point: three of e, n, u, w, s and d, such as ``"ned"``
+    topic : of logs and recordings, the topic or topics with positions, such as ``"/cf*/pose"``; else they are chosen,
+        and named in a note
+    origin : latitude, longitude [deg] and height above mean sea level [m] of the origin of positions, for logs that
+        know where they are on the Earth; else that of the first vehicle's estimator, or its first place
 
     Raises
     ------
@@ -80,6 +98,10 @@ def read_trajectories(
     for word, known in ((interpolation, Interpolation), (spans, Spans), (gaps, Gaps)):
         if word not in get_args(known):
             raise ValueError(f"there is no {word!r}; use {' or '.join(get_args(known))}")
+    if origin and not (abs(origin[0]) < 90.0 and abs(origin[1]) <= 180.0 and abs(origin[2]) < 2e4):
+        raise TrajectoryError(
+            f"origin: {origin} is no place on the Earth. Give latitude, longitude [deg] and height [m]."
+        )
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
@@ -87,9 +109,14 @@ def read_trajectories(
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
-    words = units_of(units, axes)
-    parts = [_read_sequence(group, interpolation, words) for group in listed]
+    topics = (topic,) if isinstance(topic, str) else tuple(topic)
+    options, parts = _Options(interpolation, units_of(units, axes), topics, origin), []
+    for group in listed:
+        parts.append(_read_sequence(group, options))
+        place = parts[-1].read[0].get("origin")
+        options = options._replace(origin=options.origin or (place and tuple(place)))
     parts = _put_on_one_clock(parts, listed)
+    own_clocks = len(parts) > 1 and any(part.own_clocks for part in parts)
     kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
     if len(kinds) > 1:
         (_, first), (_, second), *_ = kinds.items()
@@ -108,14 +135,28 @@ def read_trajectories(
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
     curves = tuple(curve for part in parts for curve in part.curves)
-    notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
+    several = len(parts) > 1
+    notes = [f"{group[0].stem}: {note}" if several and "clock" in part.read[0] else note
+             for part, group in zip(parts, listed, strict=True) for note in part.notes]  # fmt: skip
+    notes = [*dict.fromkeys(notes)]
+    if len(parts) > 1 and any(part.read[0].get("clock") == logs.GNSS for part in parts):
+        notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
+    if own_clocks:
+        notes.insert(
+            0, "each vehicle has a clock of its own: times of one say nothing of another's"
+        )
     if len(notes) > _NOTES:
         notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
     sampled = parts[0].assumed in ASSUMED.values()
+    spans = "away" if own_clocks else spans
     away = spans == "away" or (sampled and spans == "refuse")
     since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
     records = _records_of_alike_files(parts)
-    read = Trajectories(tuple(names), curves, parts[0].assumed, (), records, away, since)
+    measured = tuple(own for part in parts for own in part.measured)
+    measured = measured if len(measured) == len(curves) else ()
+    read = Trajectories(
+        tuple(names), curves, parts[0].assumed, (), records, away, since, measured, own_clocks
+    )
     notes += _notes_on_gaps(read, sources, spans, gaps) if sampled else []
     return read._replace(notes=(*left_out, *notes, *_note_on_spans(read)))
 
@@ -172,19 +213,22 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     if not path.is_dir():
         return [[path]]
     inside = _seen_in(path)
-    kinds = {p.suffix.lower() for p in inside if p.is_file()} & _SUFFIXES
+    parts = [p for p in inside if p.suffix.lower() in _RECORDINGS]
+    if parts and (path / "metadata.yaml").is_file():
+        return [parts]
+    kinds = {p.suffix.lower() for p in inside if p.is_file() and _is_read(p)}
     if len(kinds) > 1:
         raise TrajectoryError(
             f"{path}: the folder has files {' and '.join(sorted(kinds))}. Give files of one kind for one flight."
         )
     if kinds:
-        return [[p] for p in inside if p.suffix.lower() in kinds and p.is_file()]
+        return [[p] for p in inside if p.is_file() and _is_read(p)]
     folders = [p for p in inside if p.is_dir()]
     groups = [[p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders]
     if not groups or not all(groups):
         bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
         raise TrajectoryError(
-            f"{bare}: the folder has no .csv, .skyc or .mcap. Give a folder with one table a vehicle."
+            f"{bare}: the folder has no .csv, .skyc, .mcap or log. Give a folder with one table a vehicle."
         )
     for group in groups:
         numbers = zip(*(re.findall(r"\d+", p.stem) for p in group), strict=False)
@@ -209,9 +253,9 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
     read = {p for group in listed for p in group}
     rest = [p for p in sorted(path.rglob("*"), key=_sort_key) if p.is_file() and p not in read]
     for p in rest:
-        hidden = p.suffix.lower() in _SUFFIXES and not _is_hidden(p)
+        hidden = _is_read(p) and not _is_hidden(p)
         with suppress(TrajectoryError):
-            hidden = hidden or bool(_read_file(p, "linear", units_of(None, None)))
+            hidden = hidden or bool(_read_file([p], _Options("linear", units_of(None, None))))
         if hidden:
             raise TrajectoryError(
                 f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
@@ -224,6 +268,27 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
 def _seen_in(folder: Path) -> list[Path]:
     """What is in a folder, in order, and not hidden."""
     return [p for p in sorted(folder.iterdir(), key=_sort_key) if not _is_hidden(p)]
+
+
+def _is_read(path: Path) -> bool:
+    """Whether a file may have trajectories, by its name; of one named ``.bin``, by its content."""
+    suffix = path.suffix.lower()
+    return suffix in _SUFFIXES or (suffix == ".bin" and _head_of(path).startswith(logs.BIN))
+
+
+def _head_of(path: Path) -> bytes:
+    """The first bytes of a file.
+
+    Raises
+    ------
+    TrajectoryError
+        It cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError as error:
+        raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
 
 
 def _is_hidden(path: Path) -> bool:
@@ -243,11 +308,11 @@ def _sort_key(path: Path) -> list[tuple[int, str]]:
     return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
 
 
-def _read_sequence(group: list[Path], interpolation: Interpolation, units: Units) -> Trajectories:
-    """What is in the file of a vehicle, or in several that it flies one after the other."""
-    first, *others = parts = [_read_file(path, interpolation, units) for path in group]
-    if not others:
-        return first
+def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
+    """What is in the file of a vehicle, in the parts of a recording, or in several files that follow each other."""
+    if len(group) == 1 or group[0].suffix.lower() in _RECORDINGS:
+        return _read_file(group, options)
+    parts = [_read_file([path], options) for path in group]
     if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
         raise TrajectoryError(
             f"{group[0]}: only tables of polynomials follow each other. Give a folder with one table a vehicle."
@@ -257,39 +322,48 @@ def _read_sequence(group: list[Path], interpolation: Interpolation, units: Units
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
         curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
     name = group[0].parent.name
-    return Trajectories((name,), (curve,), first.assumed, first.notes, first.read)
+    return Trajectories((name,), (curve,), parts[0].assumed, parts[0].notes, parts[0].read)
 
 
-def _read_file(path: Path, interpolation: Interpolation, units: Units) -> Trajectories:
-    """What is in one file, by its content."""
-    try:
-        size = path.stat().st_size
-        if size > _BYTES:
-            raise TrajectoryError(
-                f"{path}: has {size >> 20} MiB, more than {_BYTES >> 20}. Split it, or give fewer samples."
-            )
-        data = path.read_bytes()
-    except OSError as error:
-        raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
-    if data.startswith(_HDF):
+def _read_file(parts: list[Path], options: _Options) -> Trajectories:
+    """What is in one file, or in the parts of a recording, by its content."""
+    path, (interpolation, units, topics, origin) = parts[0], options
+    head, suffix = _head_of(path), path.suffix.lower()
+    if head.startswith(_HDF):
         raise TrajectoryError(
             f"{path}: is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`."
         )
-    suffix = path.suffix.lower()
     try:
-        if data.startswith(_ZIP) or suffix == ".skyc":
-            read = shows.read_show(data)
-        elif data.startswith(_MCAP) or suffix == ".mcap":
-            read = poses.read_poses(data, interpolation)
+        if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
+            log = poses.read_recording(parts, topics)
+            read = logs.trajectories_of(log, path.stem, interpolation, (), origin)
+        elif head.startswith((logs.ULOG, logs.BIN)) or suffix in _LOGS:
+            log = logs.read_log(path)
+            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
+        elif topics:
+            raise fault("has no topics", "Remove --topic")
+        elif head.startswith(_ZIP) or suffix == ".skyc":
+            read = shows.read_show(_content_of(path))
         else:
-            read = texts.read_text(data, path.stem, interpolation, units)
+            read = texts.read_text(_content_of(path), path.stem, interpolation, units)
         if (units.words or units.axes) and "units" not in read.read[0]:
             raise fault("says its units and axes itself", "Remove --units and --axes")
         for who, curve in zip(read.names, read.curves, strict=True):
             _refuse_far_numbers(who, curve)
+    except OSError as error:
+        raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
     except ContentError as error:
         raise TrajectoryError(f"{path}: {error}") from None
     return read
+
+
+def _content_of(path: Path) -> bytes:
+    """All of a file that is not too large."""
+    size = path.stat().st_size
+    if size > _BYTES:
+        why = f"has {size >> 20} MiB, more than {_BYTES >> 20}"
+        raise fault(why, "Split it, or give fewer samples")
+    return path.read_bytes()
 
 
 def _refuse_far_numbers(who: str, curve: Piecewise) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rigidfleet._common.names import CRAZYFLIE
 from rigidfleet._common.tables import TextTable, fault
 from rigidfleet.foreign.columns import Units, parse_table, read_tracks
 from rigidfleet.foreign.curves import NAMES, Trajectories, curve_through_states, rows_to_curve
@@ -44,7 +45,8 @@ def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Traje
         words = f"up to {off:.3g} m/s off those of its positions, which count"
         notes.append(f"the velocities of the table are {words}")
     names = tuple(track.name for track in tracks)
-    return Trajectories(names, tuple(curves), ASSUMED[interpolation], tuple(notes), (record,))
+    read = Trajectories(names, tuple(curves), ASSUMED[interpolation], tuple(notes), (record,))
+    return read._replace(own_clocks=any(map(CRAZYFLIE.fullmatch, table.names)))
 
 
 def _curve_of_coefficients(table: TextTable) -> Piecewise:

@@ -323,6 +323,11 @@ def of_curves(read: Trajectories, **judged: Any) -> Result:
     ResultError, MissionError
         As for `of_curve`.
     """
+    if read.own_clocks:
+        raise ResultError(
+            f"{', '.join(read.names[:3])}: each has a clock of its own, so how near they came cannot be told. Give one "
+            "file at a time, or logs with the time of GNSS."
+        )
     curves, knots = read.curves, common_knots(read.curves)
     _refuse_too_many(len(curves), len(knots))
     ends = knots[np.searchsorted(knots, [curve.time[[0, -1]] - 2.0 * SAME for curve in curves])]

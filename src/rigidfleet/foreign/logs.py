@@ -1,0 +1,474 @@
+"""Logs of autopilots: ULog of PX4, MAVLink's telemetry logs, and ArduPilot's binary ones.
+
+Sources: PX4's messages (`msg/versioned/VehicleLocalPosition.msg` and its neighbours; `eph` is the root of the sum of
+two variances, `get_ekf_lpos_accuracy` in its EKF2), MAVLink's `common.xml`, and ArduPilot's `LogStructure.h` (of
+AP_NavEKF3, AP_AHRS and AP_GPS; states 7 to 9 of a filter are the position). All of them are north, east, down, and yaw
+is clockwise from north.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from array import array
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import closing, redirect_stderr, redirect_stdout
+from fnmatch import fnmatchcase
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidfleet._common.tables import ContentError, fault
+from rigidfleet.foreign.curves import LoggedStates, Trajectories
+from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.typing import Floats, Ints
+
+#: Latitude, longitude [deg] and height above mean sea level [m] of a place on the Earth.
+Geodetic = tuple[float, float, float]
+#: Equatorial radius [m] and square of the eccentricity of WGS 84.
+_RADIUS, _ECCENTRICITY = 6_378_137.0, 6.694_379_990_14e-3
+#: Nanoseconds since 1970 from which on a stamp is a date; by how much a stamp goes back if a clock begins anew.
+_DATES, _ANEW = 10**15, 10**9
+#: A step of a position that its velocities do not explain: the least [m], and in usual ones.
+_JUMP, _UNUSUAL = 0.1, 20.0
+#: Bytes after the last message of a log of ArduPilot that are the rest of its pages.
+_PAGES = 528
+#: Greatest number of things that a note lists.
+_LISTED = 3
+#: How files begin; notes on what is damaged, and on whose clock dates are of.
+ULOG, BIN = b"ULog\x01\x12\x35", b"\xa3\x95"
+DAMAGED = "the log is damaged in part: what could be read is judged"
+GNSS = "that of the receiver of GNSS, true to its delay of some tenths of a second"
+
+
+class _Fields(NamedTuple):
+    """What a message says of a place.
+
+    Attributes
+    ----------
+    frame : "ned", "enu", or "geodetic" (latitude, longitude, height; other vectors are north, east, down)
+    place, velocity, yaw : names of fields; of those of yaw one is there
+    spread : fields of variances along the axes, or of PX4's standard deviations
+    units : of the three fields of the place, of velocities and of yaw, in m or deg, m/s and rad
+    """
+
+    frame: str
+    place: str
+    velocity: str = ""
+    yaw: str = ""
+    spread: str = ""
+    units: tuple[float, float, float, float, float] = (1.0, 1.0, 1.0, 1.0, 1.0)
+
+
+_DEGREE = math.radians(1.0)
+_INTEGERS = (1e-7, 1e-7, 1e-3, 1e-2, 1e-2 * _DEGREE)
+_EPH, _SHARES, _VARIANCES = "eph eph epv", np.sqrt([0.5, 0.5, 1.0]), "V07 V08 V09"
+_LOCAL = _Fields("ned", "x y z", "vx vy vz", "heading yaw", _EPH)
+_GLOBAL = _Fields("geodetic", "lat lon alt", spread=_EPH)
+_GPS = _Fields("geodetic", "latitude_deg longitude_deg altitude_msl_m", spread=_EPH)
+_ODOMETRY = _Fields("ned", "position[0] position[1] position[2]")
+_ODOMETRY = _ODOMETRY._replace(spread=_ODOMETRY.place.replace("position", "position_variance"))
+_FILTER = _Fields("ned", "PN PE PD", "VN VE VD", "Yaw", _VARIANCES, (1.0, 1.0, 1.0, 1.0, _DEGREE))
+_POSE = _Fields("enu", "x y z", "vx vy vz", "yaw", "var_x var_y var_z")
+#: Messages with places, those that are preferred first; one has two forms.
+_MESSAGES = [
+    ("vehicle_local_position", _LOCAL), ("vehicle_odometry", _ODOMETRY), ("vehicle_global_position", _GLOBAL),
+    *[(name, form) for name in ("vehicle_gps_position", "sensor_gps")
+      for form in (_GPS, _GLOBAL._replace(units=_INTEGERS))],
+    ("vehicle_mocap_odometry", _ODOMETRY), ("vehicle_visual_odometry", _ODOMETRY), ("estimator_odometry", _ODOMETRY),
+    ("estimator_local_position", _LOCAL), ("estimator_global_position", _GLOBAL),
+    ("vehicle_local_position_groundtruth", _LOCAL), ("vehicle_global_position_groundtruth", _GLOBAL),
+    ("LOCAL_POSITION_NED", _Fields("ned", "x y z", "vx vy vz")),
+    ("GLOBAL_POSITION_INT", _Fields("geodetic", "lat lon alt", "vx vy vz", "hdg", "", _INTEGERS)),
+    ("ATT_POS_MOCAP", _Fields("ned", "x y z")), ("GPS_RAW_INT", _Fields("geodetic", "lat lon alt", units=_INTEGERS)),
+    ("XKF1", _FILTER), ("NKF1", _FILTER), ("EKF1", _FILTER),
+    *[(name, _Fields("geodetic", "Lat Lng Alt")) for name in ("POS", "GPS", "SIM")],
+    *[(name, _POSE) for name in ("PoseStamped", "NamedPoseArray", "Odometry", "PoseWithCovarianceStamped",
+                                 "TransformStamped", "TFMessage")],
+]  # fmt: skip
+_RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
+#: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
+_BESIDE = {
+    "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
+    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode", "BAD_DATA": "",
+}  # fmt: skip
+#: Fields that are not 0 where a place of PX4 is valid, and those that count how often its estimator set it anew.
+_VALID = {"xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"}
+_RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
+
+
+class Channel(NamedTuple):
+    """Samples of one topic.
+
+    Attributes
+    ----------
+    topic, message : its name, and that of its messages
+    columns : (K,) by field: ``time`` [ns], and where messages came later ``received`` [ns], too
+    frame : the one of its positions, if the log names it
+    reference : where on the Earth the origin of local positions is, if the log tells it
+    """
+
+    topic: str
+    message: str
+    columns: dict[str, Any]
+    frame: str = ""
+    reference: Geodetic | None = None
+
+
+class Log(NamedTuple):
+    """Channels of each vehicle ("" if it is the only one), whose clock they have, when it was armed, and notes.
+
+    ``clock`` is empty if it is the vehicle's own, which counts from its start. ``armed`` has times [ns] and whether.
+    """
+
+    vehicles: dict[str, list[Channel]]
+    clock: str
+    armed: tuple[Ints, Any] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_log(path: Path) -> Log:
+    """The log of an autopilot, by its content.
+
+    Raises
+    ------
+    ContentError
+        A package is missing, or the log is damaged.
+    """
+    with path.open("rb") as file:
+        head = file.read(8)
+    package, read = "pymavlink", _read_bin if head.startswith(BIN) else _read_tlog
+    if head.startswith(ULOG):
+        package, read = "pyulog", _read_ulog
+    if find_spec(package) is None:
+        raise fault(f"needs the package {package!r}", "Run: pip install rigidfleet[logs]")
+    words = io.StringIO()
+    try:
+        with redirect_stdout(words), redirect_stderr(words):
+            log = read(path)
+    except Exception as error:  # a damaged log leads the packages to any
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise fault(f"the log is damaged ({reason})", "Copy it again") from None
+    if words.getvalue():
+        log = log._replace(notes=(*log.notes, DAMAGED))
+    return log
+
+
+def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
+    """The channels whose topics are named, or all, in the order in which they are preferred.
+
+    Raises
+    ------
+    ContentError
+        There is none.
+    """
+    chosen = [c for c in channels if not topics or any(fnmatchcase(c.topic, t) for t in topics)]
+    if not chosen:
+        words = f" {' or '.join(topics)}" if topics else ""
+        every = ", ".join(sorted(c.topic for c in channels)[:20]) or "none"
+        raise fault(f"has no topic{words} with positions", f"Topics with positions are: {every}")
+    return sorted(chosen, key=lambda c: _RANK[c.message])
+
+
+def trajectories_of(
+    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None
+) -> Trajectories:
+    """Curves through the places of a log, in east, north, up about an origin.
+
+    Without one, places are about the origin of the first vehicle's estimator, or its first place.
+
+    Raises
+    ------
+    ContentError
+        A vehicle has no valid position.
+    """
+    tracks, notes = {}, [*log.notes]
+    for who, channels in log.vehicles.items():
+        reasons: list[str] = []
+        for channel in choose(channels, topics):
+            try:
+                track = _track_of(channel, origin)
+                break
+            except ContentError as error:
+                reasons.append(str(error).rstrip("."))
+        else:
+            raise fault("; ".join(reasons[:_LISTED]), "Name a topic that has valid positions")
+        others = ", ".join([c.topic for c in channels if c is not channel and not topics][:_LISTED])
+        own = [
+            f"positions are those of {channel.topic}"
+            + f"; --topic may name {others}" * bool(others)
+        ]
+        notes += [f"{who}: {x}" if who else x for x in (*own, *reasons[:1], *track.notes)]
+        tracks[who or stem], origin = track, origin or track.origin
+    first = min(int(track.time[0]) for track in tracks.values())
+    zero = first if first > _DATES else 0
+    curves, measured = [], []
+    for track in tracks.values():
+        time = (track.time - first) / 1e9 + (first - zero) / 1e9  # whole numbers lose none
+        where = lambda k, topic=track.topic: f"{topic}: message {k + 1}"  # noqa: E731
+        curves.append(curve_through_samples(time, track.place, track.yaw, interpolation, where))
+        size = len(curves[-1].time), 3  # a single sample stays for a second
+        each = (
+            None if x is None else np.resize(x, size) for x in (track.velocity, track.deviation)
+        )
+        measured.append(LoggedStates(*each))
+    frames = [*dict.fromkeys(track.frame for track in tracks.values())]
+    if len(frames) > 1:
+        words = ", ".join(frames[:_LISTED])
+        notes.append(f"positions are in frames {words}: where one is in another is not known")
+    record: dict[str, Any] = {
+        "topics": [*dict.fromkeys(track.topic for track in tracks.values())][:20], "frame": frames[0],
+        "clock": log.clock or "the vehicle's own, from its start", "since_1970_ns": zero or None,
+        "rows": sum(len(track.time) for track in tracks.values()),
+    }  # fmt: skip
+    if any(track.origin for track in tracks.values()):
+        record["origin"] = list(origin or ())
+    if log.armed is not None:
+        time, on = log.armed
+        k = np.flatnonzero(np.diff(np.concatenate([[0], on != 0, [0]])))
+        spans = (np.append(time, time[-1:])[k].reshape(-1, 2) - zero) / 1e9
+        record["armed"] = [f"{a:.6g} to {b:.6g} s" for a, b in spans[:_LISTED]] or "never"
+    read = Trajectories(
+        tuple(tracks), tuple(curves), ASSUMED[interpolation], tuple(notes), (record,)
+    )
+    return read._replace(measured=tuple(measured), own_clocks=not log.clock)
+
+
+class _Track(NamedTuple):
+    """Times (K,) [ns], places, velocities and deviations (K, 3) in east, north, up, and yaws (K,) of a vehicle."""
+
+    topic: str
+    frame: str
+    time: Ints
+    place: Floats
+    velocity: Floats | None
+    deviation: Floats | None
+    yaw: Floats | None
+    origin: Geodetic | None
+    notes: list[str]
+
+
+def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
+    """What a channel says of places.
+
+    Raises
+    ------
+    ContentError
+        It has no valid one.
+    """
+    columns, notes, reference = channel.columns, [], channel.reference
+    forms = [form for name, form in _MESSAGES if name == channel.message]
+    form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
+    if form is None:
+        raise fault(f"{channel.topic}: its messages are of a form that is not known")
+    frame = "ned" if channel.frame.endswith("_ned") else form.frame
+    place = _fields(columns, form.place) * form.units[:3]
+    known = np.isfinite(place).all(axis=1)
+    known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
+    for name in _VALID & columns.keys():
+        known &= columns[name] != 0
+    if not known.any():
+        raise fault(f"{channel.topic}: no position is valid")
+    if not known.all():
+        notes.append(f"{np.sum(~known):,} samples without a valid position are left out")
+    rows = _increasing_rows(columns["time"], np.flatnonzero(known), notes)
+    own = {name: column[rows] for name, column in columns.items()}
+    time, place, velocity, deviation, yaw = own["time"], place[rows], None, None, None
+    if "received" in own:  # as if the quickest message came at once
+        time = time + (own["received"] - time).min()
+    if frame == "geodetic":
+        if origin is None:
+            notes.append("positions are about the first one: no origin is stated")
+        reference = origin or (*place[0].tolist(),)
+        place = enu_of(place, reference)
+    else:
+        place = _turn(place, frame)
+        if reference is not None:
+            place = place + enu_of(np.array([reference]), origin or reference)
+        elif frame == "ned":
+            notes.append("positions are about a place that the log does not tell")
+    if form.velocity and {*form.velocity.split()} <= own.keys():
+        velocity = _turn(_fields(own, form.velocity) * form.units[3], frame)
+    if form.spread and {*form.spread.split()} <= own.keys():
+        spread = np.maximum(_fields(own, form.spread), 0.0)
+        spread = spread * _SHARES if form.spread == _EPH else np.sqrt(spread)
+        deviation = np.abs(_turn(np.where(spread > 0.0, spread, np.nan), frame))
+    for name in {*form.yaw.split()} & own.keys():
+        yaw = own[name].astype(np.float64) * form.units[4]
+        yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
+    notes += _notes_on_resets(own, time / 1e9, place, velocity)
+    origin, frame = reference and (origin or reference), f"{frame} {channel.frame}".strip()
+    return _Track(channel.topic, frame, time, place, velocity, deviation, yaw, origin, notes)
+
+
+def _fields(columns: dict[str, Any], names: str) -> Floats:
+    return np.column_stack([columns[name] for name in names.split()]).astype(np.float64)
+
+
+def _turn(x: Floats, frame: str) -> Floats:
+    """Vectors (K, 3) in east, north, up."""
+    return x if frame == "enu" else x[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+
+
+def enu_of(geodetic: Floats, origin: Geodetic) -> Floats:
+    """Places (K, 3) of latitude, longitude [deg] and height [m], in east, north, up about an origin [m]."""
+    lat, lon, height = np.vstack([geodetic, origin]).T
+    lat, lon = np.radians(lat), np.radians(lon)
+    n = _RADIUS / np.sqrt(1.0 - _ECCENTRICITY * np.sin(lat) ** 2)
+    flat, up = (n + height) * np.cos(lat), ((1.0 - _ECCENTRICITY) * n + height) * np.sin(lat)
+    x, y, z = (q[:-1] - q[-1] for q in (flat * np.cos(lon), flat * np.sin(lon), up))
+    (sin, cos), (sine, cosine) = ((np.sin(q[-1]), np.cos(q[-1])) for q in (lat, lon))
+    out = cosine * x + sine * y
+    return np.stack([cosine * y - sine * x, cos * z - sin * out, sin * z + cos * out], axis=1)
+
+
+def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:
+    """Of some rows those with increasing times, of the longest part between two starts of the clock."""
+    parts = np.split(rows, np.flatnonzero(np.diff(time[rows]) < -_ANEW) + 1)
+    if len(parts) > 1:
+        every, rows = len(rows), max(parts, key=len)
+        words = f"the longest part counts, {len(rows):,} of {every:,} samples"
+        notes.append(f"the clock begins anew, {len(parts) - 1} times: {words}")
+    later = np.append(True, time[rows][1:] > np.maximum.accumulate(time[rows])[:-1])
+    if not later.all():
+        notes.append(f"{np.sum(~later):,} samples whose times repeat or go back are left out")
+    return rows[later]
+
+
+def _notes_on_resets(
+    columns: dict[str, Any], time: Floats, place: Floats, velocity: Floats | None
+) -> list[str]:
+    """A note on where the estimator set the position anew: as it counts that, or as its velocities show."""
+    move, again = np.diff(place, axis=0), np.zeros(len(time) - 1, dtype=np.bool_)
+    if names := [name for name in _RESETS if name in columns]:
+        again = (np.diff(_fields(columns, " ".join(names)), axis=0) != 0.0).any(axis=1)
+    elif velocity is not None and len(move):
+        off = move - 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)[:, None]
+        far = np.linalg.norm(off, axis=1)
+        again = far > max(_JUMP, _UNUSUAL * float(np.median(far)))
+    far, rows = np.linalg.norm(move, axis=1), np.flatnonzero(again)
+    words = ", ".join(f"{far[k]:.3g} m at {time[k + 1] - time[0]:.6g} s" for k in rows[:_LISTED])
+    words += f" from its first sample ({len(rows):,} times in all): no vehicle flew that"
+    return [f"the estimator moves its position by {words}"] if len(rows) else []
+
+
+def _place_of(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:
+    """The latest place on the Earth that fields tell, if there is one."""
+    if not {*names.split()} <= columns.keys():
+        return None
+    place = _fields(columns, names) * units
+    known = place[np.isfinite(place).all(axis=1) & (place[:, :2] != 0.0).any(axis=1)]
+    return (*known[-1].tolist(),) if len(known) else None
+
+
+def _read_ulog(path: Path) -> Log:
+    from pyulog import ULog
+
+    with path.open("rb") as file:
+        log = ULog(file, ["actuator_armed", *_RANK])
+    channels, armed, after = [], None, 0
+    dated = 1000 * log.start_timestamp > _DATES
+    for data in (x.data for x in log.data_list if "time_utc_usec" in x.data and not dated):
+        if (known := data["time_utc_usec"] > 0).any():
+            late = data["time_utc_usec"].astype(np.int64) - data["timestamp"].astype(np.int64)
+            after = int(np.median((late - data.get("timestamp_time_relative", 0))[known]))
+    for name, number, data in ((x.name, x.multi_id, x.data) for x in log.data_list):
+        # Positions are of the time of the sample, which is a little before that of the message.
+        stamp = data.get("timestamp_sample", data["timestamp"]).astype(np.int64)
+        data["time"] = 1000 * (
+            np.where(stamp > 0, stamp, data["timestamp"].astype(np.int64)) + after
+        )
+        if name == "actuator_armed":
+            armed = data["time"], data["armed"]
+            continue
+        if "pose_frame" in data:
+            data["is_ned"] = data["pose_frame"] == 1
+        topic, place = (
+            f"{name}:{number}" if number else name,
+            _place_of(data, "ref_lat ref_lon ref_alt"),
+        )
+        channels.append(Channel(topic, name, data, "", place))
+    notes = [DAMAGED] * log.file_corruption
+    if lost := [x.duration / 1e3 for x in log.dropouts]:
+        words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"
+        notes.append(f"the logger lost data {len(lost):,} times, {words}")
+    clock = GNSS if after else "the dates that the vehicle had" if dated else ""
+    return Log({"": channels}, clock, armed, tuple(notes))
+
+
+def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """Columns of the messages of a log that matter, by system, message and lane of the estimator.
+
+    ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log.
+    """
+    names = {name: own.split() for name, own in _BESIDE.items()}
+    for name, form in _MESSAGES:
+        every = f"{form.place} {form.velocity} {form.yaw} {form.spread}"
+        names[name] = every.split()
+    rows: dict[tuple[str, str, int], array[float]] = defaultdict(lambda: array("d"))
+    while (message := log.recv_match(type=[*names])) is not None:
+        kind, received = message.get_type(), message._timestamp
+        who = f"{message.get_srcSystem()}" if hasattr(message, "get_srcSystem") else ""
+        lane = 0 if kind in _BESIDE else getattr(message, "C", getattr(message, "I", 0))
+        stamp = getattr(message, "time_boot_ms", 1e3 * received) / 1e3
+        own = (getattr(message, name, math.nan) for name in names[kind])
+        rows[who, kind, lane].extend((stamp, received, *own))
+    table = {}
+    for key, numbers in rows.items():
+        own = np.frombuffer(numbers).reshape(-1, 2 + len(names[key[1]])).T
+        columns = zip(names[key[1]], own[2:], strict=True)
+        table[key] = {k: x for k, x in columns if np.isfinite(x).any()}
+        with np.errstate(invalid="ignore"):  # what is no message has any time
+            stamps = np.round(1e9 * own[:2]).astype(np.int64)
+        table[key] |= {"time": stamps[0], "received": stamps[1]}
+    return table
+
+
+def _read_bin(path: Path) -> Log:
+    from pymavlink.DFReader import DFReader_binary
+
+    with closing(DFReader_binary(str(path))) as log:
+        table = _collect(log)
+        last = max(int(own[-1]) for own in log.offsets if len(own))
+        notes = (DAMAGED,) if log.data_len - last > _PAGES else ()
+    beside = {kind: columns for (_, kind, _), columns in table.items() if kind in _BESIDE}
+    channels, dated, place = [], False, None
+    if own := beside.get("ORGN"):  # type 0 is the origin of the filter
+        place = _place_of({k: x[own["Type"] == 0] for k, x in own.items()}, "Lat Lng Alt")
+    for (_, kind, lane), columns in table.items():
+        if kind in _BESIDE:
+            continue
+        dated, own = bool(columns["time"][0] > _DATES), beside.get(f"{kind[0]}KF4")
+        del columns["received"]
+        main = lane == (int(np.median(own["PI"])) if own and kind[1:] == "KF1" else 0)
+        if main and kind[1:] == "KF1" and (own := beside.get(f"{kind[0]}KV1")):
+            for name in _VARIANCES.split():
+                columns[name] = np.interp(columns["time"], own["time"], own[name])
+        made = Channel(f"{kind}:{lane}" if lane else kind, kind, columns, "", place)
+        channels.insert(0 if main else len(channels), made)
+    armed = (own["time"], own["ArmState"]) if (own := beside.get("ARM")) else None
+    return Log({"": channels}, GNSS if dated else "", armed, notes)
+
+
+def _read_tlog(path: Path) -> Log:
+    from pymavlink.mavutil import mavlogfile
+
+    with closing(mavlogfile(str(path))) as log:
+        table = _collect(log)
+    vehicles: dict[str, list[Channel]] = defaultdict(list)
+    for (who, kind, _), columns in table.items():
+        if kind not in _BESIDE:
+            own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
+            place = _place_of(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3])
+            vehicles[f"system {who}"].append(Channel(kind, kind, columns, "", place))
+    armed, notes = None, (DAMAGED,) if any(kind == "BAD_DATA" for _, kind, _ in table) else ()
+    if len(vehicles) == 1:
+        ((who, channels),) = vehicles.items()
+        if own := table.get((who.removeprefix("system "), "HEARTBEAT", 0)):
+            armed = own["received"], own["base_mode"].astype(int) & 128
+        vehicles = {"": channels}
+    clock = "that of who wrote the log, less the shortest delay"
+    return Log(vehicles or {"": []}, clock, armed, notes)

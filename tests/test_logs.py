@@ -1,0 +1,522 @@
+"""Logs of autopilots and of ROS 2: read as others wrote them, compared with what their libraries read."""
+
+import lzma
+import os
+import re
+import struct
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rigidfleet.cli.app import main
+from rigidfleet.errors import ResultError, TrajectoryError
+from rigidfleet.foreign.files import read_trajectories
+from rigidfleet.foreign.logs import enu_of
+from rigidfleet.simulation.trajectories import of_curves
+
+LOGS = Path(__file__).parent / "data" / "logs"
+#: A folder with further public logs, such as pyulog's tests, which are too large to be kept.
+MORE = os.environ.get("RIGIDFLEET_LOGS", "")
+
+
+@pytest.fixture
+def log(tmp_path):
+    """A kept log, unpacked."""
+
+    def unpack(name: str) -> Path:
+        path = tmp_path / name
+        path.write_bytes(lzma.decompress((LOGS / f"{name}.xz").read_bytes()))
+        return path
+
+    return unpack
+
+
+def at_samples(read, i=0):
+    """Times and places of a vehicle's samples."""
+    curve = read.curves[i]
+    return curve.time, curve.at(curve.time)[:, :3]
+
+
+def measured(read, i=0) -> SimpleNamespace:
+    """Velocities and deviations of a vehicle."""
+    velocity, deviation = (np.asarray(x, dtype=float) for x in read.measured[i])
+    return SimpleNamespace(velocity=velocity, deviation=deviation)
+
+
+def said(read, words: str) -> bool:
+    return any(words in note for note in read.notes)
+
+
+def flat(latitude, longitude, height, origin):
+    """East, north, up near an origin, by the radii of curvature of WGS 84 there."""
+    a, e2, lat = 6378137.0, 0.00669437999014, np.radians(origin[0])
+    w = np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
+    north = np.radians(np.asarray(latitude) - origin[0]) * (a * (1 - e2) / w**3 + origin[2])
+    east = np.radians(np.asarray(longitude) - origin[1]) * (a / w + origin[2]) * np.cos(lat)
+    return np.stack([east, north, np.asarray(height) - origin[2]], axis=1)
+
+
+def test_places_on_the_earth_are_those_of_its_curvature():
+    """Within 100 m, east, north and up follow from the radii of curvature, to a millimetre; a mile up is up."""
+    origin = (-35.36, 149.16, 580.0)
+    lat, lon = origin[0] + np.array([0, 9e-4, -5e-4]), origin[1] + np.array([9e-4, 0, 7e-4])
+    height = origin[2] + np.array([0.0, 30.0, -20.0])
+    made = enu_of(np.stack([lat, lon, height], 1), origin)
+    np.testing.assert_allclose(made, flat(lat, lon, height, origin), atol=2e-3)
+    above = enu_of(np.array([[*origin[:2], origin[2] + 1609.0]]), origin)
+    np.testing.assert_allclose(above, [[0, 0, 1609]], atol=1e-6)
+
+
+# -- ArduPilot ---------------------------------------------------------------------------------------
+
+
+def rows_of(path: Path, kind: str, *names: str, **only) -> np.ndarray:
+    """Fields of messages as pymavlink reads them."""
+    reader = pytest.importorskip("pymavlink.DFReader").DFReader_binary(str(path))
+    rows = []
+    while (m := reader.recv_match(type=[kind])) is not None:
+        if all(getattr(m, key) == value for key, value in only.items()):
+            rows.append([getattr(m, name) for name in names])
+    reader.close()
+    return np.array(rows, dtype=float)
+
+
+def test_the_primary_core_of_ardupilot_is_read(log):
+    """Of three cores the primary one: north, east, down in metres become east, north, up, as are velocities."""
+    path = log("cores.bin")
+    own = rows_of(path, "XKF1", "PN", "PE", "PD", "VN", "VE", "VD", "Yaw", "_timestamp", C=0)
+    read = read_trajectories(path)
+    time, place = at_samples(read)
+    np.testing.assert_allclose(place, own[:, [1, 0, 2]] * [1, 1, -1], atol=1e-12)
+    np.testing.assert_allclose(measured(read).velocity, own[:, [4, 3, 5]] * [1, 1, -1])
+    np.testing.assert_allclose(time + read.since, own[:, 7], atol=1e-6)
+    yaw = read.curves[0].at(read.curves[0].time)[:, 3]
+    np.testing.assert_allclose(np.cos(yaw), np.sin(np.radians(own[:, 6])), atol=1e-12)
+    assert said(read, "positions are those of XKF1; --topic may name")
+    assert read.read[0]["origin"] == pytest.approx([38.3149933, 26.6360348, 66.63])
+    other = read_trajectories(path, topic="XKF1:2")
+    own = rows_of(path, "XKF1", "PE", C=2)
+    np.testing.assert_allclose(at_samples(other)[1][:, 0], own[:, 0], atol=1e-12)
+
+
+def test_variances_of_a_filter_are_those_of_its_position(log):
+    """States 7 to 9 of ArduPilot's filter are north, east, down: their roots are deviations at that time."""
+    path = log("cores.bin")
+    own = rows_of(path, "XKV1", "V07", "V08", "V09", "_timestamp")
+    read = read_trajectories(path)
+    at = [np.interp(own[:, 3] - read.since, read.curves[0].time, x)
+          for x in measured(read).deviation.T]  # fmt: skip
+    np.testing.assert_allclose(np.stack(at, 1), np.sqrt(own[:, [1, 0, 2]]), rtol=0.05)
+
+
+def test_local_and_geodetic_positions_of_a_flight_agree(log):
+    """A filter's metres from its origin and the latitudes in the log are one place, to 5 cm, and 20 cm up."""
+    path = log("cores.bin")
+    origin = (38.3149933, 26.6360348, 66.63)
+    (t, local), (u, geodetic) = (
+        at_samples(read_trajectories(path, topic=topic, origin=origin)) for topic in ("XKF1", "POS")
+    )
+    north = rows_of(path, "POS", "Lat", "Lng", "Alt")
+    np.testing.assert_allclose(geodetic, flat(*north.T, origin), atol=1e-3)
+    np.testing.assert_allclose(t, u, atol=0.01)
+    np.testing.assert_allclose(local[:, :2], geodetic[:, :2], atol=0.05)
+    np.testing.assert_allclose(local[:, 2], geodetic[:, 2], atol=0.2)
+
+
+def test_an_origin_moves_local_positions(log):
+    """Metres from an estimator's origin are moved to the one that is stated, as a mission's is."""
+    path = log("plane.bin")
+    here, there = (-35.3626381, 149.1653685, 585.6), (-35.3636381, 149.1643685, 580.0)
+    (_, about), (_, moved) = (at_samples(read_trajectories(path, origin=x)) for x in (None, there))
+    shift = flat(*np.array([here]).T, there)
+    np.testing.assert_allclose(moved - about, np.repeat(shift, len(about), 0), atol=5e-3)
+    with pytest.raises(TrajectoryError, match=r"is no place on the Earth\. Give latitude"):
+        read_trajectories(path, origin=(149.0, -35.0, 0.0))
+
+
+def test_a_log_is_cut_or_damaged(log, tmp_path):
+    """A log that ends in the middle of a message is read up to there; what is lost behind noise is told."""
+    path = log("cores.bin")
+    data = path.read_bytes()
+    whole = read_trajectories(path)
+    path.write_bytes(data[: len(data) * 2 // 3 + 5])
+    part = read_trajectories(path)
+    n = len(part.curves[0].time)
+    assert 200 < n < len(whole.curves[0].time)
+    np.testing.assert_allclose(at_samples(part)[1], at_samples(whole)[1][:n])
+    path.write_bytes(data[:150_000] + b"\xff" * 3000 + data[150_000:])
+    part = read_trajectories(path)
+    n = len(part.curves[0].time)
+    np.testing.assert_allclose(at_samples(part)[1], at_samples(whole)[1][:n])
+    assert said(part, "the log is damaged in part")
+
+
+# -- MAVLink -----------------------------------------------------------------------------------------
+
+
+def mavlink(path: Path, kind: str, *names: str) -> np.ndarray:
+    """Fields of messages as pymavlink reads them."""
+    reader = pytest.importorskip("pymavlink.mavutil").mavlogfile(str(path))
+    rows = []
+    while (m := reader.recv_match(type=[kind])) is not None:
+        rows.append([getattr(m, name) for name in names])
+    reader.close()
+    return np.array(rows, dtype=float)
+
+
+def test_a_telemetry_log_has_the_clock_of_its_writer(log):
+    """Stamps are the vehicle's, later by the least delay of its messages; a restart ends a part of the log."""
+    path = log("copter.tlog")
+    own = mavlink(
+        path,
+        "GLOBAL_POSITION_INT",
+        "lat",
+        "lon",
+        "alt",
+        "vx",
+        "vy",
+        "vz",
+        "time_boot_ms",
+        "_timestamp",
+    )
+    starts = np.flatnonzero(np.diff(own[:, 6]) < -1000) + 1
+    parts = np.split(own, starts)
+    assert len(parts) == 3
+    own = max(parts, key=len)
+    origin = (*own[0, :2] / 1e7, 0.0)
+    read = read_trajectories(path, topic="GLOBAL_POSITION_INT", gaps="bridge", origin=origin)
+    time, place = at_samples(read)
+    np.testing.assert_allclose(place, flat(*(own[:, :3] / [1e7, 1e7, 1e3]).T, origin), atol=0.01)
+    np.testing.assert_allclose(measured(read).velocity, own[:, [4, 3, 5]] / [100, 100, -100])
+    late = own[:, 7] - (time + read.since)
+    assert late.min() == pytest.approx(0.0, abs=1e-5)
+    np.testing.assert_allclose(np.diff(time), np.diff(own[:, 6]) / 1e3, atol=1e-6)
+    assert said(read, "the clock begins anew, 2 times")
+    assert "armed" in read.read[0]
+
+
+def test_jumps_of_an_estimator_are_told(log, tmp_path):
+    """Where a position moves against its velocity, when the estimator is set anew, a note says so."""
+    path = log("cores.bin")
+    assert not said(read_trajectories(path), "the estimator moves")
+    reader = pytest.importorskip("pymavlink.DFReader").DFReader_binary(str(path))
+    data, late = bytearray(path.read_bytes()), 0
+    while (m := reader.recv_match(type=["XKF1"])) is not None:
+        late += m.C == 0
+        if m.C == 0 and late > 300:
+            at = reader.offset - len(m.get_msgbuf())
+            field = data.index(struct.pack("<f", m.PN), at)
+            data[field : field + 4] = struct.pack("<f", m.PN + 1.5)
+    reader.close()
+    path.write_bytes(data)
+    read = read_trajectories(path)
+    (note,) = (x for x in read.notes if "the estimator moves" in x)
+    assert re.search(r"by 1\.[4-7]\d* m at 30\.0", note), note
+
+
+# -- PX4 ---------------------------------------------------------------------------------------------
+
+LOCAL = [("uint64_t", "timestamp"), ("uint64_t", "timestamp_sample"), ("float", "x"), ("float", "y"), ("float", "z"),
+         ("float", "vx"), ("float", "vy"), ("float", "vz"), ("float", "heading"), ("float", "eph"), ("float", "epv"),
+         ("double", "ref_lat"), ("double", "ref_lon"), ("float", "ref_alt"), ("uint8_t", "xy_reset_counter"),
+         ("bool", "xy_valid"), ("bool", "z_valid")]  # fmt: skip
+GPS = [("uint64_t", "timestamp"), ("uint64_t", "time_utc_usec"), ("int32_t", "lat"), ("int32_t", "lon"),
+       ("int32_t", "alt")]  # fmt: skip
+CODES = {"uint64_t": "Q", "float": "f", "double": "d", "uint8_t": "B", "bool": "?", "int32_t": "i"}
+
+
+def ulog(path: Path, topics, *, cut: int = 0) -> Path:
+    """A log after PX4's description of ULog; topics: name, number, fields, rows."""
+    message = lambda kind, body: struct.pack("<HB", len(body), ord(kind)) + body  # noqa: E731
+    parts = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 1000), message("B", bytes(40))]
+    forms = {name: fields for name, _, fields, _ in topics}
+    for name, fields in forms.items():
+        text = f"{name}:" + "".join(f"{kind} {field};" for kind, field in fields)
+        parts.append(message("F", text.encode()))
+    for k, (name, number, _, _) in enumerate(topics):
+        parts.append(message("A", struct.pack("<BH", number, k) + name.encode()))
+    for k, (_, _, fields, rows) in enumerate(topics):
+        code = "<H" + "".join(CODES[kind] for kind, _ in fields)
+        parts += [message("D", struct.pack(code, k, *row)) for row in rows]
+    data = b"".join(parts)
+    path.write_bytes(data[: len(data) - cut])
+    return path
+
+
+def local_rows(n=100, start=5_000_000, valid=20):
+    """Rows of `vehicle_local_position`: the first ones are not valid; an estimator is reset once."""
+    for k in range(n):
+        t = start + 20_000 * k
+        jump = 0.5 * (k >= 60)
+        yield (t, t - 800, 0.02 * k + jump, 1.0, -3.0 - 0.01 * k, 1.0, 0.0, -0.5, 0.3, 0.2, 0.1, 47.4, 8.55, 488.0,
+               int(k >= 60), k >= valid, True)  # fmt: skip
+
+
+def test_local_positions_of_px4_are_turned_and_timed(tmp_path):
+    """North, east, down at the time of the sample become east, north, up; invalid samples are left out."""
+    pyulog = pytest.importorskip("pyulog")
+    rows = list(local_rows())
+    path = ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, rows),
+                                       ("vehicle_local_position", 1, LOCAL, rows[50:])])  # fmt: skip
+    theirs = pyulog.ULog(str(path)).get_dataset("vehicle_local_position").data
+    read = read_trajectories(path)
+    time, place = at_samples(read)
+    kept = slice(20, None)
+    np.testing.assert_allclose(place.T, [theirs["y"][kept], theirs["x"][kept], -theirs["z"][kept]])
+    np.testing.assert_allclose(time, theirs["timestamp_sample"][kept] / 1e6, atol=1e-9)
+    np.testing.assert_allclose(measured(read).velocity, [[0.0, 1.0, 0.5]] * 80)
+    # eph is the root of the sum of two variances.
+    np.testing.assert_allclose(
+        measured(read).deviation, [[0.2 / 2**0.5] * 2 + [0.1]] * 80, rtol=1e-6
+    )
+    assert read.curves[0].at(time)[0, 3] == pytest.approx(np.pi / 2 - 0.3)
+    assert said(read, "20 samples without a valid position are left out")
+    assert said(read, "the estimator moves its position by 0.52 m at 0.8 s")
+    assert said(read, "--topic may name vehicle_local_position:1")
+    assert read.read[0]["origin"] == pytest.approx([47.4, 8.55, 488.0])
+
+
+def test_what_is_not_valid_is_not_read(tmp_path):
+    """Without a valid local position another topic is read, and said; without any there is one error."""
+    pytest.importorskip("pyulog")
+    rows = list(local_rows(valid=1000))
+    fixes = [
+        (5_000_000 + 100_000 * k, 0, 474_000_000 + 90 * k, 85_500_000, 488_000) for k in range(20)
+    ]
+    topics = [("vehicle_local_position", 0, LOCAL, rows), ("vehicle_gps_position", 0, GPS, fixes)]
+    read = read_trajectories(ulog(tmp_path / "a.ulg", topics))
+    assert said(read, "vehicle_local_position: no position is valid")
+    assert said(read, "positions are those of vehicle_gps_position")
+    assert at_samples(read)[1][-1, 1] == pytest.approx(90 * 19 * 1e-7 * 111_200, rel=1e-3)
+    path = ulog(tmp_path / "b.ulg", topics[:1])
+    with pytest.raises(
+        TrajectoryError, match=r"b\.ulg: vehicle_local_position: no position is valid\. Name"
+    ):
+        read_trajectories(path)
+    with pytest.raises(
+        TrajectoryError,
+        match=r"has no topic nothing with positions\. Topics with positions are: ve",
+    ):
+        read_trajectories(path, topic="nothing")
+
+
+def test_logs_share_a_clock_by_gnss_or_have_none(tmp_path):
+    """Two logs that count from their starts are joined by the time of GNSS; without it they are not judged together."""
+    pytest.importorskip("pyulog")
+
+    def logs(folder, utc):
+        folder.mkdir()
+        for k, boot in enumerate((5_000_000, 90_000_000)):
+            fixes = [(boot, utc and utc + 1_000_000 * k, 474_000_000, 85_500_000, 488_000)]
+            topics = [("vehicle_local_position", 0, LOCAL, list(local_rows(start=boot, valid=0))),
+                      ("vehicle_gps_position", 0, GPS, fixes)]  # fmt: skip
+            ulog(folder / f"v{k}.ulg", topics)
+        return read_trajectories(folder, spans="away")
+
+    read = logs(tmp_path / "dated", 1_700_000_000_000_000)
+    assert [curve.time[0] for curve in read.curves] == pytest.approx([0.0, 1.0])
+    assert not read.own_clocks
+    assert said(read, "the clock that vehicles have in common is that of the receiver of GNSS")
+    bare = logs(tmp_path / "bare", 0)
+    assert bare.own_clocks
+    assert said(bare, "each vehicle has a clock of its own")
+    with pytest.raises(ResultError, match="v0, v1: each has a clock of its own"):
+        of_curves(bare)
+
+
+def test_origins_of_several_logs_are_one(tmp_path):
+    """Without a stated origin, all vehicles are about that of the first one's estimator."""
+    pytest.importorskip("pyulog")
+    rows = list(local_rows(valid=0))
+    north = [(*row[:11], 47.401, *row[12:]) for row in rows]
+    fix = [(5_000_000, 1_700_000_000_000_000, 474_000_000, 85_500_000, 488_000)]
+    for name, own in (("a", rows), ("b", north)):
+        ulog(tmp_path / f"{name}.ulg", [("vehicle_local_position", 0, LOCAL, own),
+                                        ("vehicle_gps_position", 0, GPS, fix)])  # fmt: skip
+    read = read_trajectories(tmp_path)
+    apart = at_samples(read, 1)[1] - at_samples(read, 0)[1]
+    np.testing.assert_allclose(
+        apart, flat([47.401], [8.55], [488.0], (47.4, 8.55, 488.0)).repeat(100, 0), atol=5e-3
+    )
+
+
+def test_a_ulog_is_cut(tmp_path):
+    """A log whose end is missing is read up to there; one without its head is one error."""
+    pytest.importorskip("pyulog")
+    topics = [("vehicle_local_position", 0, LOCAL, list(local_rows(valid=0)))]
+    read = read_trajectories(ulog(tmp_path / "cut.ulg", topics, cut=30))
+    assert len(read.curves[0].time) == 99
+    (tmp_path / "head.ulg").write_bytes(b"ULog\x01\x12\x35\x01")
+    with pytest.raises(TrajectoryError, match=r"head\.ulg: (the log is damaged|has no topic)"):
+        read_trajectories(tmp_path / "head.ulg")
+    (tmp_path / "text.tlog").write_text("this is no log\n" * 50)
+    with pytest.raises(TrajectoryError, match=r"text\.tlog: has no topic with positions"):
+        read_trajectories(tmp_path / "text.tlog")
+
+
+def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
+    """Without the extra there is one error with the command that installs it."""
+    path = ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, list(local_rows()))])
+    monkeypatch.setattr("rigidfleet.foreign.logs.find_spec", lambda _: None)
+    with pytest.raises(
+        TrajectoryError, match=r"needs the package 'pyulog'\. Run: pip install rigidfleet\[logs\]"
+    ):
+        read_trajectories(path)
+
+
+# -- ROS 2 -------------------------------------------------------------------------------------------
+
+
+def messages_of(path: Path, topic: str) -> list:
+    """Messages as rosbags reads them."""
+    reader = pytest.importorskip("rosbags.highlevel").AnyReader([path])
+    with reader:
+        own = [c for c in reader.connections if c.topic == topic]
+        return [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(own)]
+
+
+def seconds(message) -> float:
+    return message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+
+
+def test_odometry_is_read_with_its_velocity_and_covariance(log):
+    """Velocities in a robot's axes are turned into the frame of its positions; topics that are not read are named."""
+    path = log("odometry.mcap")
+    every = messages_of(path, "/odom")
+    read = read_trajectories(path, gaps="bridge")
+    assert read.names == ("/odom",)
+    time, place = at_samples(read)
+    kept = np.isin(np.round([seconds(m) for m in every], 6), np.round(time, 6))
+    assert np.count_nonzero(kept) == len(time)
+    own = [m for m, k in zip(every, kept, strict=True) if k]
+    point = [m.pose.pose.position for m in own]
+    np.testing.assert_allclose(place, [[p.x, p.y, p.z] for p in point])
+    q = [m.pose.pose.orientation for m in own]
+    turn = Rotation.from_quat([[x.x, x.y, x.z, x.w] for x in q])
+    v = [m.twist.twist.linear for m in own]
+    np.testing.assert_allclose(
+        measured(read).velocity, turn.apply([[x.x, x.y, x.z] for x in v]), atol=1e-12
+    )
+    assert said(read, "topics that are not read: /amcl_pose, /tf:base_link")
+    pose = messages_of(path, "/amcl_pose")
+    read = read_trajectories(path, gaps="bridge", topic="/amcl*")
+    deviation = [[m.pose.covariance[0] ** 0.5, m.pose.covariance[7] ** 0.5] for m in pose]
+    np.testing.assert_allclose(measured(read).deviation[:, :2], deviation)
+    assert np.isnan(measured(read).deviation[:, 2]).all()  # zero: not known
+
+
+def test_rosbag2_is_read(log, tmp_path):
+    """A folder that rosbag2 wrote, or its base of SQLite: bodies of a topic of transforms."""
+    path = log("transforms.db3")
+    (folder := tmp_path / "bag").mkdir()
+    (folder / "transforms.db3").write_bytes(path.read_bytes())
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
+    read, alone = read_trajectories(folder), read_trajectories(path)
+    pytest.importorskip("rosbags")
+    import sqlite3
+
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    rows = sqlite3.connect(path).execute(
+        "SELECT data FROM messages WHERE topic_id = 2 ORDER BY timestamp"
+    )
+    own = [store.deserialize_cdr(data, "tf2_msgs/msg/TFMessage").transforms[0] for (data,) in rows]
+    assert read.names == alone.names == ("/tf:base_footprint",)
+    time, place = at_samples(read)
+    moved = [m.transform.translation for m in own]
+    np.testing.assert_allclose(place, [[x.x, x.y, x.z] for x in moved])
+    np.testing.assert_allclose(time, [seconds(m) - seconds(own[0]) for m in own], atol=1e-6)
+    assert read.read[0]["frame"] == "enu odom"
+    path.write_bytes(path.read_bytes()[:50_000])
+    with pytest.raises(TrajectoryError, match="the recording is damaged"):
+        read_trajectories(path)
+
+
+# -- Crazyflie ---------------------------------------------------------------------------------------
+
+
+def test_logs_of_cfclient_are_in_milliseconds_and_degrees(tmp_path):
+    """Columns that cfclient names after variables have their units: ms, m or mm, m/s, deg."""
+    variables = (
+        "Timestamp,stateEstimate.x,stateEstimate.y,stateEstimate.z,stateEstimate.yaw,kalman.varPX\n"
+    )
+    rows = "".join(f"{81_000 + 10 * k},{0.01 * k},0.5,1.0,{90 + k},0.1\n" for k in range(20))
+    (tmp_path / "metres.csv").write_text(variables + rows)
+    read = read_trajectories(tmp_path / "metres.csv")
+    time, place = at_samples(read)
+    np.testing.assert_allclose(time, 81.0 + 0.01 * np.arange(20))
+    np.testing.assert_allclose(place[:, 0], 0.01 * np.arange(20))
+    np.testing.assert_allclose(read.curves[0].at(time)[:, 3], np.radians(90 + np.arange(20)))
+    compressed = variables.replace("stateEstimate", "stateEstimateZ").replace(
+        ",stateEstimateZ.yaw", ""
+    )
+    rows = "".join(f"{81_000 + 10 * k},{10 * k},500,1000,0.1\n" for k in range(20))
+    (tmp_path / "millimetres.csv").write_text(compressed + rows)
+    np.testing.assert_allclose(
+        at_samples(read_trajectories(tmp_path / "millimetres.csv"))[1], place, atol=1e-12
+    )
+    assert read_trajectories(tmp_path).own_clocks
+
+
+def test_records_of_crazyswarm2_are_in_seconds(tmp_path):
+    """Its simulator writes a table a vehicle, in seconds and metres, quaternions with the scalar first."""
+    for name, y in (("cf1", 0.0), ("cf2", 1.0)):
+        rows = "".join(f"{0.3 * k},{0.1 * k},{y},1.0,0.5,0,0,0.8660254\n" for k in range(10))
+        (tmp_path / f"{name}.csv").write_text(f"timestamp,x,y,z,qw,qx,qy,qz\n{rows}")
+    read = read_trajectories(tmp_path)
+    assert (read.names, read.own_clocks) == (("cf1", "cf2"), False)
+    time, place = at_samples(read, 1)
+    np.testing.assert_allclose(place[:, :2], [[0.1 * k, 1.0] for k in range(10)], atol=1e-12)
+    np.testing.assert_allclose(read.curves[1].at(time)[:, 3], 2 * np.pi / 3, atol=1e-7)
+
+
+# -- command -----------------------------------------------------------------------------------------
+
+
+def test_the_command_says_what_it_took(log, capsys):
+    """`assess --explain` names topic, frame, clock, origin and arming; an origin of what has none is refused."""
+    code = main(["assess", str(log("cores.bin")), "--explain", "--limits", "speed=5"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert code == 0
+    for words in ("topics: XKF1", "frame: ned", "clock: that of the receiver of GNSS", "armed: never",
+                  "origin: 38.3149933, 26.6360348, 66.63", "positions are those of XKF1"):  # fmt: skip
+        assert words in out
+    path = str(log("transforms.db3"))
+    assert main(["assess", path, "--origin", "47.4", "8.5", "0"]) == 2
+    assert "--origin: no file says where on the Earth it is" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not MORE, reason="RIGIDFLEET_LOGS names no folder with pyulog's test logs")
+@pytest.mark.parametrize("path", sorted(Path(MORE or ".").glob("*.ulg")), ids=lambda p: p.name)
+def test_public_logs_of_px4(path):
+    """Logs of several versions of PX4: what is read is what `pyulog` reads, where it is valid, or one error."""
+    data = {
+        x.name: x.data
+        for x in pytest.importorskip("pyulog").ULog(str(path)).data_list
+        if x.multi_id == 0
+    }
+    own = data["vehicle_local_position"]
+    known = (own["xy_valid"] != 0) & (own["z_valid"] != 0)
+    if not known.any():
+        with pytest.raises(TrajectoryError, match="vehicle_local_position: no position is valid"):
+            read_trajectories(path, topic="vehicle_local_position", gaps="bridge")
+        return
+    read = read_trajectories(path, topic="vehicle_local_position", gaps="bridge")
+    time, place = at_samples(read)
+    np.testing.assert_allclose(
+        place.T, [own["y"][known], own["x"][known], -own["z"][known]], atol=1e-6
+    )
+    stamp = own["timestamp_sample"][known].astype(float) / 1e6
+    np.testing.assert_allclose(time - time[0], stamp - stamp[0], atol=1e-6)
+    heard = data.get("vehicle_global_position")
+    if heard is not None:
+        origin = read.read[0]["origin"]
+        globally = flat(heard["lat"], heard["lon"], heard["alt"], origin)
+        now = heard["timestamp_sample"].astype(float) / 1e6 - stamp[0]
+        inside = (now > 0.0) & (now < time[-1] - time[0])
+        local = read.curves[0].at(now[inside] + time[0])[:, :3]
+        np.testing.assert_allclose(local, globally[inside], atol=0.3)
