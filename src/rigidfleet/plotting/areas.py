@@ -22,13 +22,16 @@ PEOPLE = "#6A3D9A"
 def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
     """Name, rings (m, 2) [m] and look of each fence and place with people; hatched where no vehicle may be."""
     drawn: list[tuple[str, list[Floats], dict[str, Any]]] = []
-    for x in (*mission.fences, *mission.people):
+    looks: list[dict[str, Any]] = []
+    for fence in mission.fences:
+        looks.append({"edgecolor": st.ALERT, "facecolor": "none", "linewidth": 1.1})
+        looks[-1] |= {"linestyle": (0, (4, 2))} if fence.soft else {}
+        looks[-1] |= {"hatch": "////"} if fence.kind == "exclusion" else {}
+    looks += [{"edgecolor": PEOPLE, "facecolor": f"{PEOPLE}2E", "linewidth": 0.8}] * len(
+        mission.people
+    )
+    for x, look in zip((*mission.fences, *mission.people), looks, strict=True):
         rings = [ring for polygon in x.polygons(mission.geodetic_origin) for ring in polygon]
-        look: dict[str, Any] = {"edgecolor": PEOPLE, "facecolor": f"{PEOPLE}2E", "linewidth": 0.8}
-        if x in mission.fences:
-            look = {"edgecolor": st.ALERT, "facecolor": "none", "linewidth": 1.1}
-            look |= {"linestyle": (0, (4, 2))} if x.soft else {}
-            look |= {"hatch": "////"} if x.kind == "exclusion" else {}
         drawn.append((x.name, rings, look))
     return drawn
 
