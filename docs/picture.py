@@ -24,7 +24,7 @@ from rigidfleet.plotting import encode_figure
 from rigidfleet.plotting.style import settings
 from rigidfleet.simulation.trajectories import of_curves
 from rigidfleet.sweep import Sweep, fly
-from rigidfleet.sweep.figures import map_over_two
+from rigidfleet.sweep.figures import map_over_two, shares
 
 IMAGES = Path(__file__).parent / "images"
 MISSION = "narrow-passage"
@@ -101,6 +101,15 @@ def own_laws() -> None:
             folder
         )
         _save_with_few_colours(Path(folder) / "own-laws.png", "own-laws")
+
+
+def drill() -> None:
+    """What the example of a drill bears."""
+    sweep = Sweep.load(IMAGES.parents[1] / "examples" / "market_square.toml")
+    with TemporaryDirectory() as folder:
+        figure = shares(fly(sweep, folder, workers=2))
+        assert figure is not None
+    _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "drill")
 
 
 def _save_with_few_colours(path: Path | io.BytesIO, name: str) -> None:
