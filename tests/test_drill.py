@@ -312,6 +312,12 @@ def test_faults_that_are_flown_are_missions():
     """Wind is added to the forecast in any direction; losses are of different vehicles and links, within the flight."""
     data = rf.load_mission("change-of-picture").to_dict()
     data["disturbances"] = {"wind": [1.0, 2.0, 0.0], "lost": [{"agent": 3, "time": 5.0}]}
+    with pytest.raises(rf.SweepError, match=r"without \[network\], one law knows all states"):
+        Sweep.of(rf.Mission.from_dict(data), [], drill={"links": [5]})
+    agents = data["agents"]
+    vehicle = {"model": "point"} | {key: agents.pop(key) for key in ("mass", "thrust_limit")}
+    data |= {"vehicles": {"p": vehicle}, "network": {}}
+    agents["vehicle"] = "p"
     mission, n = rf.Mission.from_dict(data), 12
     sweep = Sweep.of(mission, [], drill={"wind": [4.0], "links": [5], "lost": [2]}, seed=3)
     assert sweep.runs == 3 * 20
@@ -320,7 +326,7 @@ def test_faults_that_are_flown_are_missions():
     assert np.allclose(np.linalg.norm(winds, axis=1), 4.0)
     assert all((np.array(winds)[:, axis] * sign).max() > 2 for axis in (0, 1) for sign in (1, -1))
     for k in range(1, 60, 3):
-        links = sweep.varied(k)["disturbances"]["links"]["lost"]
+        links = sweep.varied(k)["network"]["lost"]
         pairs = {tuple(sorted(each["between"])) for each in links}
         assert len(pairs) == 5
         assert all(1 <= i < j <= n for i, j in pairs)
@@ -450,3 +456,37 @@ def test_a_flight_that_fails_anyway_is_not_drilled(tmp_path, capsys, monkeypatch
     assert "fails without any fault" in capsys.readouterr().err
     assert main(["sweep", "change-of-picture", "--drill", "--separation", "1"]) == 2
     assert "--separation" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def market_square(tmp_path_factory):
+    """The shares of the shipped drill that fail: by fault, magnitude and number of vehicles."""
+    file = Path(__file__).parents[1] / "examples" / "market_square.toml"
+    table = fly(Sweep.load(file), tmp_path_factory.mktemp("market"), workers=2)
+    return {(x.fault, x.magnitude, x.vehicles): x for x in summarise(table).drill}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fault", faults.UNITS)
+def test_the_shipped_drill_has_a_danger_of_each_kind(fault, market_square):
+    """Of each fault one magnitude is harmless in all trials, and another is not; lost links, of none to any, are."""
+    if fault == "stale":
+        pytest.skip("an earlier version is no part of what ships: see test_stale_files_are_flown")
+    own = [x for x in market_square.values() if x.fault == fault]
+    failed = {
+        size: sum(x.failed.count for x in own if x.magnitude == size)
+        for size in {x.magnitude for x in own}
+    }
+    assert len(failed) == 2
+    assert min(failed.values()) == 0
+    assert (max(failed.values()) > 0) == (fault != "links")
+
+
+@pytest.mark.long
+def test_the_shipped_show_as_a_whole_fails_by_its_fences(market_square):
+    """A whole show that is turned, shifted or mirrored fails by a fence or people, and keeps its separation."""
+    whole = [x for x in market_square.values() if x.fault in faults.SETUP and x.vehicles == 10]
+    assert len({round(x.separation, 6) for x in whole}) == 1
+    words = [x.worst.detail for x in whole if x.worst]
+    assert len(words) == 3
+    assert all("fence 'outer'" in each or "'crowd'" in each for each in words)

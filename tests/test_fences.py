@@ -1,11 +1,14 @@
 """Fences and people: distances from polygons, falls, files of polygons, and how flights beside them are judged."""
 
+import hashlib
 import json
 import math
+import re
 
 import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
+from sample_missions import three_points, three_quadrotors
 from scipy.integrate import solve_ivp
 
 import rigidfleet as rf
@@ -15,9 +18,9 @@ from rigidfleet.math.bernstein import greatest_of
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
+from rigidfleet.reporting import html_page
 from rigidfleet.simulation.together import simulate_together
 from rigidfleet.solids.polygons import Region, crossing
-from sample_missions import three_points, three_quadrotors
 
 L_SHAPE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], dtype=float)
 HOLE = np.array([[1, 1], [1, 3], [3, 3], [3, 1]], dtype=float)
@@ -109,7 +112,7 @@ def test_a_fall_with_drag_solves_its_differential_equation(k):
         def ground(_, y):
             return y[2]
 
-        ground.terminal, ground.direction = True, -1
+        vars(ground).update(terminal=True, direction=-1)
         start = [1.0, 2.0, 60.0, *v]
         solved = solve_ivp(rates, [0, 500], start, rtol=1e-12, atol=1e-12, events=ground)
         tau = falls.fall_time(np.array(60.0), np.array(v[2]), np.array(k), wind[2], g)
@@ -177,14 +180,15 @@ def test_flights_are_judged_between_samples(flown):
     if flown == "curves":
         t = np.unique(dense.time.round(9))
         rows = np.searchsorted(dense.time, t)
-        every = {"velocity": dense.velocity[rows][::50], "mission": result.mission}
-        result = rf.trajectories(t[::50], dense.position[rows][::50], **every)
+        r, v = dense.position[rows][::50], dense.velocity[rows][::50]
+        result = rf.trajectories(t[::50], r, velocity=v, mission=result.mission)
     own = boundaries.Boundaries(dense.mission)
     for name, close in (("fence", 2e-3), ("soft_fence", 2e-3), ("people", 2e-2)):
         values = own.values(name, *states(dense))[0]
         worst = values.min() if name == "people" else values.max()
         check = rf.assess(result).by_name[name]
         assert check.worst == pytest.approx(worst, abs=close)
+        assert check.when is not None
         assert check.at_samples is False
         k = int(np.argmin(abs(dense.time - check.when)))
         agent = int(check.who.split(",")[0].removeprefix("agent ")) - 1
@@ -250,7 +254,9 @@ def test_a_fall_on_people_fails_by_its_limit():
     assert not [r for r in rf.check(rf.Mission.from_dict(data)).remarks if r.topic == "people"]
     windy = rf.Mission.from_dict(data | {"disturbances": {"wind": [9.0, 0.0, 0.0]}})
     assert checks(windy)[0]["people"].worst < passed["people"].worst - 1.0
-    assert result.extreme("people").value == passed["people"].worst
+    x = result.extreme("people")
+    assert x is not None
+    assert x.value == passed["people"].worst
 
 
 def test_flights_side_by_side_are_watched_as_alone():
@@ -263,7 +269,10 @@ def test_flights_side_by_side_are_watched_as_alone():
     for mission, result in zip(missions, simulate_together(missions), strict=True):
         alone = rf.simulate(mission)
         for name in ("fence", "people"):
-            assert result.extreme(name).value == pytest.approx(alone.extreme(name).value, abs=1e-2)
+            one, other = (x.extreme(name) for x in (result, alone))
+            assert one is not None
+            assert other is not None
+            assert one.value == pytest.approx(other.value, abs=1e-2)
 
 
 def test_records_keep_their_fences(tmp_path):
@@ -278,6 +287,27 @@ def test_records_keep_their_fences(tmp_path):
     result.save(tmp_path / "a.nc")
     again = rf.assess(rf.Result.load(tmp_path / "a.nc"))
     assert [c.message for c in again.checks] == [c.message for c in rf.assess(result).checks]
+
+
+def test_the_first_page_is_for_those_who_decide():
+    """Before the safety table: what is planned, proved, rehearsed, how it is aborted, where things fall, digests."""
+    people = [{"name": "stand", "polygon": square(18, 4)}]
+    wind = {"wind": [3.0, 4.0, 0.0], "drag": 0.3}
+    mission = rf.Mission.from_dict(beside(people=people, disturbances=wind))
+    result = rf.simulate(mission)
+    drilled = ["Two seconds late, no two vehicles touch."]
+    text = html_page(result, rehearsed=drilled, abort=["Every second has a way home."])
+    first = re.sub(r"<[^>]+>", " ", text.split("<main>")[1].split("<h2>Safety")[0])
+    for words in (
+        "3 vehicles fly for 7.5 s", *drilled, "Every second has a way home.", "wind of 5 m/s",
+        "from people in &#39;stand&#39; if it fails at",
+        hashlib.sha256(result.mission_text.encode()).hexdigest(),
+    ):  # fmt: skip
+        assert words in first
+    falls_at = boundaries.Boundaries(mission).landings(*states(result), 0.0)
+    low, high = falls_at.min(axis=(0, 1)), falls_at.max(axis=(0, 1))
+    assert f"x = {low[0]:.1f} and {high[0]:.1f} m, y = {low[1]:.1f} and {high[1]:.1f} m" in first
+    assert "No drill belongs to this report." in html_page(result)
 
 
 # -- degrees and files -------------------------------------------------------------------------------
@@ -320,7 +350,7 @@ CLOSED = [*RING, RING[0]]
             [[RING]], "a Point is left out",
         ),
         (
-            {"type": "Polygon", "coordinates": [CLOSED], "crs": {"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}},
+            {"type": "Polygon", "coordinates": [CLOSED], "crs": {"properties": {"name": "urn:ogc:CRS84"}}},
             [[RING]], None,
         ),
     ],

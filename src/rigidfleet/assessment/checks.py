@@ -25,7 +25,6 @@ from rigidfleet.assessment.outcome import (
     limit_check,
     value,
 )
-from rigidfleet.mission.boundaries import boundary_in_words
 from rigidfleet.result import LABELS, PAD, Result
 from rigidfleet.result.quantities import Samples
 
@@ -431,6 +430,8 @@ def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
 def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """The fence that a vehicle comes nearest to or crosses farthest, and the fall that ends nearest to people."""
     if (e := measured.worst(q.name)) is not None:
+        from rigidfleet.mission.boundaries import boundary_in_words  # takes long to load
+
         limit, (agent, place) = q.limit_of(measured.mission), e.who.split(", ", 1)
         words = boundary_in_words(q.name, agent, place, e.value, e.when)
         words += f" (limit {limit:g} m)" if q.key else ""

@@ -31,6 +31,7 @@ from rigidfleet.plotting.curves import (
     motion,
 )
 from rigidfleet.plotting.logged import plan_and_flight
+from rigidfleet.plotting.messages import messages
 from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
@@ -57,6 +58,7 @@ __all__ = [
     "figure_names",
     "formations",
     "inputs",
+    "messages",
     "motion",
     "operation",
     "plan_and_flight",
@@ -71,7 +73,8 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     draw.__name__: draw
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
-        clearance, formations, disturbance, rotors, vehicles, operation, motion, plan_and_flight,
+        clearance, formations, disturbance, rotors, vehicles, operation, motion,
+        messages, plan_and_flight,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -105,6 +108,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "rotors": not has_rotors(result),
         "vehicles": not has_rotors(result),
         "operation": not leaves_ground(result),
+        "messages": result.message_age is None or not result.message_age.size,
         "motion": not limited_motions(result),
         "plan_and_flight": "bands" not in result.statistics,
     }

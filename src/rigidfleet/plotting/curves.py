@@ -449,7 +449,7 @@ _PANELS = {
 
 
 def draw_least(ax: Axes, result: Result, name: str) -> None:
-    """Least distance to others, to one straight below, to obstacles or of falls to people, with its limit and least value."""
+    """Least distance to others, to one straight below, to obstacles, or of falls to people, with its limit."""
     label, nothing = _PANELS[name]
     ax.set_ylabel(label)
     q, sampled = QUANTITIES[name], samples(result, name)

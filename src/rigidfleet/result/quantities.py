@@ -13,7 +13,6 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.bernstein import SIZES
-from rigidfleet.mission.boundaries import Boundaries, areas_of
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -125,6 +124,8 @@ def _beyond_fence(result: Result) -> tuple[Floats, ...]:
 
 def _boundary(result: Result, name: str) -> tuple[Any, ...]:
     """Distance (K, N) [m] beyond a fence, or of where a fall ends from people."""
+    from rigidfleet.mission.boundaries import Boundaries, areas_of  # takes long to load
+
     if not areas_of(result.mission, name):
         return (np.full(result.left.shape, np.nan),)
     values, number = Boundaries(result.mission).values(name, result.position, result.velocity)
