@@ -160,8 +160,8 @@ def judge_log(
                 "place": place.tolist(),
             }
     facts = facts_of(flown, deviations, estimate, alignment, doubts.clock)
-    flown.statistics["doubt"] = facts
     verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
+    flown.statistics["doubt"] = facts
     return flown, verdict
 
 
