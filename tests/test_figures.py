@@ -789,6 +789,7 @@ def test_a_flight_has_no_empty_figures(tmp_path):
         "vehicles",
         "operation",
         "motion",
+        "plan_and_flight",
     }
     assert "still air" in texts(plotting.disturbance(calm))
     unknown = np.full((181, 4), np.nan)
@@ -796,7 +797,7 @@ def test_a_flight_has_no_empty_figures(tmp_path):
     missing = set(plotting.figure_names()) - set(plotting.figure_names(free))
     assert missing == {
         "distances", "attitude", "constraint_force", "constraint_error", "formations",
-        "rotors", "vehicles", "operation", "motion",
+        "rotors", "vehicles", "operation", "motion", "plan_and_flight",
     }  # fmt: skip
     assert "no body frame attached" in texts(plotting.attitude(free))
     alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})
