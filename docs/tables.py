@@ -1,4 +1,4 @@
-"""Write the tables of missions.md, sweep.md and vehicles.md: keys of a mission file, variables of a result, metrics.
+"""Write the tables of day.md, missions.md, sweep.md and vehicles.md: keys, variables of a result, metrics, drills.
 
 `python docs/tables.py` rewrites them in place, each between `<!-- table: NAME -->` and `<!-- end -->`;
 tests/test_docs.py fails where they are out of date. NAME is a table of the JSON schema; `A-B` the keys of A
@@ -25,8 +25,11 @@ from rigidfleet.mission.kinds import KINDS
 from rigidfleet.mission.text import GROUPS
 from rigidfleet.result import LABELS, VARIABLES
 from rigidfleet.sweep import METRICS
+from rigidfleet.sweep.faults import Drill
 
-PAGES = [Path(__file__).with_name(name) for name in ("missions.md", "sweep.md", "vehicles.md")]
+PAGES = [
+    Path(__file__).with_name(name) for name in ("day.md", "missions.md", "sweep.md", "vehicles.md")
+]
 
 
 def render(page: str) -> str:
@@ -37,7 +40,7 @@ def render(page: str) -> str:
         name = match[1]
         special = {
             "result": _result, "shapes": _shapes, "metrics": _metrics, "bounds": _bounds,
-            "magnitudes": _magnitudes, "margins": _margins, "missions": _missions,
+            "magnitudes": _magnitudes, "margins": _margins, "missions": _missions, "drill": _drill,
         }  # fmt: skip
         text = special[name]() if name in special else _keys(schema, name)
         return f"<!-- table: {name} -->\n{text}\n<!-- end -->"
@@ -187,6 +190,8 @@ def _bounds() -> str:
         ("pairs of agents that touch, if all are as large as the largest", f"{bounds.TOUCHING:,}"),
         ("phases", f"{bounds.PHASES:,}"),
         ("obstacles", f"{bounds.OBSTACLES:,}"),
+        ("fences, and places with people", f"{bounds.FENCES:,}"),
+        ("corners of one of them", f"{bounds.CORNERS:,}"),
         ("points of a hull", f"{bounds.HULL:,}"),
         ("heights of a height map", f"{bounds.HEIGHTS:,}"),
         ("the heaviest vehicle over the lightest", f"{bounds.MASS_RATIO:g}"),
@@ -208,6 +213,17 @@ def _metrics() -> str:
     """The metrics of a sweep: name, unit, meaning."""
     rows = [(f"`{name}`", m.unit, m.text.replace("|", "\\|")) for name, m in METRICS.items()]
     return _table(("metric", "unit", "meaning"), rows)
+
+
+def _drill() -> str:
+    """The keys of a drill: name, magnitudes unless a sweep file has others, meaning."""
+    rows = [
+        (f"`{name}`", ", ".join(f"{x:g}" for x in magnitudes), str(field.description))
+        for name, field in Drill.model_fields.items()
+        for default in [field.default]
+        for magnitudes in [default if isinstance(default, tuple) else (default,)]
+    ]
+    return _table(("key", "default", "meaning"), rows)
 
 
 #: Attitude gains [1/s^2, 1/s] and time constant of the rotors [s]; docs/vehicles.md names the sources.

@@ -15,7 +15,7 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg, leg_of
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import complete_times
-from rigidfleet.preflight.losses import planned_way
+from rigidfleet.preflight.losses import planned_answer
 from rigidfleet.result import Result
 
 STANDING = np.array([[0.0, -2, 1], [0, 2, 1], [3, -2, 1], [3, 2, 1]])
@@ -36,7 +36,7 @@ def planned_legs(mission: Mission, result: Result) -> list[Leg]:
     sure = True
     for k, record in enumerate(result.phases):
         if record.t_start >= first:
-            return [*found[:k], *planned_way(mission, found[k - 1])]
+            return [*found[:k], *planned_answer(mission, found[k - 1], found).legs]
         if not sure:
             at = int(np.searchsorted(result.time, record.t_start))
             before = found[k - 1].state_at(record.t_start)

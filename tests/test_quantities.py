@@ -57,6 +57,10 @@ BROKEN: dict[str, tuple[str, dict[str, Any], str, str]] = {
         "geofence", POINTS | {"limits": {"geofence": {"min": [-1, -1, 0], "max": [5, 5, 7]}}}, "geofence",
         "operation",
     ),
+    "people": (
+        "people", POINTS | {"limits": {"people": 9.0}, "people": [{"polygon": [[14, 0], [18, 0], [18, 4]]}]}, "people",
+        "clearance",
+    ),
     "saturation": (
         "saturation",
         three_quadrotors(FLY | {"duration": 1.2}) | {"limits": {"saturation": 0.0}}, "rotors", "vehicles",

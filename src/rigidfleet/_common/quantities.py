@@ -12,8 +12,10 @@ from math import degrees, inf
 from operator import attrgetter
 from typing import Any, Literal
 
-#: What has one value each: an agent, two agents, an edge, an agent beside an obstacle, the formation.
-Who = Literal["agent", "pair", "edge", "obstacle", "formation"]
+#: What has one value each: an agent, two agents, an edge, an agent beside one of the `PLACES`, the formation.
+Who = Literal["agent", "pair", "edge", "obstacle", "fence", "people", "formation"]
+#: Tables of a mission in which the things stand beside which an agent has a value.
+PLACES = {"obstacle": "obstacles", "fence": "fences", "people": "people"}
 #: Which value is the worst: the least, the greatest, or the one of the greatest size.
 Sense = Literal["least", "greatest", "size"]
 
@@ -129,6 +131,18 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "geofence", "m", "greatest distance of a vehicle's centre outside the geofence; negative inside",
             key="limits.geofence", limit=lambda m: None if _no_fence(m) else 0.0,
+        ),
+        *(
+            Quantity(
+                name, "m", f"greatest distance of a vehicle's centre beyond {words} fence; negative on the right side",
+                "fence", monitored=False,
+                limit=lambda m, soft=soft: None if soft or all(x.soft for x in m.fences) else 0.0,
+            )
+            for name, words, soft in (("fence", "a hard", False), ("soft_fence", "a soft", True))
+        ),
+        Quantity(
+            "people", "m", "least distance from people, seen from above, at which a vehicle that fails at once falls",
+            "people", "least", "limits.people", lambda m: m.limits.people if m.people else None, monitored=False,
         ),
         Quantity(
             "lowest", "m", "least altitude of a vehicle's centre", sense="least", checked=False,

@@ -393,11 +393,14 @@ def _loss_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
 
 
 def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
-    """Report the phases that the flight left, or never began, because a vehicle or link was lost."""
+    """Report the phases that the flight left, or never began, after a loss or an order to abort."""
     mission, flown = measured.mission, measured.result.phases
-    when = mission.first_loss
-    if mission.on_loss == "continue" or not when < measured.result.time[-1]:
+    when = mission.abandons_at
+    if not when < measured.result.time[-1]:
         return
+    what, at = f"loss of {mission.first_lost}", mission.first_loss
+    if mission.on_loss == "continue" or at > when:
+        what, at = "order to abort", when - mission.aborting.reaction
     begun = sum(p.t_start < when for p in flown)
     left = [p.name for p in flown if p.abandoned]
     never = [phase.name for phase in mission.phases[begun:]]
@@ -408,7 +411,7 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
         parts.append(
             f"{', '.join(map(repr, never))} {'was' if len(never) == 1 else 'were'} not flown"
         )
-    words = f"after the loss of {mission.first_lost} at {when:.2f} s, {'; '.join(parts)}"
+    words = f"after the {what} at {at:.2f} s, {'; '.join(parts)}"
     yield CheckResult(
         "abandoned", True, words, float(len(left + never)), None, "", when=when, judged=False
     )
@@ -421,6 +424,18 @@ def _geofence_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     if e.value > 0:
         words = f"{e.who} leaves the geofence by {value(e.value, 'm')} at {e.when:.2f} s"
     yield limit_check(q, e, limit, words)
+
+
+def _boundary_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
+    """The fence that a vehicle comes nearest to or crosses farthest, and the fall that ends nearest to people."""
+    if (e := measured.worst(q.name)) is not None:
+        from rigidfleet.mission.boundaries import boundary_in_words  # takes long to load
+
+        limit, (agent, place) = q.limit_of(measured.mission), e.who.split(", ", 1)
+        words = boundary_in_words(q.name, agent, place, e.value, e.when)
+        words += f" (limit {limit:g} m)" if q.key else ""
+        passed = limit is None or q.rank(e.value) <= q.rank(limit) + SLACK
+        yield limit_check(q, e, limit, words, passed=passed)
 
 
 def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
@@ -509,6 +524,7 @@ _CHECKS: dict[str, Callable[[Measurements, Quantity], Iterator[CheckResult]]] = 
     "clearance": _clearance_checks,
     "lost": _loss_checks,
     "geofence": _geofence_check,
+    **dict.fromkeys(("fence", "soft_fence", "people"), _boundary_check),
     "thrust": _thrust_checks,
     "rotor_force": _rotor_check,
     "saturation": _saturation_check,

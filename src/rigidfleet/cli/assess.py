@@ -130,7 +130,7 @@ def assess(
             raise RigidfleetError("--origin: no file says where on the Earth it is; remove it")
         result = of_curves(
             read, mission=mission, separation=separation, limits=_limits(limits or []) | higher,
-            radius=radius or 0.0, ground=ground, name=_name(files[0]),
+            radius=radius or 0.0, ground=ground, name=flight_name(files[0]),
         )  # fmt: skip
     verdict = judge(result)
     made = Files(out, result.mission.name) if out is not None else None
@@ -176,7 +176,7 @@ def _limits(limits: list[str]) -> dict[str, float]:
     return by_key
 
 
-def _name(file: Path) -> str:
+def flight_name(file: Path) -> str:
     """The name of a flight after its file: files may have any characters, and names of missions only plain ones."""
     plain = re.sub(r"[^A-Za-z0-9._-]+", "-", file.resolve().stem).strip("._-")
     return plain or "trajectories"

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from rigidfleet.cli import console
 from rigidfleet.cli.outputs import keep_existing
-from rigidfleet.errors import MissionError
+from rigidfleet.errors import MissionError, RigidfleetError
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission
@@ -23,6 +23,8 @@ def check(
     realisations: Annotated[bool | None, Parameter(negative="--no-realisations")] = None,
     figure: Path | None = None,
     expand: Path | None = None,
+    abort: Annotated[bool, Parameter(negative="")] = False,
+    out: Path | None = None,
     force: bool = False,
     json: bool = False,
 ) -> int:
@@ -43,8 +45,12 @@ def check(
     expand : Path
         Write the mission to this file (.toml) with the ways that are found for it as ordinary phases, to read, copy
         and edit. Comments are not kept.
+    abort : bool
+        Instead, plan a way home from every second of the flight, by [abort], and say which are proved.
+    out : Path
+        With --abort, write the aborts to this folder: aborts.json, and a file for each vehicle.
     force : bool
-        Overwrite this file if it exists.
+        Overwrite these files if they exist.
     json : bool
         Print the result as JSON.
     """
@@ -55,6 +61,9 @@ def check(
     from rigidfleet.planning.timing import complete_times, expand_mission
 
     keep_existing(expand, force=force, other="give another path")
+    keep_existing(out, force=force, other="give another folder")
+    if out is not None and not abort:
+        raise RigidfleetError("--out says where --abort writes. Add --abort.")
     watch = console.CheckWatch(mission)
     try:
         with watch, watched_by(watch.update):
@@ -72,6 +81,18 @@ def check(
         ]
         console.print_json({"mission": mission, "right": False, "findings": findings})
         return BAD_INPUT
+    if abort:
+        from rigidfleet.preflight.aborts import check_aborts
+
+        with watch:
+            home = check_aborts(loaded, progress=watch.update)
+        if out is not None:
+            home.write(out)
+        if json:
+            console.print_json({"mission": mission, "right": True} | home.data())
+        else:
+            console.show(home.facts())
+        return PASSED
     from rigidfleet.preflight.check import check as preflight
 
     with watch:

@@ -42,6 +42,7 @@ def run(
     csv: bool = False,
     csv_rate: float | None = None,
     flown: bool = False,
+    abort_at: float | None = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -73,6 +74,8 @@ def run(
         Setpoints per second [Hz] in NAME.csv. Default: the samples of the result.
     flown : bool
         Write the motion flown into NAME.csv instead of the reference.
+    abort_at : float
+        Abort the flight at this mission time [s], as "check --abort" plans it.
     json : bool
         Print the verdict as JSON.
     quiet : bool
@@ -86,6 +89,9 @@ def run(
     from rigidfleet.mission import load_mission
 
     loaded = load_mission(mission)
+    if abort_at is not None:
+        data = loaded.to_dict()
+        loaded = loaded.rewritten(data | {"abort": data.get("abort", {}) | {"at": abort_at}})
     files = Files(out or Path("flights", loaded.name), loaded.name)
     files.claim(replace=force)
     with watching(None if quiet else console.FlightWatch()) as progress:

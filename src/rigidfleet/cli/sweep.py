@@ -15,7 +15,11 @@ from rigidfleet.cli.run import DRAWN, Format, watching
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
+    from rigidfleet.mission import Mission
     from rigidfleet.sweep import Sweep
+
+#: Suffixes of files of trajectories.
+_TRAJECTORIES = {".csv", ".skyc", ".mcap"}
 
 
 def sweep(
@@ -23,6 +27,9 @@ def sweep(
     /,
     *,
     vary: list[str] | None = None,
+    drill: bool = False,
+    separation: float | None = None,
+    radius: float | None = None,
     runs: Annotated[int | None, Parameter(converter=exact)] = None,
     seed: Annotated[int | None, Parameter(converter=exact)] = None,
     out: Path | None = None,
@@ -31,6 +38,7 @@ def sweep(
     random_numbers: Literal["shared", "own"] | None = None,
     controller: str | None = None,
     rate: float | None = None,
+    agent: str | None = None,
     workers: Annotated[int | None, Parameter(converter=exact)] = None,
     cluster: str | None = None,
     shard: str = "",
@@ -51,10 +59,18 @@ def sweep(
     Parameters
     ----------
     mission : str
-        A mission, a sweep file, or the folder of a sweep to resume, to merge or to summarise.
+        A mission, a sweep file, or the folder of a sweep to resume, to merge or to summarise. With --drill also
+        trajectories that another program made.
     vary : str
         A variation "PATH = KIND(NUMBERS)"; += adds to the value in the mission, *= scales it; may be
         repeated. KIND is normal, uniform, log-uniform, choice, grid, linspace or geomspace.
+    drill : bool
+        Rehearse the faults of the day instead: late starts, wrong files, a show that is set up askew, wind, losses.
+        [drill] in a sweep file has their magnitudes.
+    separation : float
+        Least distance [m] between two vehicles of others' trajectories, less their radii.
+    radius : float
+        Radius [m] of their vehicles. Default: 0, distances are centre to centre.
     runs : int
         Number of runs; more can be added later. Default: one per point of the grid.
     seed : int
@@ -74,6 +90,8 @@ def sweep(
         object.
     rate : float
         Calls of the controller per second [Hz]. Default: 50.
+    agent : str
+        Law of each vehicle's own, MODULE:NAME, for missions with [network].
     workers : int
         Number of processes on this machine. Default: number of cores.
     cluster : str
@@ -113,9 +131,10 @@ def sweep(
     else:
         keys = {
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
-            "controller": controller, "rate": rate,
+            "controller": controller, "rate": rate, "agent": agent, "drill": {} if drill else None,
         }  # fmt: skip
-        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys)
+        limits = {"separation": separation, "radius": radius}
+        definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys, limits)
         folder = shards.shard_folder(whole, shard)
         try:
             with watching(None if quiet else console.SweepWatch()) as progress:
@@ -155,9 +174,10 @@ def sweep(
 
 
 def _sweep_and_folder(
-    what: str, vary: list[str], runs: int | None, out: Path | None, shard: str, keys: dict[str, Any]
-) -> tuple[Sweep, Path]:
-    """Sweep of the command line, and its folder."""
+    what: str, vary: list[str], runs: int | None, out: Path | None, shard: str, keys: dict[str, Any],
+    limits: dict[str, float | None],
+) -> tuple[Sweep, Path]:  # fmt: skip
+    """Sweep of the command line, and its folder; ``limits`` are those of others' trajectories."""
     from rigidfleet.mission import mission_names
     from rigidfleet.sweep import Sweep, shards, store
     from rigidfleet.sweep.definition import is_sweep_file
@@ -172,8 +192,39 @@ def _sweep_and_folder(
         definition = store.read_sweep(stored[0])
         definition.runs = definition.runs if runs is None else runs
         return definition, here
-    if what not in mission_names() and is_sweep_file(what):
+    others = keys["drill"] is not None and (here.is_dir() or here.suffix in _TRAJECTORIES)
+    if chosen := [key for key, value in limits.items() if value is not None and not others]:
+        raise RigidfleetError(
+            f"--{chosen[0]}: is of others' trajectories, by --drill; a mission has its own. Remove it."
+        )
+    if others:
+        mission = _judging_mission(here, **limits)
+        keys["drill"] = {"files": [str(here.resolve())]}
+        definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
+    elif what not in mission_names() and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
     else:
         definition = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
     return definition, out or Path("sweeps", definition.name)
+
+
+def _judging_mission(path: Path, separation: float | None, radius: float | None) -> Mission:
+    """What others' trajectories are judged by.
+
+    Raises
+    ------
+    RigidfleetError
+        They cannot be read, or nothing is asked of them.
+    """
+    from rigidfleet.cli.assess import flight_name
+    from rigidfleet.foreign.files import read_trajectories
+    from rigidfleet.simulation.trajectories import of_curves
+
+    if separation is None:
+        raise RigidfleetError(
+            f"{path}: is no mission, and has no limits. Give --separation, the least distance [m]."
+        )
+    read = read_trajectories(path, spans="stand")
+    return of_curves(
+        read, separation=separation, radius=radius or 0.0, name=flight_name(path)
+    ).mission

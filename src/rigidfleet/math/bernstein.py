@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Sizes (...) of vectors (..., 3), by the direction in which they count; all are convex.
 SIZES: dict[str, Callable[[Floats], Floats]] = {
@@ -36,25 +36,46 @@ class Greatest(NamedTuple):
     place: float
 
 
+#: A value (M,) that each of some curves reaches, where, from 0 to 1, and an upper bound (M,) of what it reaches. They
+#: follow from control points (M, C, P) and the curves' numbers (M,).
+Measured = tuple[Floats, Floats, Floats]
+Measure = Callable[[Floats, Ints], Measured]
+
+
 def greatest(points: Floats, size: Callable[[Floats], Floats]) -> Greatest:
     """Greatest value of a convex function over curves with control points (M, 3, P), to 1e-10 of the value.
 
     ``size`` maps (..., 3) to (...). A curve lies within the hull of its control points, where a convex function is
-    greatest at one of them. Curves that may have the greatest value are halved until their hulls promise no more.
+    greatest at one of them.
     """
-    who, start, width = np.arange(len(points)), np.zeros(len(points)), 1.0
-    best = Greatest(-np.inf, -1, 0.0)
-    halving = _halving(points.shape[-1])
-    for _ in range(_HALVINGS):
+
+    def measure(points: Floats, _: Ints) -> Measured:
         sizes = size(np.moveaxis(points, -1, 1))  # (M, P)
         ends = sizes[:, [0, -1]]
-        if len(ends) and ends.max() > best.value:
-            k, end = divmod(int(ends.argmax()), 2)
-            best = Greatest(float(ends[k, end]), int(who[k]), float(start[k] + end * width))
-        bound = sizes.max(axis=1) if len(sizes) else np.zeros(0)
-        open_ = bound > best.value + _CLOSE * max(abs(best.value), 1e-3)
-        if not open_.any():
+        return ends.max(axis=1), ends.argmax(axis=1).astype(float), sizes.max(axis=1)
+
+    return greatest_of(points, measure, lambda best: _CLOSE * max(abs(best), 1e-3))
+
+
+def greatest_of(
+    points: Floats, measure: Measure, close: Callable[[float], float], least: float = -np.inf
+) -> Greatest:
+    """Greatest value that curves with control points (M, C, P) reach by a measure.
+
+    Curves that may reach it are halved until their bounds are no more than ``close`` (of the best value so far) above
+    it. What is not above ``least`` is not searched: then there is no curve, -1.
+    """
+    who, start, width = np.arange(len(points)), np.zeros(len(points)), 1.0
+    best = Greatest(least, -1, 0.0)
+    halving = _halving(points.shape[-1])
+    for _ in range(_HALVINGS):
+        if not len(who):
             break
+        values, places, bound = measure(points, who)
+        k = int(values.argmax())
+        if values[k] > best.value:
+            best = Greatest(float(values[k]), int(who[k]), float(start[k] + places[k] * width))
+        open_ = bound > best.value + close(best.value)
         points = np.einsum("hij,maj->hmai", halving, points[open_]).reshape(-1, *points.shape[1:])
         width *= 0.5
         who = np.tile(who[open_], 2)

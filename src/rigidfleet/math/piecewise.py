@@ -65,7 +65,7 @@ class Piecewise(NamedTuple):
     def series(self, t: Floats, orders: int) -> Floats:
         """Taylor coefficients (orders, T, ...) at times (T,) [s]."""
         k = piece_at(self.time, t)
-        return series.of_polynomials(self.pieces[k], t - self.time[k], orders)
+        return series.of_polynomials(_some(self.pieces, k), t - self.time[k], orders)
 
     def at(self, t: Floats) -> Floats:
         """Values (T, ...) at times (T,) [s]."""
@@ -84,7 +84,7 @@ class Piecewise(NamedTuple):
     def within(self, shares: Floats) -> Floats:
         """Values (K, S, ...) of each piece at shares (S,) of its time."""
         after = np.diff(self.time)[:, None] * shares
-        each = np.repeat(self.pieces, len(shares), axis=0)
+        each = _some(self.pieces, np.repeat(np.arange(len(after)), len(shares)))
         values = series.of_polynomials(each, after.ravel(), 1)[0]
         return values.reshape(*after.shape, *values.shape[1:])
 
@@ -112,7 +112,7 @@ class Piecewise(NamedTuple):
         middle = 0.5 * (knots[:-1] + knots[1:])
         begin = np.clip(knots[:-1], self.time[0], self.time[-1]) if stays else knots[:-1]
         k = piece_at(self.time, middle)
-        pieces = about(self.pieces[k], begin - self.time[k])
+        pieces = about(_some(self.pieces, k), begin - self.time[k])
         if stays:
             pieces[(middle < self.time[0]) | (middle > self.time[-1]), ..., 1:] = 0.0
         return Piecewise(knots, pieces)
@@ -223,7 +223,17 @@ def join(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
 def pad(pieces: Floats, powers: int) -> Floats:
     """Pieces (..., P) with zeros up to so many powers."""
     lacking = powers - pieces.shape[-1]
-    return np.pad(pieces, [(0, 0)] * (pieces.ndim - 1) + [(0, max(lacking, 0))])
+    if lacking <= 0:
+        return pieces.copy(order="K")
+    return np.pad(pieces, [(0, 0)] * (pieces.ndim - 1) + [(0, lacking)])
+
+
+def _some(pieces: Floats, k: Ints) -> Floats:
+    """Pieces (k, ..., P); of many, each coefficient is a row in memory, as `series.of_polynomials` takes them."""
+    if len(k) < len(pieces):
+        return pieces[k]
+    turned = -1, *range(1, pieces.ndim - 1), 0
+    return pieces.transpose(turned).take(k, axis=-1).transpose(turned)
 
 
 def about(pieces: Floats, x: Floats) -> Floats:

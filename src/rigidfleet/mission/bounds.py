@@ -35,6 +35,8 @@ AGENTS = 1_000_000
 FORMATIONS = 200
 PHASES = 1000
 OBSTACLES = 1000
+#: Maximum number of fences, of places with people, and of corners of one of them.
+FENCES, CORNERS = 100, 2000
 #: Maximum number of points of a convex hull, and of heights of a height map.
 HULL, HEIGHTS = 1000, 40_000
 #: Maximum number of edges of a formation: EDGES, or EDGES_EACH per agent if that is more. All pairs of 200 agents are

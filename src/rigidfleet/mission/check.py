@@ -21,8 +21,10 @@ from rigidfleet.mission import (
     avoidance,
     bounds,
     disturbances,
+    fences,
     formations,
     losses,
+    network,
     obstacles,
     phases,
     vehicles,
@@ -32,11 +34,12 @@ from rigidfleet.mission.findings import Keys, look_up, model_of, suggest_shape
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
-#: Models of the single tables. Obstacles and phases are arrays of tables, whose kinds have models.
+#: Models of the single tables. Obstacles, phases, fences and people are arrays of tables.
 _TABLES = {
     key: model
     for key, field in Contents.model_fields.items()
-    if (model := model_of(field.annotation)) is not None and key not in ("obstacles", "phases")
+    if (model := model_of(field.annotation)) is not None
+    and key not in ("obstacles", "phases", *fences.TABLES)
 }
 
 
@@ -74,10 +77,12 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         (("limits",), _limits),
         (("yaw",), _yaw),
         ((), _obstacles),
+        ((), _areas),
         (("formations",), formations.rules),
         ((), _touching),
         ((), phases.rules),
         (("disturbances",), disturbances.rules),
+        (("network",), network.rules),
         ((), losses.rules),
         (("disturbances",), disturbances.sizes),
         ((), vehicles.flight_rules),
@@ -97,6 +102,7 @@ def _sizes(m: Draft) -> Breaches:
         (("formations",), bounds.FORMATIONS, "split them into several missions"),
         (("phases",), bounds.PHASES, "split them into several missions"),
         (("obstacles",), bounds.OBSTACLES, "merge those that touch, and remove those out of reach"),
+        *(((key,), bounds.FENCES, "merge those that touch") for key in fences.TABLES),
     ]
     if isinstance(agents, dict):
         lists += [(("agents", key), bounds.AGENTS, "use fewer agents") for key in agents]
@@ -211,7 +217,7 @@ def _fixed_agents(m: Draft) -> Breaches:
         return
     agents, d = m.agents, m.disturbances
     yield from phases.members(m, agents.fixed)
-    lost = d is not None and (d.lost or (d.links and d.links.lost))
+    lost = d is not None and d.lost
     n, solver = len(agents.position), m.constraint.solver
     for wrong, problem, remedy in (
         (any(any(agents.velocity[i - 1]) for i in agents.fixed if i <= n), "starts with a velocity", "remove it"),
@@ -369,3 +375,17 @@ def _obstacles(m: Draft) -> Breaches:
                 yield from _corners(thing, path)
             things.append(thing)
     m.parts["obstacles"] = tuple(things)
+
+
+def _areas(m: Draft) -> Breaches:
+    """Each fence, and each place with people, by itself."""
+    for table, (kind, word) in fences.TABLES.items():
+        areas = []
+        for k, data in enumerate(m.tables(table)):
+            path = (table, k)
+            if (area := m.validate(kind, data, path, {"name": f"{word} {k + 1}"})) is not None:
+                m.keep(path, fences.rules(m, area, path))
+                areas.append(area)
+        m.parts[table] = tuple(areas)
+    if m.limits.model_fields_set & {"people"} and not m.data.get("people"):
+        yield Breach(("limits", "people"), "has no effect without people", "add [[people]]")

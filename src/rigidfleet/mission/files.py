@@ -157,12 +157,15 @@ def _files_named(data: dict[str, Any]) -> Iterator[_Named]:
         yield _Named(agents, "position", "position", "agents.position", _read_points)
     for k, thing in _with_file(things, "heights", "heights"):
         yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _read_heights)
+    for key in ("fences", "people"):
+        for k, area in _with_file(data.get(key), None, "coordinates"):
+            yield _Named(area, "file", "coordinates", f"{key}[{k}].file", _read_areas)
 
 
-def _with_file(tables: Any, kind: str, becomes: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Numbers, from 1, and tables of a kind that name a file instead of giving its numbers."""
+def _with_file(tables: Any, kind: str | None, becomes: str) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Numbers, from 1, and tables of a kind, if any, that name a file instead of giving its numbers."""
     for k, table in enumerate(tables if isinstance(tables, list) else (), start=1):
-        own = table if isinstance(table, dict) and table.get("kind") == kind else {}
+        own = table if isinstance(table, dict) and kind in (None, table.get("kind")) else {}
         if becomes not in own and isinstance(own.get("file"), str):
             yield k, own
 
@@ -243,6 +246,13 @@ def without_data(heights: Any) -> str:
         return ""
     i, j = cells[0]
     return f"has {len(cells):,} cells without data, the first in row {i + 1}, column {j + 1}: {z[i, j]:g}"
+
+
+def _read_areas(data: bytes, name: str) -> Content:
+    from rigidfleet.mission.geojson import read_geojson
+
+    polygons, notes = read_geojson(data, name)
+    return Content(polygons, notes=notes)
 
 
 def _read_heights(data: bytes, name: str) -> Content:

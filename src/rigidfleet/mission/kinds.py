@@ -454,8 +454,8 @@ class Vertical(Arriving):
 
     @property
     def spelled(self) -> bool:
-        """Whether there is one group."""
-        return self.stagger is None
+        """Whether there is one group, which does not land elsewhere."""
+        return self.stagger is None and self.__dict__.get("places") != "own"
 
     @property
     def level(self) -> float | None:
@@ -501,6 +501,11 @@ class Land(Vertical):
     lands: ClassVar[bool] = True
 
     kind: Literal["land"] = key("descend straight down to the ground")
+    places: Literal["below", "own"] = key(
+        "below: each vehicle lands where it is, often where another one stood; own: each goes to where it stood at the "
+        "start, straight or by levels, on ways that are proved, and then down",
+        "below",
+    )
 
     @property
     def leads_to(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
 from typing import Any, Literal, NamedTuple, Self, TypeVar
@@ -28,7 +29,7 @@ from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import latest_end
-from rigidfleet.mission.schema import DRAG, Contents
+from rigidfleet.mission.schema import DRAG, Aborting, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.solids.distance import height_below
@@ -77,6 +78,10 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
         return made if made is None or made.dtype.kind == "i" else made.copy()
 
     return wrapper
+
+
+#: Vehicles no higher above what is below them stand on it [m].
+_STANDING = 0.5
 
 
 class Mission(Contents, Shown):
@@ -484,6 +489,22 @@ class Mission(Contents, Shown):
         x, y, z = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (x, y, z)))
         return np.maximum(height_below(x, y, z, self.roofs), self.ground)
 
+    def standing(self, r: Floats) -> Bools:
+        """Which vehicles at r (N, 3) [m] stand on what is below them, (N,)."""
+        return r[:, 2] - self.fleet.radius - self.height_at(*r.T) <= _STANDING
+
+    def landings_in_words(self, end: Floats) -> str:
+        """How many vehicles land where another one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
+        start = self.fleet.position
+        stand = self.standing(end)
+        if len(end) < 2 or not (self.standing(start) & stand).any():
+            return ""
+        from scipy.spatial import KDTree
+
+        near = KDTree(start[:, :2]).query(end[:, :2])[1]
+        others = int((stand & (near != np.arange(len(end)))).sum())
+        return f"{others} of {len(end)} vehicles land where another one stood" if others else ""
+
     @cached_property
     def tracking_gains(self) -> tuple[float, float]:
         """Gains k1 [1/s^2] and k2 [1/s] of local tracking."""
@@ -529,8 +550,7 @@ class Mission(Contents, Shown):
     @cached_property
     def links_lost(self) -> tuple[Ints, Floats]:
         """The links that are lost: pairs (L, 2) of agents from 0, i < j, and times (L,) [s]."""
-        d = self.disturbances
-        lost = d.links.lost if d is not None and d.links is not None else ()
+        lost = self.network.lost if self.network is not None else ()
         pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
         return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
 
@@ -557,7 +577,32 @@ class Mission(Contents, Shown):
         return " and ".join(words)
 
     @property
-    def on_loss(self) -> Literal["continue", "hold", "land"]:
+    def aborting(self) -> Aborting:
+        """How the flight is aborted: [abort], or its defaults."""
+        return self.abort or Aborting.model_construct()
+
+    @property
+    def abandons_at(self) -> float:
+        """Time [s] at which the flight leaves its plan, for a loss that is answered or an abort; infinity if never."""
+        return min(self._answers)
+
+    @property
+    def aborts(self) -> bool:
+        """Whether it then aborts, by [abort]."""
+        loss, abort = self._answers
+        return abort < loss
+
+    @property
+    def _answers(self) -> tuple[float, float]:
+        """Times [s] at which the others brake after a loss, and at which the flight aborts; infinity if never."""
+        options, loss = self.aborting, math.inf if self.on_loss == "continue" else self.first_loss
+        order = math.inf if options.at is None else options.at
+        if self.on_loss == "abort":
+            order, loss = min(order, loss), math.inf
+        return loss, order + options.reaction
+
+    @property
+    def on_loss(self) -> Literal["continue", "hold", "land", "abort"]:
         """What the others do when a vehicle or link is lost."""
         return "continue" if self.disturbances is None else self.disturbances.on_loss
 

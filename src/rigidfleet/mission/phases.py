@@ -289,6 +289,9 @@ def _tracked_way(m: Draft, p: Phase, k: int, _: float | None) -> Breaches:
 def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
     """A take-off or a landing has what its groups need, and agents that exist."""
     yield from _tracked_way(m, p, k, longest)
+    if p.lands and p.places == "own" and (p.agents or p.stagger or p.travel or p.until):
+        problem = "leads all vehicles together, without agents, stagger, travel and until"
+        yield Breach("places", problem, "remove these, and end the phase by its duration")
     if p.stagger is None:
         if "by" in p.model_fields_set:
             yield Breach("by", "has no effect without stagger", "remove it")

@@ -23,6 +23,7 @@ from rigidfleet.mission.bounds import (
     GAIN,
     MASS,
 )
+from rigidfleet.mission.fences import Fence, People
 from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.obstacles import Obstacle
 from rigidfleet.mission.values import (
@@ -55,6 +56,7 @@ from rigidfleet.mission.values import (
     Rate,
     Rest,
     RotorSpeeds,
+    Seconds,
     Seed,
     Share,
     Size,
@@ -552,6 +554,10 @@ class Limits(Part):
         "minimum separation from an agent straight below [m]: height minus radii (downwash)", None
     )
     geofence: Geofence | None = key("box that no agent may leave", None)
+    people: LengthOrZero = key(
+        "least distance, as seen from above, at which a vehicle that fails falls past people [m]: less its radius",
+        0.0,
+    )
     saturation: Share = key(
         "maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
         0.01,
@@ -627,18 +633,55 @@ class LostLink(Part):
     time: Time = key("mission time of the loss [s], > 0")
 
 
-class Links(Part):
-    """What vehicles know of each other: states sent at a fixed rate, which arrive late or not at all."""
+class Outage(Part):
+    """A time without messages: between two vehicles, from and to one, or everywhere."""
 
-    delay: Delay = key("age of a state when it arrives [s]", 0.0)
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
-        "states sent per second [Hz], at most 1000", 50.0
+    between: tuple[Whole, ...] = key(
+        "one or two agents, counted from 1; default: all", (), max_length=2
     )
-    dropped: Share = key("share of the states that are lost, 0 to 0.95", 0.0)
-    seed: Seed = key("seed of the random numbers; the same seed loses the same states", 0)
+    start: Seconds = key("mission time from which no message is sent [s]")
+    end: Time = key("mission time from which messages are sent again [s]")
+
+
+class Network(Part):
+    """How vehicles know each other: each computes its force from its own state and its neighbours' messages."""
+
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
+        "broadcasts of each vehicle a second [Hz], at most 1000", 50.0
+    )
+    delay: Delay = key("time from a broadcast to its arrival [s]", 0.0)
+    jitter: Delay = key(
+        "greatest time by which a message is later than that [s]: each is by a share of its own, so that "
+        "messages may overtake each other",
+        0.0,
+    )
+    loss: Share = key("share of the messages that a link loses, 0 to 0.95", 0.0)
+    burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = key(
+        "mean number of messages lost one after the other; default: losses are independent", None
+    )
+    range: Length | None = key("distance beyond which no message is heard [m]; default: none", None)
+    budget: Annotated[float, Strict(), Field(gt=0)] | None = key(
+        "broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
+        "no limit",
+        None,
+    )
+    silence: Time = key("time without a message after which a vehicle lets go of an edge [s]", 0.5)
+    event: Length | None = key(
+        "distance [m] by which neighbours guess a vehicle wrongly before it sends, or before `silence` would run out; "
+        "default: it sends each time",
+        None,
+    )
+    seed: Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
+    outages: tuple[Outage, ...] = key(
+        "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()
+    )
     lost: tuple[LostLink, ...] = key(
         "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
+
+    def sent_rate(self, n: int) -> float:
+        """Broadcasts of each of n vehicles a second [Hz] that the medium carries."""
+        return self.rate if self.budget is None else min(self.rate, self.budget / n)
 
 
 class Lost(Part):
@@ -666,11 +709,6 @@ class Disturbances(Part):
     )
     gusts: Gusts | None = key("gusts: [disturbances.gusts]", None)
     noise: Noise | None = key("measurement noise: [disturbances.noise]", None)
-    links: Links | None = key(
-        "links between vehicles, only with [vehicles]: [disturbances.links]; default: each knows the "
-        "others as they know themselves",
-        None,
-    )
     downwash: Flag = key(
         "true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]", False
     )
@@ -680,9 +718,10 @@ class Disturbances(Part):
     lost: tuple[Lost, ...] = key(
         "vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`", ()
     )
-    on_loss: Literal["continue", "hold", "land"] = key(
+    on_loss: Literal["continue", "hold", "land", "abort"] = key(
         "what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "
-        "brake to a stop and hold the formation; land: brake to a stop and land straight down",
+        "brake to a stop and hold the formation; land: brake to a stop and land straight down; abort: go home by "
+        "[abort]",
         "continue",
     )
     hold_until: Time | None = key(
@@ -692,6 +731,28 @@ class Disturbances(Part):
     landing_formation: str | None = key(
         "level formation that on_loss 'land' takes before the descent; default: the one that is held",
         None,
+    )
+
+
+class Aborting(Part):
+    """How the flight is aborted, at any time: `check --abort` plans it, `run --abort-at` flies it."""
+
+    at: Annotated[float, Strict(), Field(ge=0)] | None = key(
+        "mission time at which an abort is ordered [s]; default: never", None
+    )
+    step: Time = key("time between the aborts that `check --abort` plans [s]", 1.0)
+    reaction: Annotated[float, Strict(), Field(ge=0, le=60)] = key(
+        "time after which all vehicles have the order, or notice a loss, and act at once [s]", 0.5
+    )
+    to: Literal["any", "own"] = key(
+        "any: to any landing place, by the least sum of squares; own: each to its own, straight or by levels one above "
+        "the other, or back along the plan. Places are those of the start, or a grid below if that is in the air",
+        "any",
+    )
+    agents: tuple[AgentNumber, ...] = key(
+        "numbers of the vehicles that go home, as soon as they come near no other one; the others fly the mission on. "
+        "Default: all go home",
+        (),
     )
 
 
@@ -793,6 +854,8 @@ class Contents(MissionHeader):
         "formations by name: [formations.NAME]", default_factory=dict
     )
     obstacles: tuple[Obstacle, ...] = key("obstacles: [[obstacles]]", ())
+    fences: tuple[Fence, ...] = key("fences of polygons: [[fences]]", ())
+    people: tuple[People, ...] = key("places where people are: [[people]]", ())
     limits: Limits = key(
         "limits that the verdict checks: [limits]", default_factory=Limits.model_construct
     )
@@ -800,9 +863,14 @@ class Contents(MissionHeader):
     geodetic_origin: GeodeticOrigin | None = key(
         "place of the origin on the Earth, for exports: [geodetic_origin]", None
     )
+    network: Network | None = key(
+        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
+        None,
+    )
     disturbances: Disturbances | None = key(
         "wind, gusts, noise, mass errors, lost vehicles: [disturbances]", None
     )
+    abort: Aborting | None = key("how the flight is aborted: [abort]", None)
     phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = key(
         "phases of the flight, in order: [[phases]]"
     )

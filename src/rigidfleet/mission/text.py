@@ -27,7 +27,8 @@ GROUPS = {
     "Vehicles": (
         "crazyflies", "cube-passage-quadrotors", "delayed", "downwash-cube", "passage-quadrotors", "windy-passage",
     ),
-    "Shows": ("change-of-picture", "falling-light", "ferris-wheel", "show-1000"),
+    "Networks": ("cube-by-neighbours", "lossy-passage"),
+    "Shows": ("change-of-picture", "falling-light", "ferris-wheel", "market-square", "show-1000"),
 }  # fmt: skip
 #: Shipped missions to look at first.
 FIRST = ("narrow-passage", "bridge-inspection", "change-of-picture")

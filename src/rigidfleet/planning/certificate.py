@@ -101,8 +101,12 @@ def _least(p: bytes, dp: bytes, radius: bytes) -> tuple[float, tuple[int, int], 
     return float(least[0]), (int(pairs[0, 0]), int(pairs[0, 1])), 0.0
 
 
-def of_ways(knots: Floats, ways: Floats, radius: Floats | None = None) -> Certificate:
+def of_ways(
+    knots: Floats, ways: Floats, radius: Floats | None = None, first: int | None = None
+) -> Certificate:
     """Certificate of bent ways, polynomials (K, N, 3, P) between knots (K + 1,) [s], for radii (N,) [m] or points.
+
+    With ``first``, of the pairs alone that have one of so many first vehicles.
 
     Let p(t) = sum_k c_k (t - m)^k be the way of one vehicle relative to another about the middle m of a span of length
     2 h, and n the direction of c_0. Then |p(t)| >= n . p(t) >= |c_0| - sum_k |n . c_k| h^k. Spans in which this bound
@@ -112,7 +116,7 @@ def of_ways(knots: Floats, ways: Floats, radius: Floats | None = None) -> Certif
     n, powers = ways.shape[1], ways.shape[3]
     r = np.zeros(n) if radius is None else radius
     best: tuple[float, float, tuple[int, int]] = np.inf, float(knots[0]), (0, 0)
-    for i in range(n - 1):
+    for i in range(n - 1 if first is None else min(first, n - 1)):
         c = (ways[:, i + 1 :] - ways[:, i : i + 1]).reshape(-1, 3, powers)
         half = np.repeat(np.diff(knots) / 2, n - 1 - i)
         middle = np.repeat((knots[:-1] + knots[1:]) / 2, n - 1 - i)

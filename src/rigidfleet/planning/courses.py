@@ -200,6 +200,8 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
         ways = np.einsum("ab,kibp->kiap", pose.T, pieces[:, :, :3] - body[:, None, :3])
         start = np.zeros((4, *slots.shape))
         start[0] = slots
+        if now.rates is not None:
+            start[1:] = now.rates
         own = Piecewise(knots, ways).start_from(start, fade)
         end = own.at(own.time[-1:])[0]
         lift = Lift(end - slots, length, now.t + own.time, np.ascontiguousarray(own.pieces))
@@ -243,6 +245,8 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     alone = pieces.shape[1] == 1
     place = pose.r[None] if alone else pose.r + now.slots @ pose.T
     speed = pose.v[None] + (0.0 if alone else np.cross(pose.omega, now.slots) @ pose.T)
+    if now.rates is not None and not alone:
+        speed = speed + now.rates[0] @ pose.T
     length = phase.travel or (phase.duration if isinstance(phase.duration, float) else knots[-1])
     off = (
         np.linalg.norm(first[..., 0] - place, axis=1),

@@ -186,7 +186,7 @@ class Leg:
             goal = copy_with(pose, T=pose.T if self.phase.turns_away else goal.T, named=goal.named)
         return copy_with(
             self.before, t=t, r=r, v=v, frame=frame, formation=self.formation, slots=self.slots, pose=pose, goal=goal,
-            blend=blend if t < blend.t0 + blend.T_b else None,
+            rates=None, blend=blend if t < blend.t0 + blend.T_b else None,
         )  # fmt: skip
 
 
@@ -310,7 +310,7 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
         if not lift.keeps:
             name = target = None  # no formation outlasts it
     reference = Reference(kind, now.t, T_b, _NONE, _NONE, p0, dp, turn, *bent)
-    if shaping is None and now.blend is not None:
+    if shaping is None and lift is None and now.blend is not None:
         reference = now.blend
     return Leg(
         phase, before, now.t, t_end, departure, frame, name, target is not None, slots, goal, arrival, way,

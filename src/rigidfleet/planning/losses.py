@@ -1,4 +1,4 @@
-"""What the others do when a vehicle or link is lost: they brake, and then hold or land.
+"""What the others do when a vehicle or link is lost, or an abort is ordered: they brake and hold or land, or go home.
 
 All phases follow from the reference at the moment of the loss, so that nothing jumps: position, velocity and
 acceleration of each slot continue, and in a smooth mission jerk. A change of shape under way is completed.
@@ -7,18 +7,21 @@ acceleration of each slot continue, and in a smooth mission jerk. A change of sh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
+from rigidfleet.planning.abort import Aborts, Plan, phases_of, state_to_leave
 from rigidfleet.planning.courses import height
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
+from rigidfleet.planning.timing import timed_leg
 
 #: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
 #: and acceleration of the descent, unless `limits` asks for less. A motion that is faster when it begins may go on so.
@@ -34,13 +37,45 @@ _KEPT = 1.01
 _LEVEL = 1e-3
 
 
-def after_loss(mission: Mission, now: PhaseState) -> list[Leg]:
-    """The legs of the phases that follow the loss of a vehicle or link, from the state at that moment.
+class Answer(NamedTuple):
+    """What follows a loss or an order: legs, and why they lead to no place that is proved; "" if they do."""
+
+    legs: list[Leg]
+    problem: str = ""
+
+
+def legs_from(
+    mission: Mission, now: PhaseState, phases: Sequence[Phase], number: int = 0
+) -> list[Leg]:
+    """The legs of phases in a row, of which the first has a number, from the state at its start, as far as known."""
+    legs: list[Leg] = []
+    for k, phase in enumerate(phases, start=number):
+        leg = timed_leg(mission, phase, now, k)
+        if not leg.known:
+            break
+        legs.append(leg)
+        now = leg.after
+    return legs
+
+
+def answer_to(mission: Mission, now: PhaseState, plan: Sequence[Leg]) -> Answer:
+    """What follows the loss of a vehicle or link, or the order to abort, from the state at that moment.
 
     Parameters
     ----------
     now : the state, with the vehicles lost until then, its reference ``pose`` and the ``blend`` under way
+    plan : the legs of the mission from its start to its end, as far as they are known
     """
+    if not mission.aborts:
+        return Answer(after_loss(mission, now))
+    reaction = mission.aborting.reaction
+    abort = Aborts(mission, plan, now.lost).at(now.t - reaction)
+    now = state_to_leave(plan[Plan(plan).number_at(np.array([now.t]))[0]], now, now.t)
+    return Answer(legs_from(mission, now, phases_of(mission, abort.steps, "abort")), abort.reason)
+
+
+def after_loss(mission: Mission, now: PhaseState) -> list[Leg]:
+    """The legs of the phases by which the others brake, and hold or land (`answer_to`)."""
     d = mission.disturbances
     assert d is not None
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t

@@ -129,6 +129,8 @@ class PhaseState:
     goal: Pose | None = None  # the pose to hold
     lost: Bools | None = None  # (N,) lost vehicles; None if there are none
     blend: Reference | None = None  # change of shape under way, if a loss has ended its phase
+    # Velocity, acceleration, jerk (3, N, 3) of the slots about the CM, body axes, if an abort has ended a phase.
+    rates: Floats | None = None
 
 
 # Saves 3 to 7 % of a short flight, such as narrow-passage.

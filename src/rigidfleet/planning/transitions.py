@@ -22,7 +22,9 @@ from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
+from rigidfleet.planning.abort import Homes, Plan, Step, phases_of
 from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import transfer
 from rigidfleet.planning.ways import Timed, error_of_key
 from rigidfleet.typing import Floats, Ints
@@ -62,8 +64,8 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         parts = [table]
         if not phase.spelled:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
-            room = partial(_room, mission, so_far, timed)
-            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, room)
+            state = partial(_state_after, mission, so_far, timed)
+            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, state)
             forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
@@ -73,17 +75,17 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
 
 #: Phases as tables, and the formations that they take on the way.
 _Parts = tuple[list[dict[str, Any]], dict[str, Any]]
-#: Corners (2, 3) [m] of the room for bent ways (`_room`).
-_Room = Callable[[], Floats]
+#: The state at the start of a phase (`_state_after`).
+_State = Callable[[], PhaseState | None]
 
 
 def _transition(
-    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, room: _Room
+    mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, state: _State
 ) -> _Parts:  # fmt: skip
     """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do."""
     if phase.transition == "ways":
         report(f"looking for ways of the agents in '{phase.name}'")
-        return [_bent(mission, number, table, phase, before, room())], {}
+        return [_bent(mission, number, table, phase, before, _room(mission, state()))], {}
     stops = _stops(mission, number, phase, before)
     if stops is None:
         return [table], {}
@@ -93,16 +95,17 @@ def _transition(
 
 
 def _stagger(
-    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, _: _Room
+    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, state: _State
 ) -> _Parts:  # fmt: skip
-    """The phases of a staggered take-off or landing, one for each group.
+    """The phases of a staggered take-off or landing, one for each group, or of a landing on the own places.
 
     Raises
     ------
     MissionError
         The duration leaves no time for the last group, or so much that groups would be under way together.
     """
-    assert phase.stagger is not None
+    if phase.stagger is None:
+        return _to_own_places(mission, number, table, phase, state()), {}
     assert isinstance(phase.duration, float)  # checked
     moving = phase.agents or tuple(range(1, mission.n_agents + 1))
     groups = [[i] for i in moving]
@@ -134,31 +137,66 @@ def _stagger(
 
 
 #: What takes the place of each kind of phase that may not be flown as it is written.
-_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None, _Room], _Parts]] = {
+_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None, _State], _Parts]] = {
     "land": _stagger,
     "reshape": _transition,
     "takeoff": _stagger,
 }
 
 
-def _room(mission: Mission, so_far: dict[str, Any], timed: Timed) -> Floats:
-    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly after phases ``so_far``.
+def _to_own_places(
+    mission: Mission, number: int, table: dict[str, Any], phase: Vertical, now: PhaseState | None
+) -> list[dict[str, Any]]:
+    """The phases in which each vehicle flies to where it stood at the start, and lands (`planning.abort`).
+
+    Raises
+    ------
+    MissionError
+        The vehicles did not stand on the ground, no way is proved, or there is too little time for it.
+    """
+    mistake = partial(error_of_key, mission, number)
+    homes = Homes(mission, Plan(()), to="own")
+    problem = (
+        "needs vehicles that stand on the ground at the start, and slots before that are known"
+    )
+    steps: list[Step] = []
+    if now is not None and now.goal is not None and now.slots is not None and homes.stands:
+        steps, _, problem = homes.search(now.goal.r + now.slots @ now.goal.T, now.t)
+    if not steps:
+        remedy = "leave places out, to land below"
+        raise mistake("places", "own", problem, remedy)
+    least = sum(step.duration for step in steps)
+    spare = phase.duration - least if isinstance(phase.duration, float) else 0.0
+    if spare < -1e-6:
+        problem = f"is too short for the ways to the own places; the least is {least:.3f} s"
+        raise mistake("duration", phase.duration, problem, "give that, or more")
+    parts = phases_of(mission, steps, phase.name)
+    last = parts[-1].model_copy(update={"duration": steps[-1].duration + max(spare, 0.0)})
+    keep = {key: x for key, x in table.items() if key in ("control", "input_force")}
+    return [keep | x.model_dump(mode="json", exclude_unset=True) for x in (*parts[:-1], last)]
+
+
+def _state_after(mission: Mission, so_far: dict[str, Any], timed: Timed) -> PhaseState | None:
+    """The state after phases ``so_far``; None where it is known only in flight."""
+    now, tables = at_start(mission), so_far["phases"]
+    if tables:
+        mission = mission.rewritten(so_far)
+    for number, phase in enumerate(mission.phases[: len(tables)]):
+        leg = None if phase.replaced else timed(mission, phase, now, number)
+        if leg is None or not leg.known:
+            return None
+        now = leg.after
+    return now
+
+
+def _room(mission: Mission, now: PhaseState | None) -> Floats:
+    """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly from a state on.
 
     These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides
     if its axes are along the world's. Infinite where that, or the place of the formation, is not known.
     """
     box = np.array([[-np.inf] * 3, [np.inf] * 3])
-    now, tables = at_start(mission), so_far["phases"]
-    if tables:
-        mission = mission.rewritten(so_far)
-    for number, phase in enumerate(mission.phases[: len(tables)]):
-        if phase.replaced:
-            return box
-        leg = timed(mission, phase, now, number)
-        if not leg.known:
-            return box
-        now = leg.after
-    if (pose := now.goal) is None:
+    if now is None or (pose := now.goal) is None:
         return box
     radius, fence = float(mission.fleet.radius.max()), mission.limits.geofence
     lowest = np.array([-np.inf, -np.inf, mission.ground + radius])

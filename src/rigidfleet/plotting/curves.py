@@ -444,11 +444,12 @@ _PANELS = {
     "separation": ("between agents [m]", "only one agent"),
     "separation_below": ("straight below [m]", "no agent is ever straight below another"),
     "clearance": ("to obstacles [m]", "no obstacles"),
+    "people": ("falls, to people [m]", "no people"),
 }
 
 
 def draw_least(ax: Axes, result: Result, name: str) -> None:
-    """Least distance to others, to one straight below or to obstacles, with its limit and its least value."""
+    """Least distance to others, to one straight below, to obstacles, or of falls to people, with its limit."""
     label, nothing = _PANELS[name]
     ax.set_ylabel(label)
     q, sampled = QUANTITIES[name], samples(result, name)
@@ -462,7 +463,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
             st.draw_limit(ax, limit, f"limit {limit:g} m")
         return
     st.draw_line(ax, result.time, values, color=st.TONES[0])
-    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit else "contact")
+    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit or name == "people" else "contact")
     if name == "separation":
         _draw_planned(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
@@ -471,7 +472,8 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     k = int(np.nanargmin(values))
     x = result.extreme(name)
     if x is None or x.value > values[k]:
-        who = *sampled.owner(k), -1
+        place = () if sampled.values.ndim == 1 else (int(sampled.rank[k].argmax()),)
+        who = *sampled.owner(k, *place), -1
         x = Extremum(float(values[k]), float(result.time[k]), *who[:2])
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
@@ -504,6 +506,7 @@ def clearance(result: Result) -> Figure:
         "separation": several or not mission.obstacles,
         "separation_below": several and mission.limits.separation_below is not None,
         "clearance": bool(mission.obstacles),
+        "people": bool(mission.people),
     }
     names = [name for name, there in wanted.items() if there]
     height = 3.2 if len(names) == 1 else 1.8

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rigidfleet.plotting import solids
+from rigidfleet.plotting import areas, solids
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
@@ -77,6 +77,10 @@ def scene(result: Result) -> Scene:
     begin, end = float(result.time[0]), float(result.time[-1])
     shapes = solids.drawn_obstacles(mission, begin, end, low - near, high + near)
     seen_too = [np.clip(shape.ends, low - near, high + near) for shape in shapes]
+    for _, rings, _ in areas.areas(mission):
+        flat = np.concatenate(rings)
+        ends = np.array([[*f(flat, axis=0), z] for f, z in ((np.min, low[2]), (np.max, high[2]))])
+        seen_too.append(np.clip(ends, low - near, high + near))
     low = np.minimum.reduce([low, *(a for _, a, _ in boxes), *(ends[0] for ends in seen_too)])
     high = np.maximum.reduce([high, *(b for _, _, b in boxes), *(ends[1] for ends in seen_too)])
     # A margin around it; no direction too thin to see.
@@ -248,6 +252,7 @@ def draw_space(
         ax.add_collection3d(Poly3DCollection(_box_faces(a, b), **faces, zorder=2, gid="obstacle"))
     for shape in view.shapes:
         solids.draw_in_space(ax, shape)
+    areas.draw_in_space(ax, result.mission, view.floor)
     shadow = np.full(len(view.centre), view.floor)
     ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
     edges = _edge_segments(result, view.shots)
@@ -374,6 +379,7 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         _draw_box(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
     for shape in view.shapes:
         solids.draw_from_above(ax, shape)
+    areas.draw_from_above(ax, result.mission)
     fence = result.mission.limits.geofence
     if fence is not None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}

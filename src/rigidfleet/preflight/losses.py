@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from rigidfleet.mission import Mission
 from rigidfleet.planning.legs import Leg
-from rigidfleet.planning.losses import after_loss
+from rigidfleet.planning.losses import Answer, answer_to
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import copy_with
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
@@ -25,22 +25,27 @@ from rigidfleet.rigidity import analyse
 def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     """Remarks on lost links, and on the way of those left after the first loss."""
     yield from _links(mission)
-    first = mission.first_loss
-    if mission.on_loss == "continue" or not np.isfinite(first):
+    first = mission.abandons_at
+    if not np.isfinite(first):
         return
     legs = [planned.leg for planned in preflight.planned_phases]
     at = next((x for x in legs if x.start < first <= x.end), None)
+    ordered = mission.aborts and mission.on_loss == "continue"
     if at is None:
-        text = f"{mission.first_lost} may be lost after the planned paths, at {first:g} s: what follows is not checked"
+        what = "the abort may begin" if ordered else f"{mission.first_lost} may be lost"
+        text = f"{what} after the planned paths, at {first:g} s: what follows is not checked"
         yield Remark("note", "loss", text)
         return
-    way = planned_way(mission, at)
+    way, problem = planned_answer(mission, at, legs)
     end = way[-1].end
-    does = "land by" if mission.on_loss == "land" else "hold to"
+    does = "hold to" if mission.on_loss == "hold" or problem else "land by"
     stop = way[0].after.r.mean(axis=0)
     place = ", ".join(f"{x:.1f}" for x in stop)
+    what = "the order to abort" if ordered else f"the loss of {mission.first_lost}"
+    if problem:
+        yield Remark("fails", "loss", f"no way home is proved after {what}: {problem}")
     text = (
-        f"after the loss of {mission.first_lost} at {first:g} s, in '{at.phase.name}', the others brake to rest about"
+        f"after {what} at {first:g} s, in '{at.phase.name}', the others brake to rest about"
         f" ({place}) m by {way[0].end:.1f} s, and {does} {end:.1f} s"
     )
     yield Remark("note", "loss", text)
@@ -53,11 +58,12 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         yield from judge(mission, part)
 
 
-def planned_way(mission: Mission, at: Leg) -> list[Leg]:
-    """The planned legs after the first loss, which happens in the leg ``at``."""
-    first = mission.first_loss
-    lost = mission.lost_at <= first
-    return after_loss(mission, copy_with(at.state_at(first), lost=lost if lost.any() else None))
+def planned_answer(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:
+    """What follows the first loss, or an order to abort, in the leg ``at`` of the planned ones."""
+    when = mission.abandons_at
+    lost = mission.lost_at <= when
+    now = copy_with(at.state_at(when), lost=lost if lost.any() else None)
+    return answer_to(mission, now, legs)
 
 
 def _links(mission: Mission) -> Iterator[Remark]:

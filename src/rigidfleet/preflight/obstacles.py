@@ -1,4 +1,4 @@
-"""Check the planned paths against obstacles, in continuous time, and gaps between boxes."""
+"""Check the planned paths against obstacles, fences and people, in continuous time, and gaps between boxes."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from rigidfleet._common.quantities import PLACES, QUANTITIES
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Box, Ground, Mission, Obstacle
+from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.planning.clearance import CLOSE, closest, pace
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
-from rigidfleet.preflight.findings import Preflight, Remark, names_in_words
+from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_in_words
 from rigidfleet.solids.records import extent
 from rigidfleet.typing import Floats
 
@@ -94,6 +97,29 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         text = f"to limit the time of the check, {names_in_words(names)} skipped"
         yield Remark("note", "obstacle", text)
     yield from _gaps(mission, preflight, radius)
+
+
+def boundary_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
+    """Remarks on planned paths that cross a fence, and on places where vehicles would fall that are too near people.
+
+    Between samples of a plan, its paths are quintics through positions, velocities and accelerations.
+    """
+    watch, worst = BoundaryWatch(mission), dict[tuple[str, bool], tuple[Worst, str]]()
+    for planned in preflight.planned_phases if watch.every else ():
+        states = np.stack([planned.position, planned.velocity, planned.acceleration])
+        watch.take_way(Piecewise.hermite(planned.time, states))
+        for name, x in watch.search().items():
+            at, rank = (name, planned.exact), QUANTITIES[name].rank
+            if at not in worst or rank(x.value) > rank(worst[at][0].value):
+                worst[at] = x, planned.phase
+        watch.worst.clear()
+    for (name, exact), (x, phase) in worst.items():
+        q, place = QUANTITIES[name], getattr(mission, PLACES[QUANTITIES[name].who])[x.other].name
+        limit = q.limit_of(mission)
+        if q.rank(x.value) > q.rank(limit or 0.0) + SLACK:
+            text = f"{boundary_in_words(name, f'agent {x.who + 1}', place, x.value, x.time)} in '{phase}'"
+            text += f" (limit {limit:g} m)" if q.key else ""
+            yield Remark("fails" if exact and limit is not None else "note", q.who, text)
 
 
 def _distance_bound(within: Floats, thing: Obstacle) -> Floats:

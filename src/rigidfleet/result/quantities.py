@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity
+from rigidfleet._common.quantities import MOTIONS, PLACES, QUANTITIES, Quantity
 from rigidfleet._common.text import agent_names
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -55,8 +55,8 @@ def owner_name(result: Result, q: Quantity, who: int, other: int = -1) -> str:
             return agent_names(sorted((who, other)))
         case "edge":
             return f"edge {who + 1}-{other + 1}"
-        case "obstacle":
-            return f"agent {who + 1}, {result.mission.obstacles[other].name}"
+        case "obstacle" | "fence" | "people":
+            return f"agent {who + 1}, {getattr(result.mission, PLACES[q.who])[other].name}"
     return f"agent {who + 1}" if q.who == "agent" else ""
 
 
@@ -122,6 +122,16 @@ def _beyond_fence(result: Result) -> tuple[Floats, ...]:
     return (without_lost(result, np.maximum(fence.min - r, r - fence.max).max(axis=2)),)
 
 
+def _boundary(result: Result, name: str) -> tuple[Any, ...]:
+    """Distance (K, N) [m] beyond a fence, or of where a fall ends from people."""
+    from rigidfleet.mission.boundaries import Boundaries, areas_of  # takes long to load
+
+    if not areas_of(result.mission, name):
+        return (np.full(result.left.shape, np.nan),)
+    values, number = Boundaries(result.mission).values(name, result.position, result.velocity)
+    return without_lost(result, values), lambda k, i: (i, int(number[k, i]))
+
+
 def _altitude(result: Result) -> tuple[Floats, ...]:
     return (without_lost(result, result.position[..., 2]),)
 
@@ -160,6 +170,7 @@ SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     "separation_below": _headroom,
     "lost": _distance_to_lost,
     "geofence": _beyond_fence,
+    **{name: partial(_boundary, name=name) for name in ("fence", "soft_fence", "people")},
     "lowest": _altitude,
     "highest": _altitude,
     "thrust": _thrust,

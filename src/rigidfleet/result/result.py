@@ -19,7 +19,7 @@ import numpy as np
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.facts import Fact, FactTable, Row, Sheet, Shown, worst_values
 from rigidfleet._common.files import write_file
-from rigidfleet._common.quantities import quantity
+from rigidfleet._common.quantities import PLACES, quantity
 from rigidfleet.errors import MissionError, ResultError, wrong_type
 from rigidfleet.result.netcdf import ATTRIBUTES, LABELS, Variable, file_content, read_file
 from rigidfleet.result.phases import PAD, Extremum, PhaseRecord
@@ -182,6 +182,19 @@ class Result(Shown):
         Ints | None,
         "time agent | 1 | 1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
     ] = None
+    message_age: Annotated[
+        Floats | None,
+        "time edge link | s | age of the newest message that the agents of an edge have of each other; NaN before the "
+        "first; missing without [network]",
+    ] = None
+    messages: Annotated[
+        Ints | None,
+        "edge link message | 1 | messages of the whole flight; missing without [network]",
+    ] = None
+    oldest_message: Annotated[
+        Floats | None,
+        "edge link | s | greatest age of a message when it was used; missing without [network]",
+    ] = None
     clock_rate: Annotated[
         Floats | None, "time | 1 | rate of the virtual clock; missing without [avoidance]"
     ] = None
@@ -265,7 +278,7 @@ class Result(Shown):
                     alone = x.other not in rotors
                 else:
                     alone = not (-1 <= x.other < n and x.other != x.who)
-                    alone = alone and quantity(name).who != "obstacle"
+                    alone = alone and quantity(name).who not in PLACES
                 if alone or x.who not in agents:
                     raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
         for name in _QUATERNIONS:
@@ -369,10 +382,10 @@ class Result(Shown):
         ResultError
             This version of rigidfleet does not accept the mission, or the mission does not match the arrays.
         """
-        from rigidfleet.mission import Mission
+        from rigidfleet.mission.loading import recorded_mission
 
         try:
-            mission = Mission.from_toml(self.mission_text, "mission of the result")
+            mission = recorded_mission(self.mission_text, "mission of the result")
         except MissionError as error:
             made = self.versions.get("rigidfleet", "an unknown version")
             message = (

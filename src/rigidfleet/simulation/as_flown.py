@@ -81,7 +81,8 @@ def _check_flown(phase: Phase) -> None:
         remedy = "use kind 'fly', or put it into the mission"
         raise MissionError([Finding("begin()", "kind", phase.kind, problem, remedy)])
     if not phase.spelled:
-        key = "stagger" if phase.vertical is not None else "transition"
+        vertical = phase.vertical
+        key = "transition" if vertical is None else "stagger" if vertical.stagger else "places"
         problem = "is flown as several phases, and cannot begin by hand"
         remedy = "begin one phase after the other, each with its agents or formation, or put it into the mission"
         raise MissionError([Finding("begin()", key, getattr(phase, key), problem, remedy)])
@@ -155,10 +156,12 @@ def _data_as_flown(
     if disturbed := own.get("disturbances"):
         # What followed from a loss is among the phases
         kept = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
-        for table in (kept, kept.get("links", {})):
-            if "lost" in table:
-                table["lost"] = [lost for lost in table["lost"] if lost["time"] < end]
         data["disturbances"] = kept
+    if net := own.get("network"):
+        data["network"] = dict(net)
+    for table in (data.get("disturbances", {}), data.get("network", {})):
+        if "lost" in table:
+            table["lost"] = [lost for lost in table["lost"] if lost["time"] < end]
     return data
 
 

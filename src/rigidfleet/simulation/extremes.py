@@ -21,8 +21,8 @@ from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem, Workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
-from rigidfleet.mission import Limits, Mission, Obstacle
-from rigidfleet.mission.model import Fleet
+from rigidfleet.mission import Mission, Obstacle
+from rigidfleet.mission.boundaries import BoundaryWatch
 from rigidfleet.result import PAD, Extremum, PhaseRecord
 from rigidfleet.solids.records import join
 from rigidfleet.typing import Bools, Floats, Ints
@@ -38,6 +38,8 @@ _SPARE = 0.5
 _LEAST = 0.1
 #: Overlap from which on it is a contact [m], and the time within which the first one is found [s].
 _TOUCH, _INSTANT = 1e-6, 1e-6
+#: Greatest rotation of a piece of a step in the body formulation [rad].
+_TURN = 0.1
 #: Shortest piece of a step, as a share of the step.
 _SHORTEST = 2.0**-20
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
@@ -69,10 +71,10 @@ class CurveWatch:
 
     monitor: native.Watch
 
-    def __init__(
-        self, fleet: Fleet, obstacles: Sequence[Obstacle], limits: Limits, t: float = 0.0
-    ) -> None:
+    def __init__(self, mission: Mission, t: float = 0.0) -> None:
         """Watch vehicles that begin at a time [s]."""
+        fleet, obstacles, limits = mission.fleet, mission.obstacles, mission.limits
+        self.boundaries = BoundaryWatch(mission)
         self.n = len(fleet.radius)
         self.radius = np.array(fleet.radius, dtype=float)
         self._take_obstacles(obstacles)
@@ -154,6 +156,7 @@ class CurveWatch:
         """Evaluate the paths alone of the steps in a trail, not the forces."""
         steps = int(state.count[records.TRAILED])
         self._take_solids(problem, state, 0, steps)
+        self._take_boundaries(problem, state, 0, steps)
         if self.n > _FEW:
             for step in range(steps):
                 self._step(problem, work, state, step)
@@ -208,6 +211,15 @@ class CurveWatch:
         if self.solids is not None:
             self.monitor.clearances(problem, state, first, end, self.solids)
 
+    def _take_boundaries(
+        self, problem: Problem, state: records.IntegratorState, first: int, end: int
+    ) -> None:
+        """Take some steps in the trail beside fences and people."""
+        if self.boundaries.every:
+            rows = _rows(state, np.arange(first, end))
+            clock, points = state.trail.clock[rows], state.trail.points[rows]
+            self.boundaries.take(*in_world(clock, points, problem), self.left)
+
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
@@ -220,12 +232,13 @@ class CurveWatch:
         }
         if (tension := extremes.get("tension")) is not None and self.sign[0] < 0.0:
             extremes["tension"] = tension._replace(value=-tension.value)
-        return extremes
+        return extremes | {name: Extremum(*x) for name, x in self.boundaries.search().items()}
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         extremes = self.so_far()
         self.worst[_OF_PHASE] = self.none[_OF_PHASE]
+        self.boundaries.worst.clear()
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         return extremes
 
@@ -346,7 +359,7 @@ class Extremes(CurveWatch):
     """Monitors a flight and reports the worst values of each phase."""
 
     def __init__(self, mission: Mission) -> None:
-        super().__init__(mission.fleet, mission.obstacles, mission.limits)
+        super().__init__(mission)
         self.state: records.IntegratorState | None = None  # of the integrator that is monitored
         #: States, states in its trail, edges, for which there is a monitor.
         self.size: tuple[int, int, int] | None = None
@@ -435,6 +448,7 @@ class Extremes(CurveWatch):
         count, steps = self.monitor.monitor.count, int(state.count[records.TRAILED])
         first, listed = int(count[records.STAYED]), int(count[records.LISTED_DISTANCES])
         self._take_solids(problem, state, first, steps)
+        self._take_boundaries(problem, state, first, steps)
         if self.n > _FEW:
             for step in range(first, steps):
                 self._step(problem, work, state, step)
@@ -563,6 +577,35 @@ def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
     knots = (records.KNOTS + [[0.0], [1.0]]) / 2.0
     clock = np.array([[t, 0.5 * h], [t + 0.5 * h, 0.5 * h]])
     return clock, records.FROM_KNOTS @ (records.bernstein(knots) @ points)
+
+
+def in_world(clock: Floats, points: Floats, problem: Problem) -> tuple[Floats, Floats]:
+    """Steps (S, 2) [s] and control points (S, N, 6, 5) of positions and velocities of a trail, in world axes.
+
+    In the body formulation, steps are cut so short that their axes turn by less than `_TURN`, and curves of fourth
+    degree go through five places of each.
+    """
+    n = len(problem.vehicles.m)
+    if problem.body_formulation:
+        first = 6 * n + len(problem.graph.edges)
+        q = points[:, :, first : first + 4]
+        turns = np.linalg.norm(np.diff(q, axis=1), axis=2).max(axis=1) / np.linalg.norm(
+            q, axis=2
+        ).min(axis=1)
+        parts = int(max(1.0, np.ceil(8.0 * turns.max(initial=0.0) / _TURN)))
+        shares = (np.arange(parts)[:, None] + records.KNOTS) / parts
+        x = (records.bernstein(shares.ravel()) @ points).reshape(-1, 5, points.shape[2])
+        clock = np.repeat(clock, parts, axis=0)
+        clock[:, 1] /= parts
+        clock[:, 0] += clock[:, 1] * np.tile(np.arange(parts), len(points))
+        q = x[..., first : first + 4]
+        T = att.dcm_from_quaternion(q / np.linalg.norm(q, axis=2, keepdims=True))
+        own = x[..., : 6 * n].reshape(*x.shape[:2], 2 * n, 3) @ T
+        centres = x[..., first + 4 : first + 10].reshape(*x.shape[:2], 2, 3)
+        own += np.repeat(centres, n, axis=2)
+        points = records.FROM_KNOTS @ own.reshape(*x.shape[:2], 6 * n)
+    both = points[..., : 6 * n].reshape(-1, 5, 2, n, 3)
+    return clock, both.transpose(0, 3, 2, 4, 1).reshape(-1, n, 6, 5)
 
 
 def _rows(state: records.IntegratorState, steps: ArrayLike) -> Ints:

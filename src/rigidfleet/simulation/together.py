@@ -72,10 +72,11 @@ def _alike(active: Sequence[ActivePhase]) -> bool:
 
 
 def _plain(phase: ActivePhase) -> bool:
-    """Whether a phase has a given duration, without losses and calls of users' functions."""
+    """Whether a phase has a given duration, without losses, calls of users' functions, fences and people."""
     plan = phase.plan
     return (
-        plan.phase.settle is None
+        not phase.extremes.boundaries.every
+        and plan.phase.settle is None
         and phase.solver is None
         and phase.external is None
         and not plan.loses

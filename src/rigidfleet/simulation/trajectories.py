@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.quantities import QUANTITIES
+from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
@@ -59,9 +59,15 @@ NAMES = {
     7: "polynomials of degree 7",
 }
 #: Limits of a mission that positions over time do not show.
-UNJUDGED = {q.key.removeprefix("limits.") for q in QUANTITIES.values() if not q.monitored}
+UNJUDGED = {
+    q.key.removeprefix("limits.")
+    for q in QUANTITIES.values()
+    if not q.monitored and q.who not in PLACES
+}
 #: What of a mission trajectories are judged by, beside radii and masses.
-_JUDGING = "schema_version", "name", "title", "limits", "obstacles", "gravity", "geodetic_origin"
+_JUDGING = (
+    "schema_version", "name", "title", "limits", "obstacles", "fences", "people", "gravity", "geodetic_origin",
+)  # fmt: skip
 #: Name of the only phase.
 PHASE = "flight"
 
@@ -221,6 +227,9 @@ def judged_as(
         bounds = data.get("limits", {})
         data["limits"] = {key: x for key, x in bounds.items() if key not in UNJUDGED}
         agents |= {"radius": list(own.agents.radius), "mass": list(own.agents.mass)}
+        if own.people:  # what fails falls through the air of the mission
+            wind = (0.0, 0.0, 0.0) if own.disturbances is None else own.disturbances.wind
+            data["disturbances"] = {"wind": list(wind), "drag": own.drag.tolist()}
     else:
         if "separation_below" in (limits or {}) and radius == 0.0:
             raise ResultError(
@@ -279,7 +288,7 @@ def of_curve(
             f"the trajectories begin at {since + zero:.12g} s, and obstacles move from 0 s on. Let both count from one "
             "zero."
         )
-    watch = CurveWatch(mission.fleet, mission.obstacles, mission.limits, float(time[0]))
+    watch = CurveWatch(mission, float(time[0]))
     # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
     near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
     grid = time[0] + near * np.arange(1, math.ceil(span / near))

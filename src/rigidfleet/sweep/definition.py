@@ -28,7 +28,8 @@ from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.text import parse_toml, read_text
 from rigidfleet.mission.values import Part
-from rigidfleet.sweep import controllers, keypaths
+from rigidfleet.sweep import controllers, faults, keypaths
+from rigidfleet.sweep.faults import Drill
 from rigidfleet.sweep.variation import (
     KINDS,
     Gridded,
@@ -48,9 +49,9 @@ _LEAST = 2.0**-54
 #: Greatest number of runs.
 _RUNS = 10**8
 #: Tables with seeds of random numbers.
-_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("disturbances", "links"), ("avoidance",)  # fmt: skip
+_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("network",), ("avoidance",)
 #: Keys that stores have since there are any: they are kept where they are not their defaults.
-_LATER = {"random_numbers", "controller", "rate"}
+_LATER = {"random_numbers", "controller", "rate", "agent", "drill"}
 
 
 class SweepHeader(Part):
@@ -72,7 +73,7 @@ class SweepHeader(Part):
     )
     random_numbers: Literal["shared", "own"] = Field(
         "shared",
-        description="of noise, gusts and links: shared: every run has the seeds of the mission, so that runs differ "
+        description="of noise, gusts and network: shared: every run has the seeds of the mission, so that runs differ "
         "only in what varies; own: each run has a seed of its own",
     )
     controller: str = Field(
@@ -83,6 +84,19 @@ class SweepHeader(Part):
     rate: Annotated[float, Strict(), Field(gt=0, le=1e6)] = Field(
         50.0, description="rate at which the controller is called [Hz]"
     )
+    agent: str = Field(
+        "",
+        description="law of each vehicle's own, MODULE:NAME: a function of what it knows, or a class, of which each "
+        "vehicle has a new object; for missions with [network]; default: the laws of the mission",
+    )
+    drill: Drill | None = Field(
+        None, description="faults of the day, in turn, instead of what varies: [drill]"
+    )
+
+    @property
+    def own(self) -> tuple[str, str]:
+        """Key of the user's law and its name; the name is "" if the laws of the mission fly."""
+        return ("agent", self.agent) if self.agent else ("controller", self.controller)
 
 
 @dataclass(frozen=True)
@@ -111,6 +125,7 @@ class Sweep:
     seed : seed of the random numbers
     name : name of the sweep
     evaluate : what is evaluated of each run: "flight" or "final"
+    drill : the faults of a drill, which are its cases; None: what varies does so in the mission
     """
 
     def __init__(
@@ -118,7 +133,9 @@ class Sweep:
     ) -> None:
         self.mission, self.variations, self.header = mission, tuple(variations), header
         self.seed, self.name, self.evaluate = header.seed, name, header.evaluate
-        self.runs = header.runs or math.prod(self.grid_sizes.values())
+        self.drill = header.drill
+        trials = self.drill.trials if self.drill else 1
+        self.runs = header.runs or trials * math.prod(self.grid_sizes.values())
         if self.runs > _RUNS:
             raise RigidfleetError(f"the grid has {self.runs:,} points: give runs, or fewer values.")
 
@@ -137,7 +154,7 @@ class Sweep:
         Parameters
         ----------
         vary : variations, each a line such as `agents.mass.* *= normal(1, 0.05)` or a table
-        name : name of the sweep; default: the name of the mission
+        name : name of the sweep; default: the name of the mission, of a drill with "-drill" behind it
         origin : name of the sweep in messages
         runs : number of runs; default: one per point of the grid
         seed : seed of the random numbers; default: 0
@@ -148,6 +165,9 @@ class Sweep:
         controller : a controller of your own, "MODULE:NAME" of a function, or of a class, of which each run has a new
             object; the module is installed or in the current folder
         rate : rate at which the controller is called [Hz]; default: 50
+        agent : a law of each vehicle's own, "MODULE:NAME" of a function, or of a class, of which each vehicle has a
+            new object; see `simulate`
+        drill : faults of the day, as the table `[drill]` of a sweep file; nothing else varies then
 
         Raises
         ------
@@ -160,7 +180,9 @@ class Sweep:
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
         data = {"mission": mission.name, "vary": list(vary), **keys}
-        return cls(mission, *_check(data, origin, mission), name or mission.name)
+        variations, header = _check(data, origin, mission)
+        ending = "" if header.drill is None else "-drill"
+        return cls(mission, variations, header, name or mission.name + ending)
 
     @classmethod
     def load(cls, path: str | Path, *, more: Iterable[str] = (), **keys: Any) -> Self:
@@ -169,7 +191,8 @@ class Sweep:
         Parameters
         ----------
         more : lines of additional variations
-        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate
+        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate, agent,
+            drill
 
         Raises
         ------
@@ -186,12 +209,17 @@ class Sweep:
         if isinstance(named, str):
             shipped = named in mission_names()
             mission = load_mission(named if shipped else path.parent / named)
+        if isinstance(data.get("drill"), dict):
+            keys["drill"] = data["drill"] | (keys.get("drill") or {})
         data |= {key: value for key, value in keys.items() if value is not None}
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
         controllers.add_search_folder(path.parent)
         variations, header = _check(data, origin, mission)
         assert mission is not None  # otherwise the check has raised
+        if header.drill:
+            drill = header.drill.from_folder(path.parent)
+            header = header.model_copy(update={"drill": drill})
         return cls(mission, variations, header, path.stem)
 
     @classmethod
@@ -212,33 +240,36 @@ class Sweep:
         """Everything on which a run depends besides its number. The number of runs is not included: it may grow."""
         data = self._data()
         del data["runs"], data["name"]
-        return data | {"version": __version__} | ({"code": self.law[1]} if self.law[0] else {})
+        files = {"code": self.law[1], "files": self.drill.digest if self.drill else ""}
+        return data | {"version": __version__} | {key: x for key, x in files.items() if x}
 
     @cached_property
     def law(self) -> tuple[Any, str]:
-        """The user's controller, or its class, with a digest of its file; None if the mission's laws fly.
+        """The user's controller or law, or its class, with a digest of its file; None if the mission's laws fly.
 
         Raises
         ------
         RigidfleetError
             It cannot be imported.
         """
-        if not (name := self.header.controller):
+        key, name = self.header.own
+        if not name:
             return None, ""
         try:
             return controllers.import_law(name)
         except ImportError as error:
-            raise RigidfleetError(f"controller: {error}\n    {controllers.REMEDY}") from error
+            raise RigidfleetError(f"{key}: {error}\n    {controllers.REMEDY}") from error
 
     @property
     def version(self) -> str:
         """What flies it: the version of rigidfleet, and the user's controller."""
-        law = f" with {self.header.controller} {self.law[1][:8]}" if self.header.controller else ""
+        name = self.header.own[1]
+        law = f" with {name} {self.law[1][:8]}" if name else ""
         return f"rigidfleet {__version__}{law}"
 
     @property
     def random(self) -> bool:
-        """Whether the first run has random numbers: of noise, gusts, links or sensing."""
+        """Whether the first run has random numbers: of noise, gusts, network or sensing."""
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.varied(0), keys) for keys in tables)
 
@@ -259,8 +290,12 @@ class Sweep:
             SweepColumn(v, keys, grid)
             for v in self.variations
             for grid in [v.grid if isinstance(v, Gridded) else None]
-            for keys in keypaths.expand(self.whole, v.path)
+            for keys in self._places(v.path)
         ]
+
+    def _places(self, path: str) -> list[Keys]:
+        """Keys of all places that match a path; a case of a drill is none of the mission."""
+        return [tuple(path.split("."))] if self.drill else keypaths.expand(self.whole, path)
 
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:
@@ -293,8 +328,11 @@ class Sweep:
         self, mission: Mission, run: int, values: Sequence[Any] | None = None
     ) -> dict[str, Any]:
         varied = {column.keys for column in self.columns}
-        document = mission.to_dict()
-        for column, value in zip(self.columns, values or self.values(run), strict=True):
+        document, values = mission.to_dict(), values or self.values(run)
+        if self.drill:
+            stream = faults.stream_of(self.seed, run, 2)
+            faults.disturb(document, *values[:2], stream, mission.n_agents, self._end)
+        for column, value in zip(self.columns, values, strict=True) if not self.drill else ():
             apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
             stream = np.random.SeedSequence(self.seed, spawn_key=(run, 1))
@@ -333,6 +371,14 @@ class Sweep:
         with suppress(MissionError):  # without a way, each run says so
             return expand_mission(self.mission)
         return self.mission
+
+    @cached_property
+    def _end(self) -> float:
+        """Time [s] at which the mission is expected to end."""
+        from rigidfleet.planning.legs import phase_spans
+        from rigidfleet.planning.timing import complete_times
+
+        return phase_spans(complete_times(self.mission))[-1][1]
 
     def _data(self) -> dict[str, Any]:
         return {
@@ -402,6 +448,11 @@ def _check(
     own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
     header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
+    if header is not None and header.drill is not None:
+        cases = _cases(collector, header.drill, mission)
+        if collector.findings:
+            raise SweepError(collector.findings)
+        return cases, header
     whole = None if mission is None else keypaths.whole_document(mission)
     variations: list[Variation] = []
     lacked: list[tuple[int, SweepColumn]] = []
@@ -420,14 +471,21 @@ def _check(
             collector.add(("evaluate",), why, _WHOLE, "final")
     if mission is not None and whole is not None:
         _taken(collector, lacked, mission, whole)
-    if header is not None and (name := header.controller):
+    if header is not None and header.own[1]:
+        key, name = header.own
         try:
             controllers.import_law(name)
         except ImportError as error:
-            collector.add(("controller",), str(error), controllers.REMEDY)
+            collector.add((key,), str(error), controllers.REMEDY)
         if by_final_states:
-            collector.add(("controller",), "does not act on final states alone", _WHOLE)
-    elif "rate" in data:
+            collector.add((key,), "does not act on final states alone", _WHOLE)
+        if key == "agent" and mission is not None and mission.network is None:
+            collector.add(
+                (key,), "needs a network", "add [network] to the mission, or remove agent"
+            )
+        if key == "agent" and header.controller:
+            collector.add((key,), "does not go with a controller", "give one of them")
+    if "rate" in data and not data.get("controller"):
         collector.add(("rate",), "is that of a controller", "give a controller, or remove rate")
     _same_length(collector, variations)
     if "vary" not in data or data["vary"] == []:
@@ -439,6 +497,22 @@ def _check(
     if collector.findings or header is None:
         raise SweepError(collector.findings)
     return variations, header
+
+
+def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -> list[Variation]:
+    """The cases of a drill; nothing else varies."""
+    for key, default in (("vary", []), ("evaluate", "flight")):
+        if collector.data.get(key, default) != default:
+            collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
+    if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
+        collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
+    if drill.links and mission is not None and mission.network is None:
+        problem = "has no effect: without [network], one law knows all states"
+        collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
+    grids = drill.grids(1 if mission is None else mission.n_agents)
+    if not grids:
+        collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
+    return grids
 
 
 def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:

@@ -18,7 +18,7 @@ from rigidfleet.sweep.dataset import unit_and_meaning
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.sweep.store import Table
-from rigidfleet.sweep.summary import drivers, failures, interval, outcomes, varied_numbers
+from rigidfleet.sweep.summary import borne, drivers, failures, interval, outcomes, varied_numbers
 from rigidfleet.sweep.variation import Geomspace, LogUniform
 from rigidfleet.typing import Floats, Ints
 
@@ -35,6 +35,8 @@ _COLUMNS = 4
 _BINS = 30
 #: Maximum number of intervals of an envelope.
 _ENVELOPE = 12
+#: Greatest number of values along a side of a map that are all written.
+_LABELS = 12
 #: Number of cells along a side of a map of random numbers.
 _CELLS = 10
 #: Maximum number of distinct values with a cell each.
@@ -77,6 +79,8 @@ def plot(
         "drivers": correlations,
         "map": partial(map_over_two, over=over, metric=metric),
     }
+    if table.sweep.drill is not None:
+        draw = {"drill": shares}
     files = []
     for name, drawn in draw.items():
         with st.settings(), st.figure_options(titles=titles):
@@ -118,6 +122,32 @@ def outcome(table: Table) -> Figure | None:
     right.set(xlabel="runs")
     right.set_ylim(max(len(names), 4) - 0.5, -0.5)
     right.margins(x=0.15)
+    return fig
+
+
+def shares(table: Table) -> Figure | None:
+    """Share of the runs of a drill that fail, over the magnitudes of each fault."""
+    cases = borne(table)
+    if not cases:
+        return None
+    names = list(dict.fromkeys(case.fault for case in cases))
+    fig, axes = _small_axes(table, "What the flight bears", names)
+    for name, ax in zip(names, axes, strict=True):
+        own = [case for case in cases if case.fault == name]
+        failed = np.array([100.0 * case.failed.rate for case in own])
+        labels = [f"{case.magnitude:g}\n{case.vehicles:,}" for case in own]
+        x = range(len(own))
+        ax.bar(x, failed, color=FAILED, width=0.7)
+        ax.bar(x, 100.0 - failed, bottom=failed, color=PASSED, width=0.7)
+        ax.set_xticks(x, labels, fontsize=6.5)
+        ax.set(xlim=(-0.6, max(len(own), 4) - 0.4), ylim=(0, 100))
+        ax.grid(visible=False)
+        unit = f" [{readable_unit(own[0].unit)}]" if own[0].unit else ""
+        ax.set_title(f"{name}{unit}", loc="left", fontsize=8.5)
+    for ax in axes[::_COLUMNS]:
+        ax.set_ylabel("runs [%]")
+    fig.supxlabel("magnitude, and to how many vehicles", fontsize=8)
+    _draw_key(fig, table)
     return fig
 
 
@@ -267,7 +297,8 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     ):
         distinct = np.unique(numbers[name])
         if len(distinct) <= _VALUES:
-            axis.set_ticks(range(len(distinct)), [f"{v:.3g}" for v in distinct])
+            every = 1 + (len(distinct) > _LABELS)
+            axis.set_ticks(range(0, len(distinct), every), [f"{v:.3g}" for v in distinct[::every]])
         elif _spacing(table, name) == "log":
             scale("log")
             _log_ticks(axis, distinct)

@@ -8,6 +8,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet.errors import FlightError, MissionError
+from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
 from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal
@@ -29,10 +30,25 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         from rigidfleet.sweep.final_states import fly_final_states
 
         return fly_final_states(sweep, runs)
+    rows: list[RunRecord] = []
     groups: dict[int, list[int]] = {}
     for run in runs:
-        groups.setdefault(run // GROUP, []).append(run)
-    return [row for group in groups.values() for row in _fly(sweep, group)]
+        if sweep.drill and sweep.values(run)[0] not in faults.FLOWN:
+            rows.append(_record_fault(sweep, run))
+        else:
+            groups.setdefault(run // GROUP, []).append(run)
+    return rows + [row for group in groups.values() for row in _fly(sweep, group)]
+
+
+def _record_fault(sweep: Sweep, run: int) -> RunRecord:
+    """Judge a geometric fault of a drill."""
+    show = faults.show_of(sweep.mission.text, sweep.header.drill or faults.Drill())
+    begun = perf_counter()
+    fault, size, count = values = sweep.values(run)
+    who = faults.some_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
+    stream = faults.stream_of(sweep.seed, run, 2)
+    outcome = _value_or_error(lambda: show.outcome(fault, size, who, stream))
+    return _record(sweep, run, values, outcome, perf_counter() - begun)
 
 
 def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
@@ -40,8 +56,14 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     from rigidfleet.simulation.flight import simulate
     from rigidfleet.simulation.together import simulate_together
 
-    law, rate = sweep.law[0], sweep.header.rate
-    new = law if isinstance(law, type) else lambda: law
+    law, header = sweep.law[0], sweep.header
+
+    def flight_of(run: int) -> Result:
+        if header.agent:
+            return simulate(flown[run], agent=law)
+        own = law() if isinstance(law, type) else law
+        return simulate(flown[run], controller=own, rate=header.rate)
+
     begun = perf_counter()
     values = {run: sweep.values(run) for run in runs}
     flown: dict[int, Any] = {
@@ -50,10 +72,7 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
     together = law or _value_or_error(lambda: simulate_together([flown[run] for run in valid]))
     if law is not None or isinstance(together, Exception):
-        together = [
-            _value_or_error(lambda run=run: simulate(flown[run], controller=new(), rate=rate))
-            for run in valid
-        ]
+        together = [_value_or_error(lambda run=run: flight_of(run)) for run in valid]
     flown |= zip(valid, together, strict=True)
     del together
     shared = (perf_counter() - begun) / len(runs)
@@ -71,23 +90,23 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
         return error
 
 
-def _record(
-    sweep: Sweep, run: int, values: Sequence[Any], flown: Result | Exception, shared: float
-) -> RunRecord:
-    """Judge a flight and measure it; ``shared`` is its share of the time that its group has taken so far [s]."""
+def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, shared: float) -> RunRecord:
+    """Judge and measure a flight, unless it is the outcome; ``shared``: its share of its group's time so far [s]."""
     begun = perf_counter()
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
-    outcome = flown if isinstance(flown, Exception) else _value_or_error(lambda: _judge(flown))
+    done = isinstance(flown, Exception | tuple)
+    outcome = flown if done else _value_or_error(lambda: _judge(flown))
     match outcome:
         case MissionError():
             reason, detail = refusal(outcome)
-        case FlightError() if sweep.header.controller:
+        case FlightError() if sweep.header.own[1]:
             reason, detail = RAISED, str(outcome)
         case Exception():
             reason, detail = BROKEN, f"{type(outcome).__name__}: {outcome}"
         case _:
-            metrics, reason, detail = outcome
+            known, reason, detail = outcome
+            metrics |= {name: math.nan if x is None else x for name, x in known.items()}
     wall = shared + perf_counter() - begun
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
 

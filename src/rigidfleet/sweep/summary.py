@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from statistics import NormalDist
 from typing import Any
 
@@ -14,7 +14,9 @@ import numpy as np
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.plain import plain
+from rigidfleet._common.quantities import display_unit
 from rigidfleet.sweep import store
+from rigidfleet.sweep.faults import UNITS
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.sweep.variation import is_number
@@ -74,6 +76,28 @@ class Driver:
 
 
 @dataclass(frozen=True)
+class Borne:
+    """How often a fault of a drill fails, and how.
+
+    Attributes
+    ----------
+    fault, magnitude, unit : what happens, and by how much
+    vehicles : to how many
+    failed : rate of the runs that fail
+    separation : least separation that was measured [m]; None if none was
+    worst : of the runs that fail, the one of least separation; None if none does
+    """
+
+    fault: str
+    magnitude: float
+    unit: str
+    vehicles: int
+    failed: Rate
+    separation: float | None
+    worst: Example | None
+
+
+@dataclass(frozen=True)
 class Summary(Shown):
     """Summary of a sweep.
 
@@ -90,6 +114,7 @@ class Summary(Shown):
     random_numbers : "shared": all runs have the same ones; "own": each run has its own; "varied": their seeds vary;
         "none": no random numbers act
     levels : number of runs by the level of machine code that flew them, if it is known
+    drill : how often each fault of a drill fails, in order; empty for other sweeps
     """
 
     name: str
@@ -104,10 +129,13 @@ class Summary(Shown):
     by_value: dict[str, dict[str, Rate]]
     random_numbers: str
     levels: dict[str, int]
+    drill: list[Borne] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """The summary as plain data."""
         data = asdict(self)
+        if not self.drill:
+            del data["drill"]
         data["percentiles"] = {
             name: dict(zip(map(str, PERCENTILES), values, strict=True))
             for name, values in self.percentiles.items()
@@ -124,7 +152,9 @@ class Summary(Shown):
         """Percentiles, reasons of failure, rank correlations, and the rate of success."""
         s, n = self.success, len(self.drivers)
         strong = [d for d in self.drivers if d.adjusted < _CHANCE]
-        parts = [self._percentiles(), self._reasons(), self._correlations(strong)]
+        parts: list[Any] = [self._percentiles(), self._reasons(), self._correlations(strong)]
+        if self.drill:
+            parts = [self._cases(), self._reasons()]
         if n:
             words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
             parts.append(Line(words))
@@ -135,13 +165,24 @@ class Summary(Shown):
         if len(self.levels) > 1:
             levels = ", ".join(f"{count} by {level}" for level, count in self.levels.items())
             parts.append(Line(f"Levels of machine code, whose last bits differ: {levels}.", "note"))
-        for name, rates in self.by_value.items():
+        for name, rates in () if self.drill else self.by_value.items():
             rows = [Row((word, f"{100 * r.rate:.3g} %", r.interval)) for word, r in rates.items()]
             parts.append(FactTable((name, "passed", "95 % interval"), rows))
         if s.of:
             words = f"{s.count} of {s.of} runs passed: {100 * s.rate:.3g} % (95 % interval {s.interval})."
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
+
+    def _cases(self) -> FactTable:
+        rows = []
+        for x in self.drill:
+            size, by = x.failed, f"{x.magnitude:g} {display_unit(x.unit)}".strip()
+            share = f"{size.count} of {size.of}", f"{100 * size.rate:.3g} %"
+            words = f"run {x.worst.run}: {x.worst.detail}" if x.worst else ""
+            level: Any = "fails" if size.count else "ok"
+            rows.append(Row((x.fault, by, x.vehicles, *share, x.separation, words), level))
+        heads = "fault", "by", "vehicles", "fail", "share", "least apart [m]", "the worst"
+        return FactTable(heads, rows, ("the worst",))
 
     def _percentiles(self) -> FactTable:
         rows = [
@@ -205,7 +246,26 @@ def summarise(table: store.Table) -> Summary:
         by_value,
         numbers if sweep.random else "none",
         table.levels,
+        borne(table),
     )
+
+
+def borne(table: store.Table) -> list[Borne]:
+    """How often each fault of a drill fails; empty for other sweeps."""
+    cases = []
+    for codes in np.unique(table.codes, axis=0) if table.sweep.drill else []:
+        some = np.flatnonzero((table.codes == codes).all(axis=1))
+        apart, passed = table.metrics["separation"][some], table.passed[some]
+        fault, size, count = (
+            c.variation.value(x) for c, x in zip(table.sweep.columns, codes.tolist(), strict=True)
+        )
+        worst, failed = None, some[~passed]
+        if len(failed):
+            k = failed[np.where(np.isnan(apart[~passed]), np.inf, apart[~passed]).argmin()]
+            worst = Example(int(table.run[k]), str(table.detail[k]))
+        least = float(np.fmin.reduce(apart)) if np.isfinite(apart).any() else None
+        cases.append(Borne(fault, size, UNITS[fault], int(count), rate(~passed), least, worst))
+    return cases
 
 
 def failures(table: store.Table) -> dict[str, int]:
@@ -265,7 +325,9 @@ def varied_numbers(table: store.Table) -> dict[str, Floats]:
 
 
 def drivers(table: store.Table) -> list[Driver]:
-    """Rank correlation of every varied number with every outcome, strongest first."""
+    """Rank correlation of every varied number with every outcome, strongest first; of a drill's faults, none."""
+    if table.sweep.drill is not None:
+        return []
     tested: list[tuple[str, str, float, float]] = []
     numbers = varied_numbers(table)
     ranked = {name: _ranks(x) for name, x in numbers.items()}

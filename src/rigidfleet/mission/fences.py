@@ -1,0 +1,172 @@
+"""Fences, and places where people are: their keys, and their rules."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, Strict
+
+from rigidfleet.mission import bounds
+from rigidfleet.mission.files import NOT_A_FILE
+from rigidfleet.mission.findings import Keys
+from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.values import Coordinate, Flag, Part, key
+from rigidfleet.solids.polygons import Region, crossing
+from rigidfleet.typing import Floats
+
+#: Semi-major axis [m] and flattening of the WGS 84 ellipsoid.
+_AXIS, _FLAT = 6_378_137.0, 1.0 / 298.257223563
+#: Farthest corner from the origin [m]: beyond, longitude and latitude are taken to be swapped, or the origin wrong.
+_FAR = 100_000.0
+#: Height up to which people reach [m].
+_TALL = 2.0
+
+_Degrees = Annotated[float, Strict(), Field(ge=-180, le=180)]
+_Ring = Annotated[
+    tuple[Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)], ...],
+    Field(min_length=3),
+]
+_Degree = Annotated[tuple[_Degrees, ...], Field(min_length=2, max_length=2)]
+_Polygon = Annotated[
+    tuple[Annotated[tuple[_Degree, ...], Field(min_length=3)], ...], Field(min_length=1)
+]
+
+
+class Area(Part):
+    """An area on the ground, given in metres, or in degrees as GeoJSON has it."""
+
+    name: str = key("name; default: the kind and a number", "")
+    polygon: _Ring | None = key(
+        "corners [x, y] [m], in order, either way round; the last one is joined to the first", None
+    )
+    holes: tuple[_Ring, ...] = key("polygons that are cut out, each with corners [x, y] [m]", ())
+    coordinates: Annotated[tuple[_Polygon, ...], Field(min_length=1)] | None = key(
+        "instead of polygon: coordinates of a GeoJSON MultiPolygon, [longitude, latitude] [deg], WGS 84: a list of "
+        "polygons, each a list of rings: its border, then its holes; needs [geodetic_origin]",
+        None,
+    )
+    file: str | None = key(
+        "instead of polygon: a GeoJSON file, relative to the mission file; the result holds its coordinates",
+        None,
+    )
+    floor: Coordinate | None = key("height of the underside [m]", None)
+    ceiling: Coordinate | None = key("height of the upper side [m]", None)
+
+    def polygons(self, origin: Any) -> list[list[Floats]]:
+        """Polygons, each its border and its holes, as corners (m, 2) [m]; ``origin`` is the mission's geodetic one."""
+        if self.coordinates is None:
+            return [[np.array(ring) for ring in (self.polygon or (), *self.holes)]]
+        place = origin.latitude_deg, origin.longitude_deg, origin.altitude
+        return [[metres(np.array(ring), *place) for ring in rings] for rings in self.coordinates]
+
+    def region(self, origin: Any, ground: float) -> Region:
+        """The area between its heights; ``ground`` [m] is where people stand."""
+        floor, ceiling = self.heights(ground)
+        rings = [ring for polygon in self.polygons(origin) for ring in polygon]
+        return Region.of_rings(rings, floor, ceiling)
+
+    def heights(self, ground: float) -> tuple[float, float]:
+        """Floor and ceiling [m]."""
+        del ground
+        floor = -math.inf if self.floor is None else self.floor
+        return floor, math.inf if self.ceiling is None else self.ceiling
+
+
+class Fence(Area):
+    """A fence, which holds for the centres of vehicles, at all heights unless it has a floor or a ceiling."""
+
+    kind: Literal["inclusion", "exclusion"] = key(
+        "inclusion: vehicles stay inside; exclusion: they stay outside. Each fence holds by itself"
+    )
+    soft: Flag = key(
+        "true: the inner fence, at which a pilot or an autopilot is to act: crossing it is told and fails nothing; "
+        "false: the outer, hard one: crossing it fails the flight",
+        False,
+    )
+
+
+class People(Area):
+    """A place where people are: without heights, from the ground, or z = 0 without one, to two metres above it."""
+
+    def heights(self, ground: float) -> tuple[float, float]:
+        """Floor and ceiling [m]."""
+        floor = (ground if math.isfinite(ground) else 0.0) if self.floor is None else self.floor
+        return floor, floor + _TALL if self.ceiling is None else self.ceiling
+
+
+#: The tables, and what an entry without a name is called.
+TABLES: dict[str, tuple[type[Area], str]] = {
+    "fences": (Fence, "fence"),
+    "people": (People, "people"),
+}
+
+
+def metres(degrees: Floats, latitude: float, longitude: float, altitude: float) -> Floats:
+    """Places (m, 2) [m] east and north of an origin [deg, deg, m], of longitudes and latitudes (m, 2) [deg].
+
+    They lie on the plane that touches the WGS 84 ellipsoid there.
+    """
+
+    def geocentric(x: Floats) -> Floats:
+        lon, lat = np.moveaxis(np.deg2rad(x), -1, 0)
+        squared = _FLAT * (2.0 - _FLAT)
+        n = _AXIS / np.sqrt(1.0 - squared * np.sin(lat) ** 2)
+        flat = (n + altitude) * np.cos(lat)
+        up = ((1.0 - squared) * n + altitude) * np.sin(lat)
+        return np.stack([flat * np.cos(lon), flat * np.sin(lon), up], axis=-1)
+
+    here = np.array([longitude, latitude])
+    (a, b), off = np.deg2rad(here), geocentric(degrees) - geocentric(here)
+    east = [-math.sin(a), math.cos(a), 0.0]
+    north = [-math.sin(b) * math.cos(a), -math.sin(b) * math.sin(a), math.cos(b)]
+    return off @ np.array([east, north]).T
+
+
+def rules(m: Draft, area: Area, path: Keys) -> Breaches:
+    """An area is given once, by corners that bound one, and has heights in order."""
+    ways = [name for name in ("polygon", "coordinates", "file") if getattr(area, name) is not None]
+    if area.file is not None:
+        yield Breach("file", NOT_A_FILE, "load the mission from its file, or give coordinates")
+    elif len(ways) != 1 and m.right(path, "polygon", "coordinates"):
+        problem = "is missing" if not ways else "is given together with coordinates"
+        yield Breach("polygon", problem, "give one of polygon, coordinates and file", None)
+    elif area.coordinates is not None and m.geodetic_origin is None:
+        if m.right((), "geodetic_origin"):
+            remedy = "add [geodetic_origin] with latitude_deg and longitude_deg, or give metres"
+            yield Breach("coordinates", "needs to know where the mission's origin is", remedy, None)
+    elif ways:
+        if area.holes and area.polygon is None:
+            yield Breach("holes", "has no effect without polygon", "put holes into coordinates")
+        if why := flaw(area.polygons(m.geodetic_origin)):
+            yield Breach(ways[0], *why, None)
+    floor, ceiling = area.heights(-math.inf)
+    if floor > ceiling:
+        yield Breach("ceiling", f"is below the floor, {floor:g} m", "give a greater height")
+
+
+def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
+    """What is wrong with polygons of rings (m, 2) [m], and the remedy; None if they bound an area."""
+    rings = [ring for polygon in polygons for ring in polygon]
+    corners = np.concatenate(rings)
+    if len(corners) > bounds.CORNERS:
+        return f"has {len(corners):,} corners; the maximum is {bounds.CORNERS:,}", "simplify it"
+    if np.abs(corners).max() > _FAR:
+        far = np.abs(corners).max() / 1000.0
+        return (
+            f"is {far:,.0f} km from the origin",
+            "give longitude before latitude, and check the origin",
+        )
+    edges = Region.of_rings(rings).edges
+    if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
+        return "has two corners in a row at one place", "give each corner once"
+    if crossing(edges) is not None:
+        return "has edges that cross", "give the corners in their order; polygons may not overlap"
+    for border, *holes in polygons:
+        inside = Region.of_rings([border])
+        others = [one[0] for one in polygons if one[0] is not border]
+        if any(inside.across(ring[:1])[0] < 0.0 for ring in others):
+            return "has a polygon inside another", "give it as a hole, or leave it out"
+        if any(inside.across(ring)[0] > 0.0 for ring in holes):
+            return "has a hole outside of its polygon", "leave it out"
+    return None

@@ -1,0 +1,166 @@
+"""What `check --abort` says: from which seconds of the flight there is a way home that is proved, and which."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
+from rigidfleet._common.files import write_file
+from rigidfleet._common.text import agent_names
+from rigidfleet.mission import Mission
+from rigidfleet.planning.abort import Abort, Aborts, Nearest
+from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.losses import legs_from
+
+
+@dataclass
+class AbortsCheck(Shown):
+    """Result of `check_aborts`.
+
+    Attributes
+    ----------
+    mission : with its times known
+    aborts : of each order
+    unheard : of each, how near each vehicle comes to another one if it does not hear the order and flies on
+    """
+
+    mission: Mission
+    aborts: list[Abort]
+    unheard: list[list[Nearest]]
+
+    @property
+    def least(self) -> float:
+        """The least separation that all ways home promise [m]."""
+        return min((x.least.separation for x in self.aborts if x.way), default=np.inf)
+
+    def facts(self) -> Sheet:
+        """Runs of orders with the same answer, each with its worst numbers."""
+        options, name, all_ = self.mission.aborting, self.mission.name, len(self.aborts)
+        heads = ("ordered [s]", "way home", "takes [s]", "least [m]", "one that does not hear")
+        ways = sum(bool(x.way) for x in self.aborts)
+        text = f"{name}: a way home from {ways} of {all_} times, {options.step:g} s apart"
+        if np.isfinite(self.least):
+            text += f"; no two vehicles come nearer than {self.least:.2f} m"
+        to = "any place" if options.to == "any" else "their own places"
+        parts = [
+            FactTable(heads, [*self._runs()], ("way home", "one that does not hear")),
+            Line(text, "ok" if ways == all_ else "note"),
+        ]
+        return Sheet(name, f"aborts, {options.reaction:g} s after each order, to {to}", parts)
+
+    def _runs(self) -> Iterator[Row]:
+        both = zip(self.aborts, self.unheard, strict=True)
+        for _, group in itertools.groupby(
+            both, lambda x: re.sub(r"[\d.]+", "#", x[0].way or x[0].reason)
+        ):
+            run = list(group)
+            aborts = [abort for abort, _ in run]
+            first, last = aborts[0].ordered, aborts[-1].ordered
+            when = f"{first:g}" if first == last else f"{first:g} to {last:g}"
+            if not aborts[0].way:
+                yield Row((when, f"none: {aborts[0].reason}", None, None, ""), "note")
+                continue
+            takes = max(x.end - x.ordered for x in aborts)
+            least = min(x.least.separation for x in aborts)
+            worst = min((each for _, each in run if each), key=min, default=[])
+            yield Row(
+                (
+                    when,
+                    aborts[0].way,
+                    takes,
+                    least if np.isfinite(least) else None,
+                    self._unheard(worst),
+                )
+            )
+
+    def _unheard(self, each: list[Nearest]) -> str:
+        """What follows if a vehicle does not hear, in words."""
+        if not each:
+            return ""
+        least, when, (i, j) = min(each)
+        near = f"least {least:.2f} m," if least > 0.0 else "hits"
+        text = f"{agent_names([i])} flies on: {near} {agent_names([j])} at {when:.1f} s"
+        count = self._in_danger(each)
+        return text + (f"; {count} would come too near" if count else "")
+
+    def _in_danger(self, each: list[Nearest]) -> int:
+        """How many vehicles would come within the limit of separation."""
+        return sum(x.separation < (self.mission.limits.separation or 0.0) for x in each)
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON, agents counted from 1."""
+        options = self.mission.aborting
+        return {
+            "to": options.to, "reaction_s": options.reaction, "step_s": options.step,
+            "aborts": [
+                {
+                    "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stops,
+                    "ends_s": x.end,
+                    "way": x.way, "reason": x.reason, "ways": x.number, "separation": _nearest([x.least]),
+                    "unheard": _nearest(each), "endangered": self._in_danger(each),
+                }
+                for x, each in zip(self.aborts, self.unheard, strict=True)
+            ],
+        }  # fmt: skip
+
+    def write(self, folder: Path) -> None:
+        """Write the aborts to a folder: aborts.json, and a file for each vehicle.
+
+        Each vehicle flies its own trajectory until the abort begins and has waited, slows down along it by the clock,
+        so that its time along it goes on by T (x - 2.5 x^4 + 3 x^5 - x^6), with x the share of the time T of slowing
+        down, and flies straight from place to place, by the share 35 x^4 - 84 x^5 + 70 x^6 - 20 x^7 of each way.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        data = self.data()
+        homes = {x.number: x.home for x in self.aborts}
+        keys = ("ordered_s", "begins_s", "waits_s", "stops_s", "ways")
+        aborts = [{key: x[key] for key in keys} for x in data["aborts"] if x["way"]]
+        tables = {"aborts.json": data}
+        for i in range(self.mission.n_agents):
+            ways = {
+                number: [
+                    {"name": x.name, "duration_s": x.duration, "to_m": x.end[i].round(6).tolist()}
+                    for x in steps
+                ]
+                for number, steps in homes.items()
+            }
+            tables[f"vehicle-{i + 1:04d}.json"] = {"vehicle": i + 1, "aborts": aborts, "ways": ways}
+        for name, table in tables.items():
+            write_file(folder / name, (json.dumps(table, indent=1) + "\n").encode())
+
+
+def _nearest(each: list[Nearest]) -> dict[str, Any] | None:
+    """The least of several."""
+    least, when, who = min(each, default=Nearest(np.inf, 0.0, (0, 0)))
+    if not np.isfinite(least):
+        return None
+    return {"least_m": least, "time_s": when, "agents": [i + 1 for i in who]}
+
+
+def check_aborts(
+    mission: Mission, *, progress: Callable[[str], None] = lambda _: None
+) -> AbortsCheck:
+    """Plan an abort of each `abort.step` of a mission whose times are known.
+
+    Raises
+    ------
+    MissionError
+        No time of a phase keeps the limits of the mission.
+    """
+    progress("planned paths")
+    aborts = Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
+    every: list[Abort] = []
+    unheard: list[list[Nearest]] = []
+    for abort in aborts.every():
+        progress(f"way home from {abort.ordered:g} s")
+        every.append(abort)
+        unheard.append(aborts.if_not_heard(abort))
+    return AbortsCheck(mission, every, unheard)

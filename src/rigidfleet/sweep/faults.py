@@ -1,0 +1,344 @@
+"""Faults of the day: a late start, a wrong file, a show that is set up askew; and what of a flight they change.
+
+A *geometric* fault moves vehicles on ways that are known: those that a file of the mission, or of others, tells them to
+fly. It is judged as `assess` judges trajectories, in continuous time, but only of the vehicles that it moves and of
+those that may come near them. Proof that no other comes near: at the same time, a way is no further from its chord
+between two knots than its control points from theirs, so that two ways come no nearer to each other than their chords,
+less both. A *flown* fault, wind or a loss, changes the mission, which is flown as in any sweep.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from rigidfleet._common.quantities import MOTIONS
+from rigidfleet.errors import RigidfleetError
+from rigidfleet.math import proximity
+from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, piece_at
+from rigidfleet.mission import Mission, load_mission, mission_names
+from rigidfleet.mission.obstacles import Ground
+from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, Whole, key
+from rigidfleet.sweep.metrics import METRICS
+from rigidfleet.sweep.variation import Grid, Variation
+from rigidfleet.typing import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from rigidfleet.assessment import Verdict
+
+#: Faults of some vehicles, of the whole show or one vehicle, and those that are flown, with units of their magnitudes.
+PARTIAL = {"late": "s", "another": "", "stale": "", "bias": "m"}
+SETUP = {"rotated": "deg", "shifted": "m", "mirrored": "deg"}
+FLOWN = {"wind": "m/s", "links": "", "lost": ""}
+UNITS = PARTIAL | SETUP | FLOWN
+#: Agents in a message.
+_AGENTS = re.compile(r"\bagent \d+|\bagents \d+(?:, \d+)* and \d+")
+_TURN = 2.0 * np.pi
+
+_Sizes = tuple[Positive, ...]
+_Counts = tuple[AgentNumber, ...]
+
+
+class Drill(Part):
+    """The table `[drill]` of a sweep file: the magnitudes of each fault; if it names none, all have some."""
+
+    late: _Sizes = key("vehicles start so much later than the others [s]", (0.5, 1, 2, 5))
+    another: _Counts = key("from their pads, vehicles fly files of so many numbers on", (1, 2))
+    stale: tuple[str, ...] = key("vehicles fly an earlier version: missions, or files", ())
+    bias: _Sizes = key("vehicles are off, in horizontal directions of their own [m]", (0.5, 1, 2))
+    rotated: _Sizes = key("a vehicle about its pad, the show about its origin [deg]", (1, 3, 10))
+    shifted: _Sizes = key("a vehicle or the show, in any horizontal direction [m]", (0.5, 2, 5))
+    mirrored: tuple[Angle, ...] = key("the same, at a plane of this bearing [deg]", (0, 90))
+    wind: _Sizes = key("wind beyond the forecast, in any horizontal direction [m/s]", (2, 5))
+    links: _Counts = key("so many links are lost, each at any time", ())
+    lost: _Counts = key("so many vehicles are lost, each at any time", (1,))
+    vehicles: _Counts = key("of how many at once late, another, stale and bias are faults", (1, 5))
+    trials: Whole = key("trials of each magnitude: other vehicles, directions, times", 20, ge=1)
+    files: tuple[str, ...] = key("files of others that are flown, not those of the mission", ())
+
+    def grids(self, n: int) -> list[Variation]:
+        """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
+        possible = PARTIAL | SETUP if self.files else UNITS
+        faults = self.model_fields_set & UNITS.keys() or possible.keys()
+        some = sorted({min(count, n) for count in self.vehicles})
+        counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
+        places = range(1, len(self.stale) + 1)
+        cases = [
+            (fault, float(size), count)
+            for fault in UNITS
+            if fault in faults
+            for size in (places if fault == "stale" else getattr(self, fault))
+            for count in counts.get(fault, [int(size) if fault == "lost" else n])
+        ]
+        names = "drill.fault", "drill.magnitude", "drill.vehicles"
+        columns = zip(names, zip(*cases, strict=True), strict=False)
+        return [Grid(path=name, kind="grid", values=x, group="drill") for name, x in columns]
+
+    @property
+    def digest(self) -> str:
+        """A digest of all files that it names; "" if it names none."""
+        named = [*map(Path, self.files + self.stale)]
+        paths = sorted(p for path in named for p in (path, *path.rglob("*")) if p.is_file())
+        return hashlib.sha256(b"".join(p.read_bytes() for p in paths)).hexdigest() if paths else ""
+
+    def from_folder(self, folder: Path) -> Drill:
+        """The same, with files as seen from a folder; names of shipped missions stay."""
+
+        def whole(name: str) -> str:
+            return name if name in mission_names() else str((folder / name).resolve())
+
+        named = {key: (*map(whole, getattr(self, key)),) for key in ("stale", "files")}
+        return self.model_copy(update={key: x for key, x in named.items() if x})
+
+
+def stream_of(seed: int, *number: int) -> np.random.Generator:
+    """Random numbers of a run or of an order of the vehicles."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=number))
+
+
+def some_of(seed: int, n: int, count: int, trial: int) -> Ints:
+    """Which (S,) of n vehicles a fault concerns in a trial: in n / S trials, each of them once."""
+    block, place = divmod(trial, n // count)
+    order = stream_of(seed, block, 3).permutation(n)
+    return np.sort(order[place * count : (place + 1) * count])
+
+
+def disturb(
+    document: dict[str, Any], fault: str, size: float, stream: np.random.Generator, n: int, end: float
+) -> None:  # fmt: skip
+    """Put a fault, if it is flown, into the document of a mission of n vehicles that ends at a time [s]."""
+    if fault not in FLOWN:
+        return
+    place = "network" if fault == "links" else "disturbances"
+    table = document[place] = {**document.get(place, {})}
+    if fault == "wind":
+        wind = np.array(table.get("wind", (0.0, 0.0, 0.0)))
+        wind[:2] += size * _heading(stream.uniform(0.0, _TURN))[0]
+        table["wind"] = wind.tolist()
+        return
+    key, things = "agent", range(1, n + 1)
+    if fault == "links":
+        key, things = "between", (1 + proximity.all_pairs(n).T).tolist()
+    there = [*table.get("lost", ())]
+    rest = [x for x in things if x not in [each[key] for each in there]]
+    some = stream.permutation(len(rest))[: int(size)].tolist()
+    times = stream.uniform(1e-3 * end, 0.999 * end, len(some)).tolist()
+    table["lost"] = there + [{key: rest[k], "time": t} for k, t in zip(some, times, strict=True)]
+
+
+def _heading(angle: Any) -> Floats:
+    """Unit vectors (S, 2) of bearings (S,) [rad], clockwise from y."""
+    return np.column_stack([np.sin(angle), np.cos(angle)])
+
+
+class _Chords(NamedTuple):
+    """Ways by their chords between knots.
+
+    Attributes
+    ----------
+    place : (3, K + 1, N) positions at knots [m]
+    sag : (K, N) greatest distance of a way from its chord, at the same time [m]
+    """
+
+    place: Floats
+    sag: Floats
+
+    @classmethod
+    def of(cls, way: Piecewise) -> _Chords:
+        """Chords of ways (K, N, 4, P)."""
+        points = Piecewise(way.time, pad(way.pieces[:, :, :3], 2)).bernstein()
+        place = np.concatenate([points[..., 0], points[-1:, ..., -1]])
+        share = np.linspace(0.0, 1.0, points.shape[-1])
+        points -= place[:-1, ..., None] + np.diff(place, axis=0)[..., None] * share
+        sag = np.linalg.norm(points, axis=2).max(axis=-1)
+        return cls(np.ascontiguousarray(place.transpose(2, 0, 1)), sag)
+
+
+class Show:
+    """A flight that is drilled: the ways of its vehicles, and what they are judged by.
+
+    Attributes
+    ----------
+    curve : ways (K, N, 4, P) of x, y, z [m] and yaw [rad]
+    how : what these are, in words
+    mission : whose radii, limits, fences and obstacles count
+
+    Raises
+    ------
+    RigidfleetError
+        The flight fails without any fault, or the ways cannot be read.
+    """
+
+    def __init__(self, mission: Mission, drill: Drill) -> None:
+        from rigidfleet.simulation.trajectories import judged_as
+
+        self.mission, self.drill, self.n = mission, drill, mission.n_agents
+        self.curve, self.how, verdict = self._ways(mission, drill.files)
+        if not verdict.passed:
+            why = next(check.message for check in verdict.checks if not check.passed)
+            raise RigidfleetError(
+                f"drill: the flight fails without any fault: {why}. Mend this first."
+            )
+        data = judged_as(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
+        motions = {q.name for q in MOTIONS}  # which a fault leaves as they are
+        data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
+        self._data, self.radius, limits = data, mission.fleet.radius, mission.limits
+        self.reach = max(limits.separation or 0.0, limits.separation_below or 0.0)
+        solid = any(not isinstance(thing, Ground) for thing in mission.obstacles)
+        #: Whether it matters where the show is as a whole: flat ground is the same everywhere.
+        self.bounded = solid or limits.geofence or mission.fences or mission.people
+        #: Coefficients (P, N, 4, K): arithmetic on long rows is fast.
+        self._rows = np.ascontiguousarray(self.curve.pieces.transpose(3, 1, 2, 0))
+        self._chords = _Chords.of(self.curve)
+        self._on_knots: dict[bytes, _Chords] = {}  # one for each magnitude of a delay
+
+    @cached_property
+    def versions(self) -> list[Piecewise]:
+        """The ways of earlier versions."""
+        return [
+            self._ways(load_mission(name), ())[0]
+            if name in mission_names() or name.endswith(".toml")
+            else self._ways(self.mission, (name,))[0]
+            for name in self.drill.stale
+        ]
+
+    def _ways(self, mission: Mission, files: Sequence[str]) -> tuple[Piecewise, str, Verdict]:
+        """Ways of a mission's vehicles, or of those in files; what they are, in words; and the verdict."""
+        from rigidfleet.assessment import assess
+        from rigidfleet.foreign.files import read_trajectories
+        from rigidfleet.setpoints import ways_of
+        from rigidfleet.simulation.flight import simulate
+        from rigidfleet.simulation.trajectories import NAMES, of_curves
+
+        if files:
+            read = read_trajectories(files, spans="stand")
+            return join(read.curves), read.assumed, assess(of_curves(read, mission=mission))
+        if mission.n_agents != self.n:
+            raise RigidfleetError(
+                f"stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}."
+            )
+        result = simulate(mission)
+        motion = result.motion(flown=False)
+        if not np.isfinite(motion.state).all():  # where no slots are tracked, vehicles have no file
+            motion = result.motion(flown=True)
+        return ways_of(motion, slice(None)), NAMES[7], assess(result)
+
+    def outcome(
+        self, fault: str, size: float, who: Ints, stream: np.random.Generator
+    ) -> tuple[dict[str, float | None], str, str]:
+        """What was measured of a fault of vehicles (S,), the checks that it fails, and the first of these in words.
+
+        Judged are these vehicles, and all that may come near them.
+        """
+        from rigidfleet.assessment import assess
+        from rigidfleet.simulation.trajectories import of_curve
+
+        again = np.isin(np.arange(self.n), who)
+        # A show that is moved as a whole changes no distance between its vehicles.
+        whole = fault in SETUP and again.all()
+        if whole and not self.bounded:
+            return {}, "", ""
+        way, knots = self.way_with(fault, size, who, stream), self.curve.time
+        if not np.array_equal(knots, way.time):
+            knots = common_knots([self.curve, way])
+        way = way.on(knots, stays=True)
+        if not whole:
+            again |= self._near(who, _Chords.of(way), knots)
+        every = np.flatnonzero(again)
+        curve = self._some(every).on(knots, stays=True)
+        powers = max(x.pieces.shape[-1] for x in (curve, way))
+        pieces = pad(curve.pieces, powers)
+        pieces[:, np.isin(every, who)] = pad(way.pieces, powers)
+        agents = self._data["agents"]
+        own = {key: [agents[key][i] for i in every] for key in ("position", "radius", "mass")}
+        data = self._data | {"agents": own}
+        if air := data.get("disturbances"):
+            data["disturbances"] = air | {"drag": [air["drag"][i] for i in every]}
+        mission = Mission.from_plain(data, "drill")
+        verdict = assess(of_curve(Piecewise(knots, pieces), self.how, mission=mission))
+        failed = [check for check in verdict.checks if not check.passed]
+        worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
+
+        def in_fleet(match: re.Match[str]) -> str:
+            return re.sub(r"\d+", lambda number: str(every[int(number[0]) - 1] + 1), match[0])
+
+        words = _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
+        return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
+
+    def way_with(
+        self, fault: str, size: float, who: Ints, stream: np.random.Generator
+    ) -> Piecewise:
+        """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
+        pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._some(who), np.eye(2), 0.0
+        match fault:
+            case "late":
+                return flown.later(size)
+            case "stale":
+                version = self.versions[int(size) - 1]
+                return Piecewise(version.time, version.pieces[:, who])
+            case "another":
+                source = (who + int(size)) % self.n
+                flown, by = self._some(source), pads[who] - pads[source]
+            case "bias" | "shifted":
+                by = size * _heading(stream.uniform(0.0, _TURN, len(who) if fault == "bias" else 1))
+            case "rotated":
+                u, v = _heading(np.radians(size) * stream.choice([-1.0, 1.0]))[0]
+                turn = np.array([[v, u], [-u, v]])
+            case "mirrored":
+                u = _heading(np.radians(size))
+                turn = 2.0 * u.T @ u - turn
+        if len(who) < self.n:  # a vehicle turns about its pad, the show about its origin
+            by = by + pads[who] - pads[who] @ turn.T
+        pieces = flown.pieces.copy()
+        pieces[:, :, :2] = np.einsum("ab,ksbp->ksap", turn, pieces[:, :, :2])
+        pieces[:, :, :2, 0] += by
+        return Piecewise(flown.time, pieces)
+
+    def _near(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
+        """Which vehicles (N,) may come near one of those (S,) that fly by other chords, or are the nearest to it."""
+        place, sag = (x.copy() for x in self._chords_on(knots))
+        place[:, :, who], sag[:, who] = own
+        # Between two knots none moves further than half of a step from the nearer one.
+        step = 0.5 * np.linalg.norm(np.diff(place, axis=1), axis=0).max(axis=0) + sag.max(axis=0)
+        near = np.zeros(self.n, dtype=np.bool_)
+        for i in who.tolist():
+            apart = place - place[:, :, i : i + 1]
+            allowed = self.reach + self.radius + self.radius[i]
+            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - allowed
+            ends[i] = np.inf
+            near[ends.argmin()] = True
+            some = np.flatnonzero(ends < step + step[i])
+            a, d = apart[:, :-1, some], np.diff(apart[:, :, some], axis=1)
+            share = -(a * d).sum(axis=0) / np.maximum((d * d).sum(axis=0), 1e-300)
+            a += np.clip(share, 0.0, 1.0) * d
+            gap = proximity.root_of_squares(a) - sag[:, some] - sag[:, i : i + 1]
+            near[some[gap.min(axis=0) < allowed[some]]] = True
+        return near
+
+    def _chords_on(self, knots: Floats) -> _Chords:
+        """Chords of all vehicles on other knots: on a part of a piece, the sag may be twice that of the piece."""
+        own = self.curve.time
+        if np.array_equal(knots, own):
+            return self._chords
+        if (key := knots.tobytes()) not in self._on_knots:
+            within = np.clip(knots, own[0], own[-1])
+            place = np.ascontiguousarray(self.curve.at(within)[:, :, :3].transpose(2, 0, 1))
+            middle = 0.5 * (within[:-1] + within[1:])
+            self._on_knots[key] = _Chords(place, 2.0 * self._chords.sag[piece_at(own, middle)])
+        return self._on_knots[key]
+
+    def _some(self, who: Ints) -> Piecewise:
+        """The ways of some vehicles."""
+        return Piecewise(self.curve.time, self._rows[:, who].transpose(3, 1, 2, 0))
+
+
+@lru_cache(maxsize=2)
+def show_of(text: str, drill: Drill) -> Show:
+    """The show of a mission's text: flown or read once for all faults."""
+    return Show(Mission.from_toml(text, "mission of the drill"), drill)

@@ -1,0 +1,366 @@
+"""Aborts: from every second of a flight there is a way home that is proved, or it is said why not."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rigidfleet as rf
+from rigidfleet.cli.app import main
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.abort import Aborts, _levels
+from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.losses import legs_from
+from rigidfleet.planning.timing import complete_times
+from rigidfleet.preflight.aborts import check_aborts
+
+
+def show(**abort: Any) -> Mission:
+    """A shipped show, with [abort]."""
+    data = load_mission("change-of-picture").to_dict()
+    return complete_times(Mission.from_dict(data | {"abort": abort}))
+
+
+def aborts_of(mission: Mission) -> Aborts:
+    """Its aborts."""
+    return Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
+
+
+def random_mission(seed: int) -> tuple[Mission, int]:
+    """Vehicles that take off, fly shapes, turn and land, in wind; one of them, from 0, is lost on the way."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(3, 9))
+    side = int(np.ceil(np.sqrt(n)))
+    pads = [[2.0 * (k % side), 2.0 * (k // side), 0.2] for k in range(n)]
+    forms: dict[str, Any] = {}
+    for name in ("first", "second"):
+        points: list[Any] = []
+        while len(points) < n:
+            x = rng.uniform(-3.0, 3.0, 3)
+            if all(np.linalg.norm(x - y) > 1.9 for y in points):
+                points.append(x)
+        forms[name] = {"slots": np.round(points, 3).tolist(), "edges": []}
+    quads = rng.random() < 0.15
+    phases = [
+        {"kind": "takeoff", "height": 8.0, "duration": 5.0},
+        {"kind": "establish", "formation": "first", "blend": 5.0, "duration": 5.0},
+        rng.choice([
+            {"kind": "turn", "yaw_deg": float(rng.integers(-170, 170)), "duration": 6.0},
+            {"kind": "fly", "position": [5.0, float(rng.integers(-5, 5)), 9.0], "duration": 6.0},
+            {"kind": "orbit", "centre": [4.0, 1.0, 8.2], "radius": 3.0, "rate_deg_s": 30.0, "duration": 7.0},
+        ]),
+        {"kind": "reshape", "formation": "second", "blend": 5.0, "duration": 6.0},
+        {"kind": "land", "duration": 9.0, "agents": list(range(1, n + 1))},
+    ]  # fmt: skip
+    lost, length = int(rng.integers(1, n + 1)), 5.0 + 5.0 + 6.0 + 6.0
+    data = {
+        "schema_version": 1, "name": f"random-{seed}", "assignment": "each", "gravity": 9.81,
+        "smoothness": str(rng.choice(["jerk", "lqr"])),
+        "agents": {"position": pads, "radius": 0.15} | ({"vehicle": "q"} if quads else {"mass": 1.0}),
+        "formations": forms, "obstacles": [{"kind": "ground"}], "phases": phases,
+        "limits": {"separation": 0.3, "separation_altitude": 0.5},
+        "abort": {"at": round(float(rng.uniform(0.0, length)), 2), "to": str(rng.choice(["any", "own"]))},
+        "disturbances": {
+            "wind": np.round([*rng.uniform(-4.0, 4.0, 2), 0.0], 2).tolist(),
+            "lost": [{"agent": lost, "time": round(float(rng.uniform(1.0, length)), 2)}],
+        },
+    }  # fmt: skip
+    if quads:
+        data |= {"vehicles": {"q": {"model": "paper"}}, "smoothness": "jerk"}
+    return Mission.from_dict(data), lost - 1
+
+
+def flown_apart(seed: int) -> float:
+    """How much farther than promised the vehicles of a random mission stay apart in flight, after an abort [m]."""
+    mission, lost = random_mission(seed)
+    begins, at = mission.abandons_at, mission.aborting.at
+    assert at is not None
+    gone = mission.lost_at <= begins
+    complete = complete_times(mission)
+    legs = legs_from(complete, at_start(complete), complete.phases)
+    abort = Aborts(complete, legs, gone if gone.any() else None).at(at)
+    assert abort.way, abort.reason
+    result = rf.simulate(mission)
+    assert result.complete
+    assert result.time[-1] == pytest.approx(abort.end, abs=1e-6)
+    left = [i for i in range(mission.n_agents) if i != lost]
+    r = result.position[result.time >= begins][:, left]
+    pairs = itertools.combinations(range(len(left)), 2)
+    apart = min(float(np.linalg.norm(r[:, i] - r[:, j], axis=1).min()) for i, j in pairs)
+    return apart - 0.3 - abort.least.separation
+
+
+def progress(begins: float, time: float, t: np.ndarray) -> np.ndarray:
+    """Time along the plan at times t [s], by quadrature of a rate that falls from 1 to 0 as a quintic blend."""
+    fine = np.linspace(begins, begins + time, 20_001)
+    x = (fine - begins) / time
+    rate = 1.0 - (10.0 * x**3 - 15.0 * x**4 + 6.0 * x**5)
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(fine))])
+    return begins + np.interp(t, fine, way)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_aborts_keep_their_promise_in_flight(seed: int) -> None:
+    """In wind, with one vehicle lost, the others stay as far apart as promised, by samples of their flight."""
+    assert flown_apart(seed) > -1e-9
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("first", range(0, 200, 20))
+def test_two_hundred_aborts_keep_their_promise_in_flight(first: int) -> None:
+    """Of 200 random missions in wind, with one vehicle lost, no abort is below its promise as flown."""
+    assert min(flown_apart(seed) for seed in range(first, first + 20)) > -1e-9
+
+
+@pytest.mark.parametrize("to", ["any", "own"])
+def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
+    """Samples of every second's abort come as near as proved, to a millimetre, and no nearer; all stand on places."""
+    aborts = aborts_of(show(to=to))
+    start = aborts.mission.fleet.position
+    i, j = np.triu_indices(len(start), 1)
+    for abort in aborts.every():
+        assert abort.way, abort.reason
+        r = abort.at(np.linspace(abort.begins, abort.end, 1500))
+        least = float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 2.0 * 0.15
+        proved = abort.least.separation
+        assert least >= proved - 1e-9
+        own = min(x.least.separation for x in abort.steps[1:]) if abort.steps[1:] else proved
+        if own == proved:  # not from the plan, whose other seconds count, too
+            assert least == pytest.approx(proved, abs=2e-3)
+        last = abort.steps[-1].end
+        order = np.linalg.norm(last[:, None, :2] - start[:, :2], axis=2).argmin(axis=1)
+        assert sorted(order) == list(range(len(start)))
+        planned = abort.way == "lands as planned"
+        assert to == "any" or planned or (order == np.arange(len(start))).all()
+        assert np.allclose(last[:, :2], start[order, :2], atol=0.01)
+
+
+def test_slowing_down_is_the_plan_at_another_clock() -> None:
+    """Vehicles that slow down are where the flight without an abort was, at the time along it by quadrature."""
+    mission = show()
+    plain = rf.simulate(mission, times=np.linspace(0.0, 24.0, 4801))
+    result = rf.simulate(show(at=19.0))
+    begins = 19.5
+    step = aborts_of(mission).at(19.0).steps[0]
+    during = (result.time >= begins) & (result.time <= begins + step.duration)
+    at = progress(begins, step.duration, result.time[during])
+    k = np.searchsorted(plain.time, at)
+    assert np.abs(plain.velocity[k]).max() > 0.5
+    share = (at - plain.time[k - 1]) / (plain.time[k] - plain.time[k - 1])
+    between = plain.position[k - 1] + share[:, None, None] * (
+        plain.position[k] - plain.position[k - 1]
+    )
+    assert np.abs(result.position[during] - between).max() < 1e-4
+
+
+@pytest.mark.parametrize(("to", "T"), [("any", 4.0), ("own", 16.0), ("own", 27.0)])
+def test_files_of_vehicles_are_what_is_flown(tmp_path: Path, to: str, T: float) -> None:
+    """A vehicle that knows its trajectory and its file flies as `run --abort-at` does, which passes its verdict."""
+    check_aborts(show(to=to, step=T)).write(tmp_path)
+    result = rf.simulate(show(to=to, at=T))
+    assert rf.assess(result).passed
+    plain = rf.simulate(show(to=to))
+    for i in (0, 7):
+        table = json.loads((tmp_path / f"vehicle-{i + 1:04d}.json").read_text())
+        abort = next(x for x in table["aborts"] if x["ordered_s"] == T)
+        begins, stops = abort["begins_s"], abort["stops_s"]
+        at = progress(begins, stops - begins, np.array([stops]))
+        place = np.array([np.interp(at, plain.time, plain.position[:, i, q])[0] for q in range(3)])
+        t = stops
+        for way in table["ways"][str(abort["ways"])]:
+            x = np.clip((result.time - t) / way["duration_s"], 0.0, 1.0)
+            during = (result.time >= t) & (result.time <= t + way["duration_s"])
+            s = 35 * x**4 - 84 * x**5 + 70 * x**6 - 20 * x**7
+            r = place + s[:, None] * (np.array(way["to_m"]) - place)
+            assert np.abs(result.position[during, i] - r[during]).max() < 5e-3
+            place, t = np.array(way["to_m"]), t + way["duration_s"]
+        assert t == pytest.approx(result.time[-1], abs=1e-6)
+
+
+def test_what_follows_if_one_does_not_hear() -> None:
+    """The nearest of a vehicle that flies on is that of a search of all vehicles, at fine samples."""
+    aborts = aborts_of(show())
+    plain = rf.simulate(aborts.mission, times=np.linspace(0.0, 24.0, 4801))
+    abort = aborts.at(7.0)
+    each = aborts.if_not_heard(abort)
+    told = min(each)
+    t = plain.time[(plain.time > abort.begins) & (plain.time < min(abort.end, 24.0))]
+    r, on = abort.at(t), plain.position[np.searchsorted(plain.time, t)]
+    n = aborts.mission.n_agents
+    best = np.full(n, np.inf)
+    for i in range(n):
+        far = np.linalg.norm(r - on[:, i, None], axis=2) - 0.3
+        best[i] = np.delete(far, i, axis=1).min()
+    assert told.time <= 24.0
+    assert told.separation == pytest.approx(best.min(), abs=0.02)
+    assert told.agents[0] == best.argmin()
+    assert np.allclose([x.separation for x in each], best, atol=0.05)
+    assert [x.agents[0] for x in each] == list(range(n))
+
+
+def test_levels_keep_who_is_above() -> None:
+    """Of two ways that cross as seen from above, levels differ; who is above at first has the higher level."""
+    rng = np.random.default_rng(4)
+    p, q = rng.uniform(0.0, 6.0, (30, 3)), rng.uniform(0.0, 12.0, (30, 3))
+    level = _levels(1.0, p, q)
+    s = np.linspace(0.0, 1.0, 2001)[:, None]
+    crossing = 0
+    for i, j in itertools.combinations(range(30), 2):
+        far = np.linalg.norm(((1 - s) * (p[i] - p[j]) + s * (q[i] - q[j]))[:, :2], axis=1)
+        if far.min() < 0.999:
+            crossing += 1
+            assert level[i] != level[j]
+        if far[0] < 0.999:
+            assert (level[i] > level[j]) == (p[i, 2] > p[j, 2])
+    assert crossing > 20
+
+
+def test_a_loss_may_send_the_others_home() -> None:
+    """With on_loss = "abort" those left land where vehicles stood, and nothing of the lost one counts."""
+    data = load_mission("change-of-picture").to_dict()
+    data["disturbances"] = {"lost": [{"agent": 5, "time": 9.0}], "on_loss": "abort"}
+    result = rf.simulate(Mission.from_dict(data))
+    assert rf.assess(result).passed
+    assert next(p.name for p in result.phases if "abort" in p.name) == "abort: slow down"
+    left = np.arange(12) != 4
+    end, start = result.position[-1][left], result.position[0]
+    order = np.linalg.norm(end[:, None, :2] - start[:, :2], axis=2).argmin(axis=1)
+    assert len(set(order)) == 11
+    assert np.abs(end - start[order]).max() < 0.01
+
+
+@pytest.mark.parametrize(("agents", "T"), [([3], 19.0), ([8, 9], 5.0)])
+def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
+    """Those that leave come down where the plan leads them; the others fly as without them; none come too near."""
+    mission = show(agents=agents, at=T)
+    plain, result = rf.simulate(show()), rf.simulate(mission)
+    assert rf.assess(result).passed
+    others = [i for i in range(12) if i + 1 not in agents]
+    last = plain.time[-1]
+    t = np.linspace(T, last - 1.5, 60)
+    for i in others:
+        for q in range(3):
+            a, b = (np.interp(t, x.time, x.position[:, i, q]) for x in (plain, result))
+            assert np.abs(a - b).max() < 1e-2
+    assert np.abs(result.position[-1] - plain.position[-1]).max() < 0.02
+    abort = aborts_of(mission).at(T)
+    i, j = np.triu_indices(12, 1)
+    r = abort.at(np.linspace(abort.begins, abort.end, 3000))
+    assert np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.3 >= abort.least.separation - 1e-9
+    away = abort.at(np.array([abort.stops]))[0] - r[0]
+    assert all(np.abs(away[k - 1]).max() > 0.01 for k in agents) or T < 10.0
+
+
+def test_what_stands_in_the_way_is_named() -> None:
+    """Without a ground, or with a roof over the places and none to go back to, there is no way, and it is said why."""
+    data = load_mission("change-of-picture").to_dict()
+    legs = {"obstacles": []}
+    data["phases"] = [p for p in data["phases"] if p["kind"] not in ("takeoff", "land")]
+    data["agents"]["position"] = [[x, y, 12.0] for x, y, _ in data["agents"]["position"]]
+    aborts = aborts_of(complete_times(Mission.from_dict(data | legs)))
+    abort = aborts.at(2.0)
+    assert not abort.way
+    assert "there is no ground to land on" in abort.reason
+    roof = {
+        "name": "roof",
+        "kind": "box",
+        "min": [-99, -99, 2.5],
+        "max": [99, 99, 3.0],
+        "zone": True,
+    }
+    mission = complete_times(Mission.from_dict(data | {"obstacles": [{"kind": "ground"}, roof]}))
+    abort = aborts_of(mission).at(2.0)
+    assert not abort.way
+    assert "'roof' stands in the way" in abort.reason
+
+
+def test_ways_home_stay_within_fences() -> None:
+    """Ways that lead through a closed area without its fence keep out of it with the fence, at dense samples."""
+    data = load_mission("change-of-picture").to_dict()
+    ring = [[3.0, -1.5], [6.0, -1.5], [6.0, 1.5], [3.0, 1.5]]
+    fence = {"name": "tent", "kind": "exclusion", "polygon": ring, "ceiling": 6.0}
+    entered = []
+    for fences in ([], [fence]):
+        more = {"fences": fences, "abort": {"to": "own"}}
+        aborts = aborts_of(complete_times(Mission.from_dict(data | more)))
+        entered.append(0)
+        for t in (21.0, 24.0, 28.0):
+            abort = aborts.at(t)
+            assert abort.way
+            x, y, z = np.moveaxis(abort.at(np.linspace(abort.begins, abort.end, 3000)), 2, 0)
+            entered[-1] += bool(((x > 3.0) & (x < 6.0) & (np.abs(y) < 1.5) & (z < 6.0)).any())
+    assert entered[0] > 0
+    assert entered[1] == 0
+
+
+def test_equal_stopped_places_are_planned_once() -> None:
+    """Orders while all hold share the number of their ways."""
+    aborts = aborts_of(show())
+    numbers = [aborts.at(t).number for t in (8.0, 8.25, 8.5, 8.75, 9.0)]
+    assert len(set(numbers)) < 5
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`check --abort` says from how many times there is a way home; --out is refused without it."""
+    assert main(["check", "change-of-picture", "--abort", "--out", str(tmp_path / "home")]) == 0
+    out = capsys.readouterr().out
+    assert "to any place" in out
+    assert "flies on" in out
+    table = json.loads((tmp_path / "home" / "aborts.json").read_text())
+    assert all(x["way"] for x in table["aborts"])
+    assert main(["check", "change-of-picture", "--out", str(tmp_path / "other")]) == 2
+    assert "Add --abort" in capsys.readouterr().err
+
+
+def test_vehicles_may_land_where_they_stood(tmp_path: Path) -> None:
+    """With places = "own" each vehicle lands where it stood; without, check, verdict and export tell who does not."""
+    data = load_mission("change-of-picture").to_dict()
+    data["phases"][3]["yaw_deg"] = 90.0
+    plain = Mission.from_dict(data)
+    words = "vehicles land where another one stood"
+    assert words in str([x.text for x in rf.check(plain).remarks])
+    result = rf.simulate(plain)
+    start, end = result.position[0], result.position[-1]
+    nearest = np.linalg.norm(end[:, None, :2] - start[:, :2], axis=2).argmin(axis=1)
+    others = int((nearest != np.arange(12)).sum())
+    assert f"{others} of 12 {words}" in str(rf.assess(result).notes)
+    result.save(tmp_path / "show.nc")
+    assert main(["export", str(tmp_path / "show.nc"), "--format", "setpoints"]) == 0
+    data["phases"][-1]["places"] = "own"
+    own = Mission.from_dict(data)
+    ahead, result = rf.check(own), rf.simulate(own)
+    assert ahead.passed
+    assert words not in str([x.text for x in ahead.remarks])
+    verdict = rf.assess(result)
+    assert verdict.passed
+    assert words not in str(verdict.notes)
+    assert np.abs(result.position[-1] - result.position[0])[:, :2].max() < 1e-6
+
+
+def test_a_landing_on_own_places_needs_time() -> None:
+    """Too short a duration is refused with the least one, which is then enough."""
+    data = load_mission("change-of-picture").to_dict()
+    data["phases"][-1] |= {"places": "own", "duration": 5.0}
+    with pytest.raises(rf.MissionError, match=r"the least is ([\d.]+) s") as error:
+        complete_times(Mission.from_dict(data))
+    words = str(error.value).partition("the least is ")[2]
+    data["phases"][-1]["duration"] = float(words.partition(" s")[0]) + 0.01
+    assert complete_times(Mission.from_dict(data)).phases[-1].lands
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("to", ["any", "own"])
+def test_a_thousand_come_home_from_every_second(to: str) -> None:
+    """Every second of show-1000 has a way home: to any place, and to the own ones."""
+    mission = load_mission("show-1000")
+    check = check_aborts(
+        complete_times(Mission.from_dict(mission.to_dict() | {"abort": {"to": to}}))
+    )
+    assert len(check.aborts) == 81
+    assert all(x.way for x in check.aborts)
+    assert check.least >= 0.8
