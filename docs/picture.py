@@ -143,4 +143,5 @@ if __name__ == "__main__":
     show()
     words()
     others()
+    drill()
     drawings()
