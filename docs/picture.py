@@ -5,6 +5,7 @@ A picture that looks as before is kept to the byte: the last digits of a simulat
 
 import io
 import re
+import runpy
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -82,6 +83,26 @@ def study() -> None:
     _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "gain-study")
 
 
+def radio() -> None:
+    """The map of the cube that is formed by messages, as its page flies it."""
+    mission = rf.load_mission(IMAGES.parents[1] / "examples" / "cube_by_radio.toml")
+    vary = ("network.loss = linspace(0, 0.95, 20)", "network.delay = linspace(0, 0.19, 20)")
+    with TemporaryDirectory() as folder:
+        table = fly(Sweep.of(mission, vary), folder, workers=2)
+        figure = map_over_two(table, ["network.delay", "network.loss"], "success")
+        assert figure is not None
+    _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "cube-by-radio")
+
+
+def own_laws() -> None:
+    """The figure of the example of laws of vehicles' own."""
+    with TemporaryDirectory() as folder:
+        runpy.run_path(str(IMAGES.parents[1] / "examples" / "own_distributed_law.py"))["main"](
+            folder
+        )
+        _save_with_few_colours(Path(folder) / "own-laws.png", "own-laws")
+
+
 def drill() -> None:
     """What the example of a drill bears."""
     sweep = Sweep.load(IMAGES.parents[1] / "examples" / "market_square.toml")
@@ -140,8 +161,10 @@ if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     flight()
     study()
+    radio()
     show()
     words()
     others()
+    own_laws()
     drill()
     drawings()

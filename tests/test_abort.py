@@ -279,6 +279,25 @@ def test_what_stands_in_the_way_is_named() -> None:
     assert "'roof' stands in the way" in abort.reason
 
 
+def test_ways_home_stay_within_fences() -> None:
+    """Ways that lead through a closed area without its fence keep out of it with the fence, at dense samples."""
+    data = load_mission("change-of-picture").to_dict()
+    ring = [[3.0, -1.5], [6.0, -1.5], [6.0, 1.5], [3.0, 1.5]]
+    fence = {"name": "tent", "kind": "exclusion", "polygon": ring, "ceiling": 6.0}
+    entered = []
+    for fences in ([], [fence]):
+        more = {"fences": fences, "abort": {"to": "own"}}
+        aborts = aborts_of(complete_times(Mission.from_dict(data | more)))
+        entered.append(0)
+        for t in (21.0, 24.0, 28.0):
+            abort = aborts.at(t)
+            assert abort.way
+            x, y, z = np.moveaxis(abort.at(np.linspace(abort.begins, abort.end, 3000)), 2, 0)
+            entered[-1] += bool(((x > 3.0) & (x < 6.0) & (np.abs(y) < 1.5) & (z < 6.0)).any())
+    assert entered[0] > 0
+    assert entered[1] == 0
+
+
 def test_equal_stopped_places_are_planned_once() -> None:
     """Orders while all hold share the number of their ways."""
     aborts = aborts_of(show())

@@ -331,7 +331,7 @@ def test_a_force_from_outside_is_not_proved():
         ({"avoidance": {"guard": False, "barrier": False}}, "neither guard nor barrier"),
         ({"vehicles": {"point": {"model": "point", "mass": 1.0}}}, "thrust_limit"),
         ({"vehicles": {"point": {"model": "point", "mass": 2.0, "thrust_limit": 19.0}}}, "nothing to brake with"),
-        ({"disturbances": {"links": {"rate": 50.0}}}, "links"),
+        ({"network": {"rate": 50.0}}, "network"),
         ({"avoidance": {"sensing_noise": 0.1}}, "sensing_range"),
         ({"disturbances": {"wind": [9.0, 0, 0]}, "vehicles": {
             "point": {"model": "point", "mass": 1.0, "thrust_limit": 12.0, "drag": 0.3}}}, "nothing to brake with"),

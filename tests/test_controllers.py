@@ -12,7 +12,7 @@ from vehicle_samples import rotorpy, rotorpy_derivative
 import rigidfleet as rf
 
 NOISE = {"position": 0.005, "velocity": 0.01, "delay": 0.03, "rate": 100.0, "dropped": 0.1}
-LINKS = {"delay": 0.03, "rate": 50.0}
+NETWORK = {"delay": 0.03, "rate": 50.0}
 SMALLER = {"shape": "triangle", "size": 3.5, "count": 3, "centre": [3.0, 5.0, 3.0]}
 TRIANGLE = {"triangle": {"shape": "triangle", "size": 4.0}}
 
@@ -142,16 +142,16 @@ def test_a_flight_observes_the_state_of_now(tables):
     "tables",
     [
         {"disturbances": {"noise": NOISE}},
-        {"disturbances": {"links": LINKS | {"lost": [{"between": [1, 2], "time": 1.0}]}}},
+        {"network": NETWORK | {"lost": [{"between": [1, 2], "time": 1.0}]}},
         {
-            "disturbances": {"links": LINKS | {"lost": [{"between": [1, 2], "time": 1.0}]}},
+            "network": NETWORK | {"lost": [{"between": [1, 2], "time": 1.0}]},
             "autopilot": {"delay_compensation": False},
         },
     ],
     ids=["noise", "lost link", "uncompensated"],
 )
 def test_to_observe_changes_no_bit(tables):
-    """A flight with stops at ticks that is looked at is that without, also where a lost link is presumed upon."""
+    """A flight with stops at ticks that is looked at is that without, also where a link is lost."""
     flight = rf.Flight(mission(**tables))
     while flight.begin():
         flight.observe()

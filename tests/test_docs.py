@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -214,6 +215,23 @@ def test_controller_page(capsys):
     assert "Passed" in calm
     misses = re.findall(r"missed, (\S+) m off", windy)
     assert [float(miss) for miss in misses] == pytest.approx([1 / 3, 1 / 3], abs=0.05)
+
+
+def test_own_laws_page(capsys):
+    """The law of the page fails, as it says; what it lists is all that a law knows; the environment steps."""
+    from rigidfleet.simulation.own_laws import View
+
+    text = page("own_laws.md")
+    names: dict[str, Any] = {}
+    for code in blocks(text, "python"):
+        exec(compile(code, "own_laws.md", "exec"), names)
+    assert capsys.readouterr().out.startswith("Failed")
+    listed = re.findall(
+        r"`(\w+)(?:\[j\])?`", " ".join(re.findall(r"^\| (`.*?) \|", text, re.MULTILINE))
+    )
+    assert sorted(listed) == sorted(View.__slots__)
+    assert set(names["rewards"]) == set(names["env"].agents)
+    assert names["result"].complete
 
 
 # -- sweep.md ----------------------------------------------------------------------------------------

@@ -312,6 +312,12 @@ def test_faults_that_are_flown_are_missions():
     """Wind is added to the forecast in any direction; losses are of different vehicles and links, within the flight."""
     data = rf.load_mission("change-of-picture").to_dict()
     data["disturbances"] = {"wind": [1.0, 2.0, 0.0], "lost": [{"agent": 3, "time": 5.0}]}
+    with pytest.raises(rf.SweepError, match=r"without \[network\], one law knows all states"):
+        Sweep.of(rf.Mission.from_dict(data), [], drill={"links": [5]})
+    agents = data["agents"]
+    vehicle = {"model": "point"} | {key: agents.pop(key) for key in ("mass", "thrust_limit")}
+    data |= {"vehicles": {"p": vehicle}, "network": {}}
+    agents["vehicle"] = "p"
     mission, n = rf.Mission.from_dict(data), 12
     sweep = Sweep.of(mission, [], drill={"wind": [4.0], "links": [5], "lost": [2]}, seed=3)
     assert sweep.runs == 3 * 20
@@ -320,7 +326,7 @@ def test_faults_that_are_flown_are_missions():
     assert np.allclose(np.linalg.norm(winds, axis=1), 4.0)
     assert all((np.array(winds)[:, axis] * sign).max() > 2 for axis in (0, 1) for sign in (1, -1))
     for k in range(1, 60, 3):
-        links = sweep.varied(k)["disturbances"]["links"]["lost"]
+        links = sweep.varied(k)["network"]["lost"]
         pairs = {tuple(sorted(each["between"])) for each in links}
         assert len(pairs) == 5
         assert all(1 <= i < j <= n for i, j in pairs)

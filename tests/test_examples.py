@@ -97,3 +97,14 @@ def test_step_by_step(example, capsys):
     assert [phase.kind for phase in result.phases] == ["establish", "fly", "fly"]
     assert result.phases[1].target is None
     assert assess(result).passed
+
+
+@pytest.mark.parametrize("example", ["own_distributed_law"], indirect=True)
+def test_own_distributed_law(example, tmp_path):
+    """A squall takes one vehicle: whoever hears of it waits, with three in ten messages lost as well as with all."""
+    errors = example.main(tmp_path)
+    assert errors["each alone", 0.3] > 1.0
+    for name in ("consensus", "gradient", "built-in"):
+        assert errors[name, 0.3] < 0.5 * errors["each alone", 0.3]
+        assert errors[name, 0.3] == pytest.approx(errors[name, 0.0], rel=0.15)
+    assert (tmp_path / "own-laws.png").stat().st_size > 10_000

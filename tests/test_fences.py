@@ -1,7 +1,9 @@
 """Fences and people: distances from polygons, falls, files of polygons, and how flights beside them are judged."""
 
+import hashlib
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from rigidfleet.math.bernstein import greatest_of
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
+from rigidfleet.reporting import html_page
 from rigidfleet.simulation.together import simulate_together
 from rigidfleet.solids.polygons import Region, crossing
 
@@ -284,6 +287,27 @@ def test_records_keep_their_fences(tmp_path):
     result.save(tmp_path / "a.nc")
     again = rf.assess(rf.Result.load(tmp_path / "a.nc"))
     assert [c.message for c in again.checks] == [c.message for c in rf.assess(result).checks]
+
+
+def test_the_first_page_is_for_those_who_decide():
+    """Before the safety table: what is planned, proved, rehearsed, how it is aborted, where things fall, digests."""
+    people = [{"name": "stand", "polygon": square(18, 4)}]
+    wind = {"wind": [3.0, 4.0, 0.0], "drag": 0.3}
+    mission = rf.Mission.from_dict(beside(people=people, disturbances=wind))
+    result = rf.simulate(mission)
+    drilled = ["Two seconds late, no two vehicles touch."]
+    text = html_page(result, rehearsed=drilled, abort=["Every second has a way home."])
+    first = re.sub(r"<[^>]+>", " ", text.split("<main>")[1].split("<h2>Safety")[0])
+    for words in (
+        "3 vehicles fly for 7.5 s", *drilled, "Every second has a way home.", "wind of 5 m/s",
+        "from people in &#39;stand&#39; if it fails at",
+        hashlib.sha256(result.mission_text.encode()).hexdigest(),
+    ):  # fmt: skip
+        assert words in first
+    falls_at = boundaries.Boundaries(mission).landings(*states(result), 0.0)
+    low, high = falls_at.min(axis=(0, 1)), falls_at.max(axis=(0, 1))
+    assert f"x = {low[0]:.1f} and {high[0]:.1f} m, y = {low[1]:.1f} and {high[1]:.1f} m" in first
+    assert "No drill belongs to this report." in html_page(result)
 
 
 # -- degrees and files -------------------------------------------------------------------------------

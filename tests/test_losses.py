@@ -407,8 +407,8 @@ def test_reports_show_the_phases_flown(tmp_path):
 
 # -- links and quadrotors -----------------------------------------------------------------------------
 
-LINKS = {"delay": 0.02, "rate": 50.0}
-CUT = {"links": LINKS | {"lost": [{"between": [3, 1], "time": 8.0}]}}
+NETWORK = {"delay": 0.02, "rate": 50.0}
+CUT = NETWORK | {"lost": [{"between": [3, 1], "time": 8.0}]}
 
 
 @pytest.mark.parametrize("on_loss", ["hold", "land"])
@@ -428,8 +428,8 @@ def test_quadrotors_hold_or_land(on_loss):
 
 def test_a_lost_link_drops_its_edge():
     """No force acts along it after the loss; the others hold the shape, and the verdict says what happened."""
-    result = simulate(rotors(CUT))
-    whole = simulate(rotors({"links": LINKS}))
+    result = simulate(rotors({}, network=CUT))
+    whole = simulate(rotors({}, network=NETWORK))
     k = result.edges.tolist().index([0, 2])
     after = result.time > 8.0
     assert np.isfinite(result.multiplier[~after][:, k]).all()
@@ -457,7 +457,7 @@ def test_without_a_link_states_of_the_other_do_not_count(monkeypatch):
         "agents": {"vehicle": "drone", "position": [[0.0, 0, 5], [4.0, 0, 5]]},
         "formations": {"square": {"shape": "line", "size": 4.0}},
     }
-    cut = {"links": LINKS | {"lost": [{"between": [1, 2], "time": 6.0}]}}
+    cut = NETWORK | {"lost": [{"between": [1, 2], "time": 6.0}]}
     ways = []
     for strength in (0.0, 3.0):
 
@@ -466,14 +466,14 @@ def test_without_a_link_states_of_the_other_do_not_count(monkeypatch):
             force[1, 0] = strength * np.clip(t - 6.5, 0.0, 1.0)
             return force
 
-        ways.append(simulate(rotors(cut, **pair), force=push))
+        ways.append(simulate(rotors({}, network=cut, **pair), force=push))
     assert np.abs(ways[0].position[-1, 1] - ways[1].position[-1, 1]).max() > 0.1
     np.testing.assert_array_equal(ways[0].position[:, 0], ways[1].position[:, 0])
 
 
 def test_without_a_link_a_common_lag_costs_no_force():
-    """Vehicles that lag by 0.5 m, all alike, presume this lag of each other, too: the forces stay what they were."""
-    cut, whole = (simulate(rotors(d, tracking={})) for d in (CUT, {"links": LINKS}))
+    """Vehicles that lag by 0.5 m, all alike, keep the forces that they had with the link."""
+    cut, whole = (simulate(rotors({}, network=d, tracking={})) for d in (CUT, NETWORK))
     lag = np.linalg.norm(cut.position - cut.slot_position, axis=2)
     assert np.nanmax(lag) > 0.4
     forces = [r.extreme("constraint_force") for r in (cut, whole)]
@@ -485,7 +485,7 @@ def test_without_a_link_a_common_lag_costs_no_force():
 @pytest.mark.parametrize("on_loss", ["hold", "land"])
 def test_the_loss_of_a_link_is_answered(on_loss):
     """As for a vehicle; all four go on together."""
-    result = simulate(rotors(CUT | {"on_loss": on_loss}))
+    result = simulate(rotors({"on_loss": on_loss}, network=CUT))
     assert names(result)[1:] == ["fly 2", "brake (loss)", f"{on_loss} (loss)"]
     assert max(jumps(result, 8.0, [0, 1, 2, 3])) < 1e-9
     verdict = assess(result)
@@ -516,7 +516,7 @@ def test_check_follows_the_way_after_the_loss():
 
 def test_check_tells_what_a_link_does_to_rigidity():
     """A square of all pairs that loses a diagonal keeps 5 edges, which in the plane are just enough."""
-    found = check(rotors(CUT), search=False)
+    found = check(rotors({}, network=CUT), search=False)
     (told,) = [r.text for r in found.remarks if r.topic == "loss"]
     assert told.startswith("without the lost links (1-3 at 8 s), 'square' has 5 of 6 edges: ")
     assert "5 of 6 independent distances" in told
@@ -539,7 +539,7 @@ def test_check_tells_what_a_link_does_to_rigidity():
              "phases": [PHASES[0], {"kind": "hold", "control": "open", "duration": 9.0}]},
             "phases[2].control", "only tracked slots can brake",
         ),
-        ({"disturbances": CUT}, "disturbances.links", "needs sampled control"),
+        ({"network": CUT}, "network", "needs sampled control"),
         ({"phases": [*PHASES, {"kind": "brake", "settle": {}}]}, "phases[4].settle", "needs a time of arrival"),
         (
             {"phases": [*PHASES, {"kind": "brake", "duration": 2.0, "travel": 3.0}]}, "phases[4].travel",
@@ -561,30 +561,20 @@ def test_what_cannot_be_is_refused(change, key, words):
 @pytest.mark.parametrize(
     ("lost", "key", "words"),
     [
-        ([{"between": [1, 5], "time": 8.0}], "disturbances.links.lost[1].between", "no such agent"),
-        ([{"between": [2, 2], "time": 8.0}], "disturbances.links.lost[1].between", "to itself"),
-        ([{"between": [1, 2], "time": 8.0}, {"between": [2, 1], "time": 9.0}], "disturbances.links.lost[2].between",
+        ([{"between": [1, 5], "time": 8.0}], "network.lost[1].between", "no such agent"),
+        ([{"between": [2, 2], "time": 8.0}], "network.lost[1].between", "to itself"),
+        ([{"between": [1, 2], "time": 8.0}, {"between": [2, 1], "time": 9.0}], "network.lost[2].between",
          "lost twice"),
-        ([{"between": [1, 2], "time": 88.0}], "disturbances.links.lost[1].time", "is not before the end"),
+        ([{"between": [1, 2], "time": 88.0}], "network.lost[1].time", "is not before the end"),
     ],
 )  # fmt: skip
 def test_wrong_links_are_refused(lost, key, words):
     """Agents that do not exist, the same one twice, the same link twice, or too late."""
     with pytest.raises(MissionError) as refused:
-        rotors({"links": LINKS | {"lost": lost}})
+        rotors({}, network=NETWORK | {"lost": lost})
     (finding,) = refused.value.findings
     assert finding.key == key
     assert words in finding.problem
-
-
-def test_links_are_lost_where_slots_are_tracked():
-    """Without slots, vehicles would know nothing to put in place of what they do not hear."""
-    phases = [PHASES[0], {"kind": "hold", "control": "open", "duration": 9.0}]
-    with pytest.raises(MissionError) as refused:
-        rotors(CUT, phases=phases)
-    (finding,) = refused.value.findings
-    assert finding.key == "phases[2].control"
-    assert "so the slots must be tracked" in finding.problem
 
 
 def test_kinds_of_their_own():

@@ -30,6 +30,7 @@ SHIPPED = [
     "bridge-inspection",
     "change-of-picture",
     "crazyflies",
+    "cube-by-neighbours",
     "cube-passage",
     "cube-passage-quadrotors",
     "cube-waypoint",
@@ -44,6 +45,7 @@ SHIPPED = [
     "hexagon",
     "hill-search",
     "line-singular",
+    "lossy-passage",
     "moving-obstacles",
     "narrow-passage",
     "narrow-passage-found",
@@ -144,8 +146,10 @@ def test_shipped_mission_is_in_order(name):
     assert mission.source or name in (
         "show-1000",
         "crazyflies",
+        "cube-by-neighbours",
         "delayed",
         "downwash-cube",
+        "lossy-passage",
         "moving-obstacles",
         *SCENES,
     )

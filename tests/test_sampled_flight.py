@@ -67,13 +67,11 @@ def everything(rows: int = 0) -> tuple[Any, ...]:
             wind=np.array([1.0, -2.0, 0.3]), gust=rng.normal(size=(9, n, 3)), gust_step=0.1, downwash=True,
             ground_effect=True, floor=np.full(n, 0.5),
         ),
-        sensing=fleet.Sensing(
-            3, rng.integers(0, 9, n), True, 5, rng.integers(0, 30, (n, n)), np.zeros((0, 2), dtype=np.int64)
-        ),
+        sensing=fleet.Sensing(3, rng.integers(0, 9, n)),
         guidance=fleet.Guidance(np.full(n, 0.8), np.full((n, 3), 0.3)),
         tables=fleet.TickInputs(
             0, K, rng.normal(size=(K, n, 6)), yaw, 0.5 * small[0], small[1], 0.01 * small[2, ::3], 0.02 * small[3, ::3],
-            rng.random((84, n)) < 0.1, rng.random((50, n, n)) < 0.2,
+            rng.random((84, n)) < 0.1,
         ),
     )  # fmt: skip
     S = fleet.hovering(vehicles, load_mission("cube-passage").agents.position, np.zeros((n, 3)))
@@ -103,7 +101,6 @@ def test_a_pause_changes_no_bit():
                 name: getattr(tables, name)[first // 3 :]
                 for name in ("noise_r", "noise_v", "dropped")
             }
-            cut |= {"unheard": tables.unheard[first // 5 :]}
             chunk = rest | {k: np.ascontiguousarray(v) for k, v in cut.items()}
         flight = flight._replace(tables=tables._replace(**chunk))
         call = call._replace(max_steps=int(rng.integers(1, 40)))
@@ -253,82 +250,6 @@ def test_measurements_are_late_noisy_and_rare():
             np.testing.assert_allclose(call.seen[k + 1, i], expected, rtol=0, atol=1e-13)
 
 
-def test_messages_at_once_are_shared_knowledge():
-    """Links without delay and loss make the same flight as one law for all."""
-    ends = []
-    for linked in (False, True):
-        problem, work, flight, state = planned("cube-passage", 1, SIH)
-        flight = flight._replace(sensing=flight.sensing._replace(linked=linked))
-        state = fleet.begin(flight, state.S, work)
-        fly(problem, work, flight, state, flight.start + 1.0)
-        assert len(state.heard) == len(state.integral) - (not linked) == 8 * linked
-        ends.append(state)
-    np.testing.assert_allclose(ends[1].S, ends[0].S, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(
-        ends[1].integral, np.tile(ends[0].integral, (8, 1)), rtol=0, atol=1e-12
-    )
-
-
-def test_vehicles_know_others_as_they_were():
-    """Over links of 20 ms, each vehicle's force is that of the law for its own state and the others' of 20 ms ago."""
-    problem, work, flight, state = planned("cube-passage", 1, SIH)
-    late = np.full((8, 8), 10)
-    flight = flight._replace(sensing=flight.sensing._replace(linked=True, link_delay=late))
-    state = fleet.begin(flight, state.S, work)
-    times = np.asarray(flight.start + 2e-3 * np.arange(301))
-    call = fly(problem, work, flight, state, times[-1], times)
-    k = 299
-    for i in range(8):
-        known = call.S[k - 10, :, :6].copy()
-        known[i] = call.S[k, i, :6]
-        np.testing.assert_allclose(state.heard[i], known, rtol=0, atol=1e-13)
-    known = call.S[k - 10, :, :6].copy()
-    known[0] = call.S[k, 0, :6]
-    y = np.concatenate([known[:, :3].ravel(), known[:, 3:].ravel(), call.integral[k]])
-    law = native.record(problem, work, times[k : k + 1], y[None])
-    np.testing.assert_allclose(state.f_C[0], law.f_C[0, 0], rtol=0, atol=1e-12)
-    assert np.linalg.norm(state.f_C[0]) > 1e-3
-
-
-def test_messages_that_are_lost():
-    """A vehicle that hears nothing of another one keeps its last message."""
-    problem, work, flight, state = planned("cube-passage", 1, SIH)
-    unheard = np.zeros((100, 8, 8), dtype=np.bool_)
-    unheard[40:, 2, 6] = True
-    flight = flight._replace(
-        sensing=flight.sensing._replace(linked=True),
-        tables=flight.tables._replace(last=100, unheard=unheard),
-    )
-    state = fleet.begin(flight, state.S, work)
-    times = np.asarray(flight.start + 2e-3 * np.arange(101))
-    call = fly(problem, work, flight, state, times[-1], times)
-    np.testing.assert_allclose(state.heard[2, 6], call.S[39, 6, :6], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(state.heard[3, 6], call.S[99, 6, :6], rtol=0, atol=1e-14)
-
-
-def test_without_a_link_a_vehicle_presumes_the_other():
-    """It takes the other one to be as far off its slot as it is itself, and hears nothing of where that is."""
-    problem, work, flight, state = planned("cube-passage", 1, SIH)
-    pair = np.array([[0, 1]])
-    flight = flight._replace(sensing=flight.sensing._replace(linked=True, parted=pair))
-    state = fleet.begin(flight, state.S, work)
-    times = np.asarray(flight.start + 2e-3 * np.arange(301))
-    y = np.concatenate([state.S[:, :3].ravel(), state.S[:, 3:6].ravel(), state.integral[0]])
-    native.record(
-        problem, work, times[:1], y[None]
-    )  # what is presumed begins with the slots in `work`
-    call = fly(problem, work, flight, state, times[-1], times)
-    k = 299
-    S = call.S[k, :, :6]
-    y = np.concatenate([S[:, :3].ravel(), S[:, 3:].ravel(), call.integral[k]])
-    slots = native.record(problem, work, times[k : k + 1], y[None]).r_ref[0]
-    for i, j in ((0, 1), (1, 0)):
-        presumed = S[i, :3] + slots[j] - slots[i]
-        np.testing.assert_allclose(state.heard[i, j, :3], presumed, rtol=0, atol=1e-8)
-        assert np.abs(presumed - S[j, :3]).max() > 1e-5
-    np.testing.assert_allclose(state.heard[2, 1], S[1], rtol=0, atol=1e-13)
-
-
 def test_a_law_at_a_slower_rate_holds_its_force():
     """Between evaluations of the law, desired forces are held."""
     given = planned("cube-passage", 1, SIH, every=5)
@@ -396,11 +317,11 @@ def test_the_integral_waits_while_a_vehicle_saturates():
     assert state.saturations.tolist() == [250 * w for w in weak]
     frozen = weak[problem.graph.edges].any(axis=1)
     first = (
-        np.abs(state.integral[0]) <= np.abs(2e-3 * work.c).max()
+        np.abs(state.integral) <= np.abs(2e-3 * work.c).max()
     )  # the first tick knows nothing yet
     assert 0 < frozen.sum() < len(frozen)
     assert first[frozen].all()
-    assert (state.integral[0][~frozen] != 0).all()
+    assert (state.integral[~frozen] != 0).all()
 
 
 def test_the_body_law_and_its_frame():

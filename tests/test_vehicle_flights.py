@@ -175,13 +175,14 @@ NOISY = {
     "wind": [3.0, 1.0, 0.0],
     "mass_error": [0.02, 0.0, -0.02],
 }
-LINKS = {"delay": 0.03, "rate": 50.0, "dropped": 0.2}
+NETWORK = {"delay": 0.03, "rate": 50.0, "loss": 0.2, "jitter": 0.02}
 
 
-@pytest.mark.parametrize("disturbances", [None, NOISY, NOISY | {"links": LINKS}])
-def test_flights_repeat_bit_for_bit(disturbances):
+@pytest.mark.parametrize(
+    "tables", [{}, {"disturbances": NOISY}, {"disturbances": NOISY, "network": NETWORK}]
+)
+def test_flights_repeat_bit_for_bit(tables):
     """The same mission flies the same bits; other samples are those of the same flight."""
-    tables = {} if disturbances is None else {"disturbances": disturbances}
     first, again = (rf.simulate(short(**tables)) for _ in range(2))
     assert first.position.tobytes() == again.position.tobytes()
     coarse = rf.simulate(short(**tables, output_step=0.5))

@@ -114,7 +114,7 @@ def test_what_a_mission_may_not_say(vehicles, changes, words):
         ({"tracking": {"drag_feedforward": True}}, "tracking.drag_feedforward"),
         ({"disturbances": {"noise": {"delay": 0.02}}}, "disturbances.noise.delay"),
         ({"disturbances": {"noise": {"position": 0.01, "dropped": 0.1}}}, "noise.dropped"),
-        ({"disturbances": {"links": {"delay": 0.05}}}, "disturbances.links"),
+        ({"network": {"delay": 0.05}}, "network"),
         ({"autopilot": {"rate": 100.0}}, "autopilot"),
     ],
 )

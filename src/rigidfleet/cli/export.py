@@ -48,7 +48,6 @@ def export(
     from rigidfleet.assessment import assess
     from rigidfleet.interchange import export as write
     from rigidfleet.interchange import format_of
-    from rigidfleet.mission.describe import landings_in_words
     from rigidfleet.result import as_result
 
     try:
@@ -69,7 +68,7 @@ def export(
         made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)  # ty: ignore[invalid-argument-type]
     except ValueError as error:
         raise RigidfleetError(f"{error}.") from None
-    if words := landings_in_words(flight.mission, flight.position[-1]):
+    if words := flight.mission.landings_in_words(flight.position[-1]):
         console.warn(f"{words}.")
     console.out().print(f"{made}\nExport   {path}", soft_wrap=True)
     return PASSED

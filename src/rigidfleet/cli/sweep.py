@@ -38,6 +38,7 @@ def sweep(
     random_numbers: Literal["shared", "own"] | None = None,
     controller: str | None = None,
     rate: float | None = None,
+    agent: str | None = None,
     workers: Annotated[int | None, Parameter(converter=exact)] = None,
     cluster: str | None = None,
     shard: str = "",
@@ -89,6 +90,8 @@ def sweep(
         object.
     rate : float
         Calls of the controller per second [Hz]. Default: 50.
+    agent : str
+        Law of each vehicle's own, MODULE:NAME, for missions with [network].
     workers : int
         Number of processes on this machine. Default: number of cores.
     cluster : str
@@ -128,7 +131,7 @@ def sweep(
     else:
         keys = {
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
-            "controller": controller, "rate": rate, "drill": {} if drill else None,
+            "controller": controller, "rate": rate, "agent": agent, "drill": {} if drill else None,
         }  # fmt: skip
         limits = {"separation": separation, "radius": radius}
         definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys, limits)

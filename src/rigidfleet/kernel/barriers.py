@@ -68,7 +68,7 @@ def loosen(p, w, state, a):
             state.force[i, q] -= force
             state.force[j, q] += force
         if not (state.saturated[i] or state.saturated[j]):
-            state.integral[0, e] -= free * a.period * w.c[e]
+            state.integral[e] -= free * a.period * w.c[e]
 
 
 @jit

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
 from rigidfleet.solids.records import Solids, join
@@ -19,13 +20,14 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
 STATES = 17
-#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors.
-FORCE, ATTITUDE, ROTORS = range(3)
+#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors;
+#: forces by laws of their own, which the flight asks for.
+FORCE, ATTITUDE, ROTORS, OWN = range(4)
 #: Places in `SampledState.clock`: the time, and that of the last evaluation of the law [s].
 TIME, LAW_TIME = range(2)
 #: Places in `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
-#: written, steps in the trail.
-STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
+#: written, steps in the trail, ticks up to which own laws have answered.
+STEPS, TICKS, LAWS, SAMPLES, TRAILED, ANSWERED = range(6)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
 #: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
 UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
@@ -165,18 +167,10 @@ class Air(NamedTuple):
 
 
 class Sensing(NamedTuple):
-    """What the formation law knows; attitude, rates and rotor speeds are known to each vehicle at once.
-
-    If ``linked``, vehicle i knows the others by messages of what they have measured, and its forces are those of a law
-    evaluated for what it knows. Otherwise all measured states are known to one law.
-    """
+    """What the formation law knows; attitude, rates and rotor speeds are known to each vehicle at once."""
 
     every: int  # attitude ticks between measurements
     delay: Ints  # (N,) attitude ticks from a state to its measurement
-    linked: bool
-    link_every: int  # attitude ticks between messages
-    link_delay: Ints  # (N, N) attitude ticks from a measurement of j to its arrival at i, by [i, j]
-    parted: Ints  # (P, 2) pairs without a link for good; see `sampled_flight.presume`
 
 
 class Guidance(NamedTuple):
@@ -192,8 +186,8 @@ class Guidance(NamedTuple):
 class TickInputs(NamedTuple):
     """Values for attitude ticks from ``first`` to before ``last``, where the flight pauses for the next ones.
 
-    A table without rows stands for zeros, or for nothing dropped. K = last - first ticks. A measurement or message
-    takes place at multiples of `Sensing.every` or `Sensing.link_every`; their tables have a row for each.
+    A table without rows stands for zeros, or for nothing dropped. K = last - first ticks. A measurement takes place
+    at multiples of `Sensing.every`; its tables have a row for each.
     """
 
     first: int
@@ -205,7 +199,6 @@ class TickInputs(NamedTuple):
     noise_r: Floats  # (K', N, 3) of measurements [m]
     noise_v: Floats  # (K', N, 3) [m/s]
     dropped: Bools  # (K', N) measurements that fail
-    unheard: Bools  # (K'', N, N) messages of j that do not reach i, by [i, j]
 
 
 class Commands(NamedTuple):
@@ -224,6 +217,7 @@ class SampledFlight(NamedTuple):
     vehicles: Quadrotors
     air: Air
     sensing: Sensing
+    network: Links  # how vehicles know each other
     guidance: Guidance
     tables: TickInputs
     commands: Commands
@@ -241,8 +235,10 @@ class SampledState(NamedTuple):
 
     S: Floats  # (N, 17) true states
     clock: Floats  # (2,) see `TIME`
-    count: Ints  # (5,) see `STEPS`
-    integral: Floats  # (1, m) of the constraints [m s]; (N, m) if linked
+    count: Ints  # (6,) see `STEPS`
+    integral: (
+        Floats  # (m,) of the constraints [m s]; with a network, the mean of what both ends hold
+    )
     frame: Floats  # (3, 4) mean-axis quaternion at the last evaluation, its rate, the one before
     error: Floats  # (N, 3) integral of the tracking error [m s]
     f_u: Floats  # (N, 3) input force of the law, held [N]
@@ -254,8 +250,7 @@ class SampledState(NamedTuple):
     layers: Ints  # (N,) of avoidance that have acted at the last tick; see `avoidance.ACTS`
     seen: Floats  # (N, 6) measured r, v
     history: Floats  # (D, N, 6) true r, v of the last ticks
-    sent: Floats  # (D, N, 6) measured ones
-    heard: Floats  # (N, N, 6) what i knows of j, if linked; else without rows
+    mail: Mail
     peak: Floats  # (N, 4) greatest thrust of each rotor [N]
     peak_time: Floats  # (N, 4) [s]
     worst: Floats  # (N, 7) see `UPRIGHT`
@@ -298,8 +293,9 @@ class SampledSegment(NamedTuple):
     air: Floats  # (K, N, 3) velocity of the air [m/s]
     saturated: Bools  # (K, N)
     layers: Ints  # (K, N)
-    integral: Floats  # (K, m) of the constraints, of the first vehicle's view if linked
+    integral: Floats  # (K, m) of the constraints
     frame: Floats  # (K, 4)
+    stamp: Ints  # (K, L) tick at which the newest message of each link was sent
 
 
 class Evaluation(NamedTuple):
@@ -376,10 +372,7 @@ def still_air(n: int) -> Air:
 
 def exact_sensing(n: int) -> Sensing:
     """States that are known exactly and at once."""
-    nobody = np.zeros((0, 2), dtype=np.int64)
-    return Sensing(
-        1, np.zeros(n, dtype=np.int64), False, 1, np.zeros((n, n), dtype=np.int64), nobody
-    )
+    return Sensing(1, np.zeros(n, dtype=np.int64))
 
 
 def no_tables(n: int) -> TickInputs:
@@ -387,7 +380,6 @@ def no_tables(n: int) -> TickInputs:
     none = np.zeros((0, n, 3))
     return TickInputs(
         0, ENDLESS, np.zeros((0, n, 6)), none, none, none, none, none, np.zeros((0, n), dtype=np.bool_),
-        np.zeros((0, n, n), dtype=np.bool_),
     )  # fmt: skip
 
 
@@ -404,7 +396,7 @@ def flight(
     """A flight in still air with exact sensing; see `SampledFlight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
     return SampledFlight(
-        vehicles, still_air(n), exact_sensing(n), Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n),
+        vehicles, still_air(n), exact_sensing(n), no_network(n), Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n),
         no_commands(n), start, h, steps, every,
     )  # fmt: skip
 
@@ -430,11 +422,14 @@ def begin(
     *,
     frame: Floats | None = None,
     rows: int = 0,
+    iterations: int = 1,
 ) -> SampledState:
-    """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail."""
+    """State of a flight at its start, from states ``S`` (N, 17); ``rows`` steps fit into the trail.
+
+    With a network, the constraint law has some ``iterations``.
+    """
     n, m = len(S), len(workspace.c)
-    sensing = flight.sensing
-    depth = 1 + int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
+    depth = 1 + int(flight.sensing.delay.max())
     known = np.ascontiguousarray(S[:, :6])
     past = np.tile(known, (depth, 1, 1))
     attitude = _frame(frame)
@@ -443,17 +438,19 @@ def begin(
     worst = np.zeros((n, VERTICAL + 1))
     worst[:, UPRIGHT] = 1.0 - 2.0 * (S[:, 7:9] ** 2).sum(axis=1)
     times = np.full(worst.shape, flight.start)
+    mail = empty_mail(flight.network, iterations)
+    mail.estimate[:, :3] = S[: len(mail.estimate), 3:6]
     trail = NO_TRAIL
     if rows:
         none = np.zeros(0)
         trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
-        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
-        integral=np.zeros((n if sensing.linked else 1, m)), frame=attitude, error=np.zeros((n, 3)),
+        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(ANSWERED + 1, dtype=np.int64),
+        integral=np.zeros(m), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
-        layers=np.zeros(n, dtype=np.int64), seen=known, history=past, sent=past.copy(),
-        heard=np.tile(known, (n if sensing.linked else 0, 1, 1)), peak=peak, peak_time=times[:, :4].copy(),
+        layers=np.zeros(n, dtype=np.int64), seen=known, history=past,
+        mail=mail, peak=peak, peak_time=times[:, :4].copy(),
         worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
         work=_work(n, m),
     )  # fmt: skip
@@ -468,9 +465,9 @@ def under_problem(
     the new one and must not be used further.
     """
     state.clock[LAW_TIME], state.count[LAWS] = state.clock[TIME], 0
-    views, n = len(state.integral), len(state.S)
+    n = len(state.S)
     return state._replace(
-        integral=np.tile(np.asarray(integral, dtype=float), (views, 1)), frame=_frame(frame),
+        integral=np.array(integral, dtype=float), frame=_frame(frame),
         work=_work(n, len(workspace.c)),
     )  # fmt: skip
 
@@ -491,13 +488,14 @@ def _work(n: int, m: int) -> SampledWork:
 
 
 def segment(
-    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS
+    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS, links: int = 0
 ) -> SampledSegment:
-    """A flight to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
+    """A flight of n vehicles with m edges to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
     at = np.ascontiguousarray(times, dtype=float)
     k = len(at)
     return SampledSegment(
         t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
         np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
         np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, m)), np.empty((k, 4)),
+        np.empty((k, links), dtype=np.int64),
     )  # fmt: skip

@@ -12,8 +12,10 @@ from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
+from rigidfleet.kernel.control import local_law
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
+    ANSWERED,
     CONSTRAINT_FORCE,
     ERROR,
     FORCE,
@@ -21,6 +23,7 @@ from rigidfleet.kernel.fleet import (
     LAW_TIME,
     LAWS,
     LOAD,
+    OWN,
     SAMPLES,
     STEPS,
     TICKS,
@@ -31,9 +34,18 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
-from rigidfleet.kernel.problem import TRACKING
+from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
+from rigidfleet.kernel.neighbours import (
+    bring_forward,
+    estimate_acceleration,
+    hold_edges,
+    solve_own_edges,
+)
+from rigidfleet.kernel.network import receive, send
+from rigidfleet.kernel.problem import SHAPE, TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
-from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
     mean_axes,
@@ -66,7 +78,7 @@ def path_at(k, i, q, tables):
 
 @jit
 def measure(k, flight, state):
-    """Measured states of all vehicles at tick k, into ``state.seen`` and, if vehicles are linked, ``state.heard``.
+    """Measured states of all vehicles at tick k, into ``state.seen``.
 
     States are kept as what they differ from a path by. A state that is old when it is used is then added to the path of
     now, not of then: a measurement that carries its time.
@@ -87,26 +99,6 @@ def measure(k, flight, state):
                 r, v = state.history[then, i, q], state.history[then, i, 3 + q]
                 state.seen[i, q] = r + (tables.noise_r[u, i, q] if noisy else 0.0)
                 state.seen[i, 3 + q] = v + (tables.noise_v[u, i, q] if noisy else 0.0)
-    if sensing.linked:
-        listen(k, flight, state)
-
-
-@jit
-def listen(k, flight, state):
-    """Messages that arrive at tick k: what vehicle i knows of the others, into ``state.heard[i]``."""
-    sensing, tables, depth = flight.sensing, flight.tables, state.sent.shape[0]
-    n, now = state.S.shape[0], k % depth
-    heard, u = k % sensing.link_every == 0, row_of(k, sensing.link_every, tables.first)
-    for j in range(n):
-        for q in range(6):
-            state.sent[now, j, q] = state.heard[j, j, q] = state.seen[j, q]
-    for i in range(n):
-        for j in range(n):
-            if not heard or i == j or (tables.unheard.shape[0] > 0 and tables.unheard[u, i, j]):
-                continue
-            then = (k - sensing.link_delay[i, j]) % depth
-            for q in range(6):
-                state.heard[i, j, q] = state.sent[then, j, q]
 
 
 # -- the formation law ---------------------------------------------------------------------------------
@@ -163,8 +155,8 @@ def expect_drag(i, v, share, vehicles, state):
 
 @jit
 def take_force(k, i, dt, p, w, flight, state):
-    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
-    vehicles, guidance = flight.vehicles, flight.guidance
+    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it, if it is not its own."""
+    vehicles, guidance, own = flight.vehicles, flight.guidance, flight.commands.kind == OWN
     m, pull = p.vehicles.m[i], 0.0
     for q in range(3):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
@@ -173,9 +165,9 @@ def take_force(k, i, dt, p, w, flight, state):
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
-        if guidance.drag[i] > 0.0:
+        if guidance.drag[i] > 0.0 and not own:
             expect_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
-        for q in range(3):
+        for q in range(0 if own else 3):
             if not state.saturated[i]:
                 known = state.seen[i, q] + path_at(k, i, q, flight.tables)
                 state.error[i, q] += dt * (known - w.r_ref[i, q])
@@ -195,19 +187,108 @@ def worse(i, kind, value, t, state):
 
 
 @jit
-def presume(k, w, flight, state):
-    """Let vehicles without a link take each other to be as far off their slots at tick k as they are themselves.
-
-    States that are measured about the slots differ by nothing else; otherwise the slots are those last evaluated.
-    """
-    pairs, heard, about = flight.sensing.parted, state.heard, flight.tables.path.shape[0] > 0
-    for row in range(pairs.shape[0]):
-        for side in range(2):
-            i, j = pairs[row, side], pairs[row, 1 - side]
+def know(k, t, p, w, flight, state):
+    """What each vehicle knows at tick k, time t [s], beside messages: its measured state and the plan, into w."""
+    known_states(k, w, flight, state)
+    if p.reference.kind == SHAPE or p.control.kind == TRACKING:
+        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    if p.control.kind == TRACKING:
+        local_law(t, p, w)
+    else:
+        for i in range(state.S.shape[0]):
             for q in range(3):
-                r = 0.0 if about else w.r_ref[j, q] - w.r_ref[i, q]
-                v = 0.0 if about else w.v_ref[j, q] - w.v_ref[i, q]
-                heard[i, j, q], heard[i, j, 3 + q] = heard[i, i, q] + r, heard[i, i, 3 + q] + v
+                w.f_u[i, q] = p.control.force[i, q]
+    distance_references(
+        t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
+    )
+
+
+@jit
+def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
+    """Desired force of each vehicle from its own measured state, the plan and its neighbours' messages.
+
+    ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
+    Vehicles that follow laws of their own have answered in ``state.f_u`` with their whole force.
+    """
+    net, mail, tick = flight.network, state.mail, flight.steps * flight.h
+    state.work.law_time[0] = t
+    know(k, t, p, w, flight, state)
+    state.integral[:] = 0.0
+    last = mail.multiplier.shape[1] - 1
+    for i in range(state.S.shape[0]):
+        if flight.vehicles.lost[i]:
+            continue
+        estimate_acceleration(i, dt, w.v[i], net, mail)
+        hold_edges(i, k, flight.every, net, mail)
+        if flight.commands.kind == OWN:
+            for q in range(3):
+                w.f_u[i, q], w.f_C[i, q] = state.f_u[i, q], 0.0
+        else:
+            solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
+        take_force(k, i, dt, p, w, flight, state)
+        for q in range(3):
+            mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
+        mail.commanded[i, 2] -= p.vehicles.g
+        for l in range(net.first[i], net.first[i + 1]):
+            if mail.edge[l] >= 0:
+                state.integral[mail.edge[l]] += 0.5 * mail.multiplier[l, last]
+
+
+@jit
+def known_states(k, w, flight, state):
+    """Measured states of vehicles at tick k, each of its own, into w.r and w.v."""
+    for i in range(state.S.shape[0]):
+        for q in range(3):
+            w.r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
+            w.v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
+
+
+@jit
+def post(k, p, w, flight, state):
+    """Have ready what each vehicle could send at tick k: what it knows of itself, and what it does."""
+    mail, row = state.mail, k % state.mail.due.shape[1]
+    known_states(k, w, flight, state)
+    for i in range(state.S.shape[0]):
+        message, m = mail.post[row, i], p.vehicles.inverse[i]
+        for q in range(3):
+            message[R + q], message[V + q] = w.r[i, q], w.v[i, q]
+            message[A + q] = mail.commanded[i, q] + mail.estimate[i, 3 + q]
+            message[U + q] = m * state.f_u[i, q]
+            message[SLOT + q], message[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
+            message[SLOT + 6 + q] = w.a_ref[i, q]
+        message[TRACKED] = 1.0 if p.control.kind == TRACKING else 0.0
+        message[SATURATED] = 1.0 if state.saturated[i] else 0.0
+        for q in range(mail.pull.shape[1]):
+            message[PULL + q] = mail.pull[i, q]
+    for l in range(mail.multiplier.shape[0]):
+        for q in range(mail.multiplier.shape[1]):
+            mail.posted[row, l, q] = mail.multiplier[l, q]
+
+
+@jit
+def is_foreseen(j, k, p, w, flight, mail):
+    """Whether neighbours guess at tick k where vehicle j is, in w.r, well enough by its last broadcast."""
+    net, since, square = flight.network, k - mail.said[j], 0.0
+    if net.event == 0.0 or mail.said[j] == NONE or since >= net.longest:
+        return False
+    age, tracks = since * flight.steps * flight.h, p.control.kind == TRACKING
+    for q in range(3):
+        place, _, _ = bring_forward(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
+        square += (w.r[j, q] - place) ** 2
+    return square < net.event**2
+
+
+@jit
+def fall_silent(k, p, w, flight, state):
+    """Decide which vehicles do not broadcast what they have posted at tick k; keep what the others send."""
+    mail = state.mail
+    for j in range(state.S.shape[0]):
+        quiet = flight.vehicles.lost[j] or mail.mute[j]
+        mail.silent[j] = quiet or is_foreseen(j, k, p, w, flight, mail)
+        if not mail.silent[j]:
+            mail.said[j] = k
+            for q in range(mail.last.shape[1]):
+                mail.last[j, q] = mail.post[k % mail.due.shape[1], j, q]
 
 
 @jit
@@ -215,18 +296,13 @@ def desire(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if there are none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
-    linked = flight.sensing.linked
-    if flight.sensing.parted.shape[0] > 0 and flight.tables.path.shape[0] == 0:  # slots of now
-        evaluate_law(k, t, state.seen, state.integral[0], p, w, flight, state, call)
-    presume(k, w, flight, state)
-    for i in range(n if linked else 1):
-        known = state.heard[i] if linked else state.seen
-        integral = state.integral[i]
-        evaluate_law(k, t, known, integral, p, w, flight, state, call)
-        integrate_constraints(dt, integral, p, w, state)
-        for j in range(n):
-            if j == i or not linked:
-                take_force(k, j, dt, p, w, flight, state)
+    if flight.network.every > 0:
+        evaluate_by_neighbours(k, t, dt, p, w, flight, state)
+    else:
+        evaluate_law(k, t, state.seen, state.integral, p, w, flight, state, call)
+        integrate_constraints(dt, state.integral, p, w, state)
+        for i in range(n):
+            take_force(k, i, dt, p, w, flight, state)
     if p.has_frame:
         for i in range(n):
             for q in range(3):
@@ -262,13 +338,20 @@ def advance_frame(t, p, state):
 def tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     measure(k, flight, state)
-    due = flight.commands.kind == FORCE and k % flight.every == 0
+    if flight.network.every > 0:
+        receive(k, flight.network, state.mail)
+    due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
     if due and not desire(k, t, p, w, flight, state, call):
         return False
     for i in range(state.S.shape[0]):
         state.saturated[i] = steer(k, i, flight, state)
         if state.saturated[i]:
             state.saturations[i] += 1
+    if flight.network.every > 0:
+        post(k, p, w, flight, state)
+        if k % flight.network.every == 0:
+            fall_silent(k, p, w, flight, state)
+            send(k, state.S, flight.network, state.mail)
     return True
 
 
@@ -342,13 +425,15 @@ def write_samples(t, h, p, flight, state, call):
             call.saturated[c, i] = state.saturated[i]
             call.layers[c, i] = state.layers[i]
         write_derivatives(c, t + x, p, flight, state, call)
-        for k in range(state.integral.shape[1]):
-            call.integral[c, k] = state.integral[0, k]
+        for k in range(state.integral.shape[0]):
+            call.integral[c, k] = state.integral[k]
         for q in range(4):
             call.frame[c, q] = (
                 state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]
             )
         normalise(call.frame[c])
+        for l in range(call.stamp.shape[1]):
+            call.stamp[c, l] = state.mail.stamp[l]
         count[SAMPLES] = c + 1
 
 
@@ -426,17 +511,28 @@ def advance_fleet(t, h, p, flight, state):
 
 
 @jit
+def look(k, t, p, w, flight, state):
+    """Measure at tick k, time t [s]; where vehicles follow laws of their own, have ready what they know there."""
+    measure(k, flight, state)
+    if flight.commands.kind == OWN:
+        receive(k, flight.network, state.mail)
+        know(k, t, p, w, flight, state)
+
+
+@jit
 def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 
     Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
     gives no force (a singular law) or a user's function none: states and time are then those before. A pause changes no
     bit of the flight, unless ``t_end`` lies between two steps, where it divides one. With no steps to do, a flight at a
-    tick measures what the law will know there; to measure once more changes nothing.
+    tick measures what the law will know there; to measure once more changes nothing. Where vehicles follow laws of
+    their own, it returns ASKS before each of their ticks, with what they know in w and the mail: their forces go into
+    ``state.f_u``, and tick + 1 into ``state.count``.
     """
     count, clock = state.count, state.clock
     if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
-        measure(count[TICKS], flight, state)
+        look(count[TICKS], clock[TIME], p, w, flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[TIME], count[STEPS]
@@ -448,6 +544,9 @@ def fly_ticks(p, w, flight, state, call):
         if step % flight.steps == 0 and count[TICKS] == k:
             if k >= flight.tables.last:
                 return PAUSED
+            if flight.commands.kind == OWN and k % flight.every == 0 and count[ANSWERED] <= k:
+                look(k, t, p, w, flight, state)
+                return ASKS
             if not tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1

@@ -117,7 +117,6 @@ class LoopGains:
     control : "tracking" of slots, regulation of the virtual "body" (rigid allocation), or "open"
     k_def : deformation damping where no slots are tracked [1/s]
     solver, damping, iterations, threshold, cutoff : see `filter_factors`
-    link : age of other vehicles' states beyond that of a vehicle's own [s]
     """
 
     alpha: float = 3.0
@@ -133,7 +132,6 @@ class LoopGains:
     iterations: int = 3
     threshold: float = 0.1
     cutoff: float = 1e-3
-    link: float = 0.0
 
     def with_pole(self, p: float) -> LoopGains:
         """With all three poles of the constraint law at -p [1/s]."""
@@ -172,9 +170,9 @@ def overshoot(lag: Lag, laws: LoopGains, drag: float) -> float:
 class Loop(NamedTuple):
     """A part of the loop that no other part acts on, in an orthonormal basis of n directions.
 
-    ``S`` (2, n, n) is the share of the constraint law, and ``Q`` (2, n, n) the projection on rigid motions: whole, and
-    what each vehicle adds of its own state. ``P`` (g, n, n) are the directions of each of the ``channels``: a lag, and
-    whether it is the vertical one. B parts of one size are one loop with a further axis before the last two.
+    ``S`` (n, n) is the share of the constraint law, and ``Q`` (n, n) the projection on rigid motions. ``P`` (g, n, n)
+    are the directions of each of the ``channels``: a lag, and whether it is the vertical one. B parts of one size are
+    one loop with a further axis before the last two.
     """
 
     S: Floats
@@ -185,15 +183,13 @@ class Loop(NamedTuple):
     @property
     def is_constrained(self) -> bool:
         """Whether the constraint law has a share in it."""
-        return bool(np.abs(self.S[0]).max() > _NO_SHARE)
+        return bool(np.abs(self.S).max() > _NO_SHARE)
 
     def gain(self, s: Complexes, law: LoopGains) -> Complexes:
         """L (K, n, n) at s (K,)."""
-        each = (..., *(None,) * (self.S.ndim - 1))
+        each = (..., *(None,) * self.S.ndim)
         k_u, to_k_c, to_rigid = _gains(s, law)[each]
-        heard = np.exp(-s * law.link)[each]
-        S, Q = (heard * X[0] + (1 - heard) * X[1] for X in (self.S, self.Q))
-        K = k_u * np.eye(self.S.shape[-1]) + to_k_c * S + to_rigid * Q
+        K = k_u * np.eye(self.S.shape[-1]) + to_k_c * self.S + to_rigid * self.Q
         G = [lag.response(s, vertical=vertical) / (s * s) for lag, vertical in self.channels]
         if len(G) == 1:
             return G[0][each] * K
@@ -249,7 +245,7 @@ def formation_loops(
 ) -> list[Loop]:
     """The distinct parts of a formation's loop at rest, for `margins`, `is_stable` and `largest_pole`.
 
-    Gains of the law may change afterwards; the solver, its options, the control and the link may not.
+    Gains of the law may change afterwards; the solver, its options, and the control may not.
 
     Parameters
     ----------
@@ -271,32 +267,29 @@ def formation_loops(
     S = shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
-    own = np.kron(np.eye(n), np.ones((3, 3)))  # what a vehicle adds of its own state
     kinds = [(lag, axis == 2 and not lag.point) for lag in lags for axis in range(3)]
     channels = tuple(dict.fromkeys(kinds))
     P = np.stack([np.diag([float(kind == channel) for kind in kinds]) for channel in channels])
-    parts = [S, S * own, Q, Q * own, *P]
+    parts = [S, Q, *P]
     basis = np.eye(3 * n)
-    if law.control == "open" and law.link == 0:
+    if law.control == "open":
         # Nothing feeds rigid motions back, and deformations do not depend on them.
         basis = np.linalg.svd(Q)[0][:, rigid.shape[1] :]
     parts = [basis.T @ part @ basis for part in parts]
     loops = []
-    acting = [0, *([2] if law.control != "tracking" else []), *range(4, len(parts))]
-    if law.link > 0:
-        acting += [1, 3]
+    acting = [k for k in range(len(parts)) if k != 1 or law.control != "tracking"]
     for V in _invariant([parts[k] for k in acting]):
-        S2, Q2 = ([V.T @ parts[k] @ V for k in pair] for pair in ((0, 1), (2, 3)))
-        P2 = np.stack([V.T @ part @ V for part in parts[4:]])
+        S2, Q2, *rest = (V.T @ part @ V for part in parts)
+        P2 = np.stack(rest)
         present = np.abs(P2).max(axis=(1, 2)) > _ROUNDING
         there = tuple(c for c, is_there in zip(channels, present, strict=True) if is_there)
-        loops.append(Loop(np.stack(S2), np.stack(Q2), P2[present], there))
+        loops.append(Loop(S2, Q2, P2[present], there))
     return loops
 
 
 def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     """The distinct loops by which single vehicles track their slots: each lag, horizontal and vertical."""
-    zero, one = np.zeros((2, 1, 1)), np.ones((1, 1, 1))
+    zero, one = np.zeros((1, 1)), np.ones((1, 1, 1))
     kinds = dict.fromkeys((lag, up and not lag.point) for lag in lags for up in (False, True))
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
@@ -360,13 +353,13 @@ def is_stable(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> 
 
 def _by_size(loops: Sequence[Loop]) -> Iterator[Loop]:
     """The loops of each size, small ones first, as one: most are small, and what is done with each takes longer."""
-    for n in sorted({len(loop.S[0]) for loop in loops}):
-        some = [loop for loop in loops if len(loop.S[0]) == n]
+    for n in sorted({len(loop.S) for loop in loops}):
+        some = [loop for loop in loops if len(loop.S) == n]
         channels = tuple(dict.fromkeys(channel for loop in some for channel in loop.channels))
         P = np.zeros((len(channels), len(some), n, n))
         for k, loop in enumerate(some):
             P[[channels.index(channel) for channel in loop.channels], k] = loop.P
-        S, Q = (np.stack(parts, axis=1) for parts in zip(*(loop[:2] for loop in some), strict=True))
+        S, Q = (np.stack(parts) for parts in zip(*(loop[:2] for loop in some), strict=True))
         yield Loop(S, Q, P, channels)
 
 
@@ -414,8 +407,7 @@ def _highest(loop: Loop, law: LoopGains, size: float) -> float:
     s = 1j * omega
     each = np.abs([lag.response(s, vertical=vertical) for lag, vertical in loop.channels])
     k_u, to_k_c, to_rigid = np.abs(_gains(s, law))
-    # The norms of S, Q and of what each vehicle adds to them are at most 1.
-    K = k_u + (to_k_c + to_rigid) * (3.0 if law.link > 0 else 1.0)
+    K = k_u + to_k_c + to_rigid  # the norms of S and Q are at most 1
     above = np.flatnonzero(each.max(axis=0) * K > size * omega**2)
     return float(omega[min(above[-1] + 1, len(omega) - 1)]) if len(above) else 0.0
 
@@ -471,7 +463,7 @@ def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
     """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
     end = _highest(loop, law, _FAINT)
     if end <= _FREQUENCIES[0]:
-        return np.zeros(0), np.zeros((0, len(loop.S[0])), np.complex128)
+        return np.zeros(0), np.zeros((0, len(loop.S)), np.complex128)
     omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
     values = _eigenvalues(loop.gain(1j * omega, law))
     for _ in range(12):

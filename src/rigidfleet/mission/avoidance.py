@@ -143,10 +143,8 @@ def rules(m: Draft) -> Breaches:
     if a.sensing_noise and a.sensing_range is None:
         remedy = "add the range within which obstacles that move are seen, or remove the noise"
         yield Breach((_TABLE, "sensing_noise"), "has no effect without sensing_range", remedy)
-    if d is not None and d.links is not None:
-        problem = (
-            "needs the states of all vehicles at once, which [disturbances.links] does not give"
-        )
+    if m.network is not None:
+        problem = "needs the states of all vehicles at once, which [network] does not give"
         yield Breach(_TABLE, problem, "remove one of the two", None)
     for k, thing in enumerate(m.obstacles):
         if thing.kind == "heights":

@@ -24,6 +24,7 @@ from rigidfleet.mission import (
     fences,
     formations,
     losses,
+    network,
     obstacles,
     phases,
     vehicles,
@@ -81,6 +82,7 @@ def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         ((), _touching),
         ((), phases.rules),
         (("disturbances",), disturbances.rules),
+        (("network",), network.rules),
         ((), losses.rules),
         (("disturbances",), disturbances.sizes),
         ((), vehicles.flight_rules),
@@ -215,7 +217,7 @@ def _fixed_agents(m: Draft) -> Breaches:
         return
     agents, d = m.agents, m.disturbances
     yield from phases.members(m, agents.fixed)
-    lost = d is not None and (d.lost or (d.links and d.links.lost))
+    lost = d is not None and d.lost
     n, solver = len(agents.position), m.constraint.solver
     for wrong, problem, remedy in (
         (any(any(agents.velocity[i - 1]) for i in agents.fixed if i <= n), "starts with a velocity", "remove it"),

@@ -4,20 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.phases import latest_end
 from rigidfleet.mission.values import AUTO
-from rigidfleet.typing import Floats
-
-if TYPE_CHECKING:
-    from rigidfleet.mission.model import Mission
-
-#: Vehicles no higher above what is below them stand on it [m].
-STANDING = 0.5
 
 
 def size_in_words(agents: int, formations: int, phases: Sequence[Phase]) -> str:
@@ -42,16 +32,3 @@ def ending(phase: Phase) -> str:
     if phase.duration == AUTO:
         return "as soon as the limits allow"
     return f"at {phase.until:g} s" if phase.until is not None else f"after {phase.duration:g} s"
-
-
-def landings_in_words(mission: Mission, end: Floats) -> str:
-    """How many vehicles land where another one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
-    start, radius = mission.fleet.position, mission.fleet.radius
-    stand = [r[:, 2] - radius - mission.height_at(*r.T) <= STANDING for r in (start, end)]
-    if len(end) < 2 or not (stand[0] & stand[1]).any():
-        return ""
-    from scipy.spatial import KDTree
-
-    near = KDTree(start[:, :2]).query(end[:, :2])[1]
-    others = int((stand[1] & (near != np.arange(len(end)))).sum())
-    return f"{others} of {len(end)} vehicles land where another one stood" if others else ""

@@ -72,8 +72,6 @@ def rules(m: Draft) -> Breaches:
     for key in ("delay", "dropped"):
         if noise is not None and getattr(noise, key):
             yield Breach(("noise", key), *NOT_SAMPLED)
-    if d.links is not None:
-        yield Breach("links", *NOT_SAMPLED, None)
 
 
 def _gusts(m: Draft, gusts: Gusts, wind: bool) -> Breaches:

@@ -454,8 +454,8 @@ class Vertical(Arriving):
 
     @property
     def spelled(self) -> bool:
-        """Whether there is one group."""
-        return self.stagger is None
+        """Whether there is one group, which does not land elsewhere."""
+        return self.stagger is None and self.__dict__.get("places") != "own"
 
     @property
     def level(self) -> float | None:
@@ -506,11 +506,6 @@ class Land(Vertical):
         "start, straight or by levels, on ways that are proved, and then down",
         "below",
     )
-
-    @property
-    def spelled(self) -> bool:
-        """Whether there is one group, which lands where it is."""
-        return super().spelled and self.places == "below"
 
     @property
     def leads_to(self) -> str:

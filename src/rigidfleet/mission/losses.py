@@ -37,22 +37,22 @@ def rules(m: Draft) -> Breaches:
     for k, p in enumerate(m.phases):
         if p.grounded and not grounded:
             yield Breach(("phases", k, "kind"), *_NO_GROUND)
+    links = m.network.lost if m.network else ()
     if d is None:
         return
     yield from _vehicles(m, d)
-    yield from _links(m, d)
     for key, needed in ON_LOSS.items():
         if getattr(d, key) is not None and d.on_loss != needed:
             problem = f"has no effect with on_loss '{d.on_loss}'"
             yield Breach((_TABLE, key), problem, f"remove it or use on_loss = '{needed}'")
-    times = [lost.time for lost in (*d.lost, *(d.links.lost if d.links else ()))]
+    times = [lost.time for lost in (*d.lost, *links)]
     if d.on_loss == "continue" or not times or m.n is None or m.findings:
         return
     first = min(times)
     if d.hold_until is not None and d.hold_until <= first:
         problem = f"is not after the first loss at {first:g} s"
         yield Breach((_TABLE, "hold_until"), problem, "give a later time or remove it")
-    for k, p in _under_way(m.phases, first):
+    for k, p in under_way(m.phases, first):
         if p.control != "tracking":
             problem = (
                 f"may be under way at the loss at {first:g} s, but only tracked slots can brake"
@@ -70,7 +70,7 @@ def _abort(m: Draft) -> Breaches:
     options: Aborting | None = m.abort
     if options is not None:
         for k, agent in enumerate(options.agents):
-            yield from _loss(
+            yield from agents_exist(
                 m,
                 ("abort", "agents", k),
                 (agent,),
@@ -82,7 +82,7 @@ def _abort(m: Draft) -> Breaches:
     if begins >= m.end:
         problem = f"and the reaction of {options.reaction:g} s are not before the end of the mission at {m.end:g} s"
         yield Breach(("abort", "at"), problem, "give an earlier time or remove it")
-    for k, p in _under_way(m.phases, begins):
+    for k, p in under_way(m.phases, begins):
         if p.control != "tracking":
             problem = f"may be under way at the abort at {begins:g} s, but only tracked slots can slow down"
             remedy = "use control = 'tracking', or abort at another time"
@@ -95,8 +95,8 @@ def _vehicles(m: Draft, d: Disturbances) -> Breaches:
     for k, one in enumerate(d.lost):
         path = (_TABLE, "lost", k)
         again = "is lost twice" if one.agent in lost[:k] else ""
-        yield from _loss(m, (*path, "agent"), (one.agent,), again)
-        yield from _in_time(m, one.time, path)
+        yield from agents_exist(m, (*path, "agent"), (one.agent,), again)
+        yield from in_time(m, one.time, path)
     if m.n is not None and len(set(lost)) >= m.n:
         yield Breach((_TABLE, "lost"), "all vehicles are lost", "keep at least one")
     for key, possible, whose in (
@@ -110,52 +110,22 @@ def _vehicles(m: Draft, d: Disturbances) -> Breaches:
             yield Breach((_TABLE, "lost"), problem, f"use {key} = '{possible}'")
 
 
-def _links(m: Draft, d: Disturbances) -> Breaches:
-    """Links join two agents, are lost once and in time, and slots are tracked from then on."""
-    links = () if d.links is None else d.links.lost
-    pairs = [tuple(sorted(one.between)) for one in links]
-    for k, one in enumerate(links):
-        path, pair = (_TABLE, "links", "lost", k), pairs[k]
-        if pair[0] == pair[1] and _exist(m, pair):
-            problem = "joins an agent to itself"
-            yield Breach((*path, "between"), problem, "give two agents")
-        else:
-            yield from _loss(
-                m, (*path, "between"), pair, "is lost twice" if pair in pairs[:k] else ""
-            )
-        yield from _in_time(m, one.time, path)
-    if not links:
-        return
-    first = min(one.time for one in links)
-    for k, p in _under_way(m.phases, first, ever_after=True):
-        if p.control != "tracking":
-            problem = (
-                f"may be under way after the link lost at {first:g} s: vehicles without a link know each other"
-                " by their slots alone, so the slots must be tracked"
-            )
-            yield Breach(("phases", k, "control"), problem, "use control = 'tracking'", p.control)
-
-
-def _exist(m: Draft, agents: Sequence[int]) -> bool:
-    return m.n is None or all(1 <= agent <= m.n for agent in agents)
-
-
-def _loss(m: Draft, where: Keys, agents: Sequence[int], again: str) -> Breaches:
-    """Agents exist, and are not lost again."""
-    if not _exist(m, agents):
+def agents_exist(m: Draft, where: Keys, agents: Sequence[int], again: str = "") -> Breaches:
+    """Agents exist, and are not lost ``again``, in words."""
+    if m.n is not None and not all(1 <= agent <= m.n for agent in agents):
         yield Breach(where, "there is no such agent", f"agents are numbered from 1 to {m.n}")
     elif again:
         yield Breach(where, again, "remove one of the two")
 
 
-def _in_time(m: Draft, time: float, path: Keys) -> Breaches:
+def in_time(m: Draft, time: float, path: Keys) -> Breaches:
     """A loss is before the end of the mission."""
     if m.end is not None and time >= m.end:
         problem = f"is not before the end of the mission at {m.end:g} s"
         yield Breach((*path, "time"), problem, "give an earlier time or remove the entry")
 
 
-def _under_way(
+def under_way(
     phases: Sequence[AnyPhase], t: float, *, ever_after: bool = False
 ) -> Iterator[tuple[int, AnyPhase]]:
     """Phases that may be under way at a time [s], or also later: one that settles may do so early or late."""
@@ -190,7 +160,7 @@ def _landings(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
             yield Breach(where, f"cannot land: {words}", remedy)
         return
     held: dict[str | None, None] = {}
-    for k, _ in _under_way(m.phases, first):
+    for k, _ in under_way(m.phases, first):
         taken = [p.shaping.formation for p in m.phases[: k + 1] if p.shaping is not None]
         held[taken[-1] if taken else None] = None
     for one in held:

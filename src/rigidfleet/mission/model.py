@@ -80,6 +80,10 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
     return wrapper
 
 
+#: Vehicles no higher above what is below them stand on it [m].
+_STANDING = 0.5
+
+
 class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -485,6 +489,22 @@ class Mission(Contents, Shown):
         x, y, z = np.broadcast_arrays(*(np.asarray(a, dtype=np.float64) for a in (x, y, z)))
         return np.maximum(height_below(x, y, z, self.roofs), self.ground)
 
+    def standing(self, r: Floats) -> Bools:
+        """Which vehicles at r (N, 3) [m] stand on what is below them, (N,)."""
+        return r[:, 2] - self.fleet.radius - self.height_at(*r.T) <= _STANDING
+
+    def landings_in_words(self, end: Floats) -> str:
+        """How many vehicles land where another one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
+        start = self.fleet.position
+        stand = self.standing(end)
+        if len(end) < 2 or not (self.standing(start) & stand).any():
+            return ""
+        from scipy.spatial import KDTree
+
+        near = KDTree(start[:, :2]).query(end[:, :2])[1]
+        others = int((stand & (near != np.arange(len(end)))).sum())
+        return f"{others} of {len(end)} vehicles land where another one stood" if others else ""
+
     @cached_property
     def tracking_gains(self) -> tuple[float, float]:
         """Gains k1 [1/s^2] and k2 [1/s] of local tracking."""
@@ -530,8 +550,7 @@ class Mission(Contents, Shown):
     @cached_property
     def links_lost(self) -> tuple[Ints, Floats]:
         """The links that are lost: pairs (L, 2) of agents from 0, i < j, and times (L,) [s]."""
-        d = self.disturbances
-        lost = d.links.lost if d is not None and d.links is not None else ()
+        lost = self.network.lost if self.network is not None else ()
         pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
         return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
 

@@ -56,6 +56,7 @@ from rigidfleet.mission.values import (
     Rate,
     Rest,
     RotorSpeeds,
+    Seconds,
     Seed,
     Share,
     Size,
@@ -632,18 +633,55 @@ class LostLink(Part):
     time: Time = key("mission time of the loss [s], > 0")
 
 
-class Links(Part):
-    """What vehicles know of each other: states sent at a fixed rate, which arrive late or not at all."""
+class Outage(Part):
+    """A time without messages: between two vehicles, from and to one, or everywhere."""
 
-    delay: Delay = key("age of a state when it arrives [s]", 0.0)
-    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
-        "states sent per second [Hz], at most 1000", 50.0
+    between: tuple[Whole, ...] = key(
+        "one or two agents, counted from 1; default: all", (), max_length=2
     )
-    dropped: Share = key("share of the states that are lost, 0 to 0.95", 0.0)
-    seed: Seed = key("seed of the random numbers; the same seed loses the same states", 0)
+    start: Seconds = key("mission time from which no message is sent [s]")
+    end: Time = key("mission time from which messages are sent again [s]")
+
+
+class Network(Part):
+    """How vehicles know each other: each computes its force from its own state and its neighbours' messages."""
+
+    rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
+        "broadcasts of each vehicle a second [Hz], at most 1000", 50.0
+    )
+    delay: Delay = key("time from a broadcast to its arrival [s]", 0.0)
+    jitter: Delay = key(
+        "greatest time by which a message is later than that [s]: each is by a share of its own, so that "
+        "messages may overtake each other",
+        0.0,
+    )
+    loss: Share = key("share of the messages that a link loses, 0 to 0.95", 0.0)
+    burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = key(
+        "mean number of messages lost one after the other; default: losses are independent", None
+    )
+    range: Length | None = key("distance beyond which no message is heard [m]; default: none", None)
+    budget: Annotated[float, Strict(), Field(gt=0)] | None = key(
+        "broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
+        "no limit",
+        None,
+    )
+    silence: Time = key("time without a message after which a vehicle lets go of an edge [s]", 0.5)
+    event: Length | None = key(
+        "distance [m] by which neighbours guess a vehicle wrongly before it sends, or before `silence` would run out; "
+        "default: it sends each time",
+        None,
+    )
+    seed: Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
+    outages: tuple[Outage, ...] = key(
+        "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()
+    )
     lost: tuple[LostLink, ...] = key(
         "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
+
+    def sent_rate(self, n: int) -> float:
+        """Broadcasts of each of n vehicles a second [Hz] that the medium carries."""
+        return self.rate if self.budget is None else min(self.rate, self.budget / n)
 
 
 class Lost(Part):
@@ -671,11 +709,6 @@ class Disturbances(Part):
     )
     gusts: Gusts | None = key("gusts: [disturbances.gusts]", None)
     noise: Noise | None = key("measurement noise: [disturbances.noise]", None)
-    links: Links | None = key(
-        "links between vehicles, only with [vehicles]: [disturbances.links]; default: each knows the "
-        "others as they know themselves",
-        None,
-    )
     downwash: Flag = key(
         "true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]", False
     )
@@ -829,6 +862,10 @@ class Contents(MissionHeader):
     yaw: VehicleYaw = key("yaw of each vehicle: [yaw]", default_factory=VehicleYaw.model_construct)
     geodetic_origin: GeodeticOrigin | None = key(
         "place of the origin on the Earth, for exports: [geodetic_origin]", None
+    )
+    network: Network | None = key(
+        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
+        None,
     )
     disturbances: Disturbances | None = key(
         "wind, gusts, noise, mass errors, lost vehicles: [disturbances]", None

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet._common.text import agent_names
 from rigidfleet.foreign.curves import curve_to_rows
 from rigidfleet.formation.assignment import (
@@ -31,7 +32,7 @@ from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import proximity, series
 from rigidfleet.math.piecewise import Piecewise, join, pad
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.describe import STANDING
+from rigidfleet.mission.boundaries import BoundaryWatch, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.planning.certificate import certificate_of, of_ways
@@ -380,6 +381,8 @@ class _Judge:
             if height[k] < limits.separation_below - 1e-6:
                 who = agent_names(int(self.left[i]) for i in sorted(pair[k].tolist()))
                 return f"{who} are {height[k]:.2f} m above each other on the way {step.name}"
+        if crossing := self._crossing(step, begin):
+            return f"{crossing}, on the way {step.name}"
         if not things:
             return ""
         room, near = proximity.obstacle_clearances(r, radius, things, begin + time)
@@ -389,6 +392,19 @@ class _Judge:
         ):  # more than half the way between two samples, at twice the mean speed
             thing = things[int(near[k, i])].name
             return f"'{thing}' stands in the way {step.name} of agent {self.left[i] + 1}"
+        return ""
+
+    def _crossing(self, step: Step, begin: float) -> str:
+        """Where a step crosses a hard fence, or leads vehicles that fail onto people; "" if nowhere."""
+        mission, watch = self.mission, BoundaryWatch(self.mission)
+        if watch.every:
+            watch.take_way(step.ways(), np.isin(np.arange(mission.n_agents), self.left))
+        for name, x in watch.search().items():
+            q = QUANTITIES[name]
+            limit, place = q.limit_of(mission), getattr(mission, PLACES[q.who])[x.other].name
+            if limit is not None and q.rank(x.value) > q.rank(limit) + 1e-6:
+                who = f"agent {x.who + 1}"
+                return boundary_in_words(name, who, place, x.value, begin + x.time)
         return ""
 
     def _on_pads(self, step: Step) -> bool:
@@ -413,10 +429,9 @@ class Homes:
         self.mission, self.plan, self.judge = mission, plan, _Judge(mission, lost)
         self.to = to or mission.aborting.to
         start = mission.fleet.position
-        below = mission.height_at(*start.T)
-        stands = start[:, 2] - mission.fleet.radius - below
-        self.stands = bool(np.isfinite(below).all() and stands.max() <= STANDING)
-        self.start = np.column_stack([start[:, :2], below + ABOVE + mission.fleet.radius])
+        below = mission.height_at(*start.T) + ABOVE + mission.fleet.radius
+        self.stands = bool(mission.standing(start).all() and np.isfinite(below).all())
+        self.start = np.column_stack([start[:, :2], below])
         self.known: dict[bytes, tuple[int, Ways]] = {}
         self.moves = any(x.solid.moves for x in self.judge.things)
 

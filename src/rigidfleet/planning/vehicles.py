@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
+from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
 from rigidfleet.math.margins import Lag, LoopGains, overshoot
@@ -35,7 +36,7 @@ from rigidfleet.typing import Floats, Ints
 #: Rows of random numbers in a block.
 _BLOCK = 1024
 #: Kinds of random numbers.
-_NOISE, _DROPPED, _UNHEARD = 2, 3, 4
+_NOISE, _DROPPED = 2, 3
 #: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
 DENSITY = 1.225
 #: Speed below which the direction of quadratic drag is rounded off [m/s].
@@ -44,6 +45,10 @@ _STILL = 0.1
 _LEFT = 0.2
 #: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
 _TURN_TIME = 3.0
+#: Time constant with which vehicles in a network estimate the acceleration by what they do not know [s].
+_ESTIMATE = 0.15
+#: Probability with which all messages that a vehicle owes its neighbours within the time of silence are lost.
+_ALL_LOST = 1e-3
 
 
 def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.SampledFlight:
@@ -78,7 +83,9 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         radius=around.radius,
         roofs=around.roofs,
     )
-    return flight._replace(air=air, guidance=guidance, sensing=_sensing(mission))
+    return flight._replace(
+        air=air, guidance=guidance, sensing=_sensing(mission), network=network_of(mission)
+    )
 
 
 def vehicle_lags(mission: Mission) -> list[Lag]:
@@ -172,26 +179,60 @@ def kernel_vehicle(model: VehicleModel, mass: float) -> fleet.VehicleDynamics:
 
 
 def _sensing(mission: Mission) -> fleet.Sensing:
-    """Rates and delays of measurements and links, in whole ticks of the attitude control."""
+    """Rate and delay of measurements, in whole ticks of the attitude control."""
     n, rate, d = mission.n_agents, mission.autopilot.rate, mission.disturbances
     noise = None if d is None else d.noise
-    links = None if d is None else d.links
+    if noise is None:
+        return fleet.exact_sensing(n)
+    return fleet.Sensing(max(1, round(rate / noise.rate)), np.full(n, round(noise.delay * rate)))
 
-    def ticks(seconds: float) -> int:
-        return round(seconds * rate)
 
-    sensing = fleet.exact_sensing(n)
-    if noise is not None:
-        sensing = sensing._replace(
-            every=max(1, round(rate / noise.rate)), delay=np.full(n, ticks(noise.delay))
-        )
-    if links is not None:
-        sensing = sensing._replace(
-            linked=True,
-            link_every=max(1, round(rate / links.rate)),
-            link_delay=np.full((n, n), ticks(links.delay)),
-        )
-    return sensing
+def network_of(mission: Mission) -> Links:
+    """The network of a mission in whole ticks of the attitude control; one that nobody uses if it has none."""
+    net, n, rate = mission.network, mission.n_agents, mission.autopilot.rate
+    if net is None:
+        return no_network(n)
+    edges = [mission.formation_edges(name) for name in mission.formations]
+    both = np.concatenate([e for pairs in edges for e in (pairs, pairs[:, ::-1])])
+    links = np.unique(both, axis=0).astype(np.int64)
+    place = {pair: l for l, pair in enumerate(map(tuple, links.tolist()))}
+    worsens, recovers = fading(net.loss, net.burst)
+    every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
+    delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
+    # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
+    tries = math.ceil(math.log(_ALL_LOST) / math.log(1.0 - recovers)) if recovers < 1.0 else 1
+    longest = (silence - delay - jitter) // max(tries, 2)
+    seed = net.seed & 0xFFFFFFFF, net.seed >> 32 & 0xFFFFFFFF
+    out = [
+        [*(sorted(x - 1 for x in one.between) or (-1, -1)), one.start * rate, one.end * rate]
+        for one in net.outages
+    ] + [[*(x - 1 for x in one.between), one.time * rate, np.inf] for one in net.lost]
+    return Links(
+        every=every,
+        delay=delay,
+        jitter=jitter,
+        worsens=worsens,
+        recovers=recovers,
+        range=net.range if net.range is not None else np.inf,
+        silence=silence,
+        seed=np.array(seed, dtype=np.int64),
+        links=links,
+        first=np.searchsorted(links[:, 0], np.arange(n + 1)).astype(np.int64),
+        reverse=np.array([place[j, i] for i, j in links.tolist()], dtype=np.int64),
+        outages=np.array(out, dtype=np.float64).reshape(-1, 4),
+        event=net.event or 0.0,
+        longest=max(longest // every * every, 1),
+        lag=_ESTIMATE,
+    )
+
+
+def fading(loss: float, burst: float | None) -> tuple[float, float]:
+    """Probabilities with which a link begins and ends to lose messages, by the share lost and the mean burst.
+
+    In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
+    """
+    recovers = 1.0 - loss if burst is None else 1.0 / burst
+    return loss * recovers / (1.0 - loss), recovers
 
 
 class TickTables:
@@ -202,7 +243,6 @@ class TickTables:
         self.flight, self.n = flight, mission.n_agents
         self.rate = mission.autopilot.rate
         self.noise = None if d is None else d.noise
-        self.links = None if d is None else d.links
         self.yaw = asked_yaw(mission)
         self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation
@@ -247,7 +287,6 @@ class TickTables:
             path = _by_tick(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
-        unheard = np.zeros((0, self.n, self.n), dtype=np.bool_)
         if self.noise is not None:
             rows = _rows(first, last, sensing.every)
             seed = self.noise.seed
@@ -257,13 +296,7 @@ class TickTables:
                 noise_v = np.ascontiguousarray(self.noise.velocity * white[:, 1])
             if self.noise.dropped:
                 dropped = _random_rows(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
-        if self.links is not None and self.links.dropped:
-            rows = _rows(first, last, sensing.link_every)
-            share = _random_rows(_UNHEARD, self.links.seed, rows, (self.n, self.n))
-            unheard = share < self.links.dropped
-        return fleet.TickInputs(
-            first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped, unheard
-        )
+        return fleet.TickInputs(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped)
 
     def yaw_at(self, problem: Problem, t: float, turn: YawTurn) -> Floats:
         """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""

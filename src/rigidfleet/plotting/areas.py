@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,12 +12,16 @@ from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d import Axes3D
 
     from rigidfleet.mission import Mission
+    from rigidfleet.result import Result
 
 #: Colour of places with people.
 PEOPLE = "#6A3D9A"
+#: Colour of places where vehicles fall, and the most places of a kind that are drawn.
+_FALLS, _MOST = "#E69F00", 4000
 
 
 def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
@@ -55,3 +60,39 @@ def draw_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
         for ring in rings:
             x, y = np.vstack([ring, ring[:1]]).T
             ax.plot(x, y, np.full(len(x), floor), color=look["edgecolor"], **style, zorder=1)
+
+
+def falls(result: Result) -> Floats:
+    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m] on the ground, or at z = 0 without one."""
+    from rigidfleet.mission.boundaries import Boundaries
+
+    mission = result.mission
+    level = mission.ground if np.isfinite(mission.ground) else 0.0
+    return Boundaries(mission).landings(result.position, result.velocity, level)
+
+
+@st.in_style
+def sketch(result: Result) -> Figure:
+    """The ground from above: fences, people, and where vehicles fly and fall."""
+    fig = st.blank_figure(st.WIDTH, 4.6, "constrained")
+    ax = fig.subplots()
+    draw_from_above(ax, result.mission)
+    handles = []
+    for what, places, colour in (
+        ("vehicles that fail fall", falls(result), _FALLS),
+        ("vehicles fly", result.position[..., :2], st.FLOWN),
+    ):
+        flat = places[result.left]
+        ax.plot(*flat[:: 1 + len(flat) // _MOST].T, ".", markersize=2, color=colour, zorder=2)
+        handles.append(st.legend_entry(what, linestyle="", marker="o", markersize=5, color=colour))
+    line = partial(st.legend_entry, color=st.ALERT, linewidth=1.1)
+    kinds = {fence.soft for fence in result.mission.fences}
+    handles += [line("fence")] if False in kinds else []
+    handles += [line("soft fence", linestyle=(0, (4, 2)))] if True in kinds else []
+    if result.mission.people:
+        handles.append(st.legend_entry("people", color=PEOPLE, linewidth=5.0, alpha=0.4))
+    ax.set(xlabel="x, east [m]", ylabel="y, north [m]")
+    ax.margins(0.06)
+    ax.set_aspect("equal", adjustable="box")
+    fig.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    return fig

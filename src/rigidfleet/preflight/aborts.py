@@ -88,10 +88,10 @@ class AbortsCheck(Shown):
         least, when, (i, j) = min(each)
         near = f"least {least:.2f} m," if least > 0.0 else "hits"
         text = f"{agent_names([i])} flies on: {near} {agent_names([j])} at {when:.1f} s"
-        count = self._endangered(each)
+        count = self._in_danger(each)
         return text + (f"; {count} would come too near" if count else "")
 
-    def _endangered(self, each: list[Nearest]) -> int:
+    def _in_danger(self, each: list[Nearest]) -> int:
         """How many vehicles would come within the limit of separation."""
         return sum(x.separation < (self.mission.limits.separation or 0.0) for x in each)
 
@@ -105,7 +105,7 @@ class AbortsCheck(Shown):
                     "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stops,
                     "ends_s": x.end,
                     "way": x.way, "reason": x.reason, "ways": x.number, "separation": _nearest([x.least]),
-                    "unheard": _nearest(each), "endangered": self._endangered(each),
+                    "unheard": _nearest(each), "endangered": self._in_danger(each),
                 }
                 for x, each in zip(self.aborts, self.unheard, strict=True)
             ],

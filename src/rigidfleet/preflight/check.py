@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rigidfleet.mission import Mission, as_mission
-from rigidfleet.mission.describe import landings_in_words
 from rigidfleet.mission.files import notes_on_files
 from rigidfleet.planning.preview import FEWEST_SAMPLES, preview, samples_per_phase
 from rigidfleet.planning.timing import complete_times
@@ -24,6 +23,7 @@ from rigidfleet.preflight.formations import SEARCHED, check_formations, formatio
 from rigidfleet.preflight.gains import check_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
+from rigidfleet.preflight.network import check_network, network_remarks
 from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
 from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
@@ -73,6 +73,7 @@ def check(
     if lags := vehicle_lags(mission):
         progress("margins")
         preflight.margins = check_margins(mission, planned, lags)
+        preflight.network = check_network(mission, planned, lags)
         preflight.vehicles = check_vehicles(mission, planned)
         preflight.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
@@ -81,6 +82,7 @@ def check(
         *formation_remarks(mission, formations),
         *gain_remarks(mission, preflight),
         *margin_remarks(preflight),
+        *network_remarks(preflight),
         *separation_remarks(mission, preflight),
         *downwash_remarks(mission, preflight),
         *assignment_remarks(mission, preflight),
@@ -95,7 +97,7 @@ def check(
         *waypoint_remarks(mission, preflight),
         *loss_remarks(mission, preflight),
     ]
-    if planned and (words := landings_in_words(mission, planned[-1].position[-1])):
+    if planned and (words := mission.landings_in_words(planned[-1].position[-1])):
         preflight.remarks.append(Remark("note", "landing", words))
     if not known:
         why = "later positions depend on distances alone and are known only in flight"

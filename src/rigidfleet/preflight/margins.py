@@ -100,7 +100,7 @@ def formation_laws(
                 continue
             seen.add(key)
             loops = formation_loops(r, edges, mission.agents.mass, law, lags)
-            size = sum(len(loop.S[0]) ** 3 for loop in loops)
+            size = sum(len(loop.S) ** 3 for loop in loops)
             if work + size > _WORK and laws:
                 skipped = True
                 continue
@@ -114,12 +114,8 @@ def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGai
     c = mission.constraint
     k1, k2 = mission.tracking_gains
     on = float(c.stabilisation == "pid")
-    d = mission.disturbances
-    links = None if d is None else d.links
     return LoopGains(
         ki=mission.tracking.integral,
-        # A state waits for half a period on average until it is sent.
-        link=0.0 if links is None else links.delay + 0.5 / links.rate,
         alpha=on * c.alpha,
         beta=on * c.beta,
         gamma=on * c.gamma,

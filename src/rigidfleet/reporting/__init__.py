@@ -1,8 +1,10 @@
 """A flight, or several side by side, as one HTML page for screen and print.
 
-`report` writes the page. It shows the verdict first, then a safety table (distances, speed, altitude and thrust,
-each with its limit), the figures, the mission, its gains and their meaning, and versions. The page contains
-everything it needs and loads nothing from a network. Its templates are in this package; its only input is results.
+`report` writes the page. The first page of one flight is for those who decide: the verdict, what is planned, proved and
+rehearsed, where things fall, and versions with digests. Then follow a safety table (distances, speed, altitude and
+thrust, each with its limit), the figures and the mission; vehicles, gains and all checks are an appendix. The page
+contains everything it needs and loads nothing from a network. Its templates are in this package; its only input is
+results.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ def report(
     *,
     labels: Sequence[str] | None = None,
     verdicts: Sequence[Verdict] | None = None,
+    rehearsed: Sequence[str] = (),
+    abort: Sequence[str] = (),
 ) -> None:
     """Write one flight, or several side by side, as one HTML page.
 
@@ -37,6 +41,7 @@ def report(
     path : file of the page; an existing one is replaced, completely or not at all
     labels : name of each flight; by default the name of its mission
     verdicts : those of `assess`, if they have been computed already
+    rehearsed, abort : of one flight, what drills have shown and how it is aborted, in sentences for the first page
 
     Raises
     ------
@@ -48,7 +53,12 @@ def report(
         ``results`` holds what is neither a flight nor a path.
     """
     target = as_path(path)
-    write_file(target, html_page(results, labels=labels, verdicts=verdicts).encode())
+    write_file(
+        target,
+        html_page(
+            results, labels=labels, verdicts=verdicts, rehearsed=rehearsed, abort=abort
+        ).encode(),
+    )
 
 
 def html_page(
@@ -56,6 +66,8 @@ def html_page(
     *,
     labels: Sequence[str] | None = None,
     verdicts: Sequence[Verdict] | None = None,
+    rehearsed: Sequence[str] = (),
+    abort: Sequence[str] = (),
 ) -> str:
     """The page that `report` writes."""
     from rigidfleet._common.templates import templates
@@ -70,7 +82,7 @@ def html_page(
     environment = templates("rigidfleet.reporting")
     style = environment.get_template("style.css").render()
     return environment.get_template("page.html").render(
-        contents(flights, labels, verdicts),
+        contents(flights, labels, verdicts, rehearsed=rehearsed, abort=abort),
         policy=content_policy(style=style),
         style=style,
     )

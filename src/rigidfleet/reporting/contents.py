@@ -24,7 +24,7 @@ from rigidfleet.plotting.quadrotors import (
     tilt,
 )
 from rigidfleet.plotting.style import clean_name
-from rigidfleet.reporting import gains, overlay
+from rigidfleet.reporting import brief, gains, overlay
 from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
@@ -41,9 +41,12 @@ _SAME = 1e-3
 
 
 def contents(
-    flights: Sequence[Result], labels: Sequence[str] | None, verdicts: Sequence[Verdict] | None
+    flights: Sequence[Result],
+    labels: Sequence[str] | None,
+    verdicts: Sequence[Verdict] | None,
+    **more: Sequence[str],
 ) -> dict[str, Any]:
-    """Everything on the page.
+    """Everything on the page; ``more`` is what the first page of one flight says that no record has.
 
     Raises
     ------
@@ -67,6 +70,8 @@ def contents(
         "title": " · ".join(names),
         "several": several,
         "flights": pages,
+        "brief": [] if several else brief.rows(flights[0], judged[0], **more),
+        "sketch": None if several else _data_url(brief.sketch(flights[0])),
         "figures": [] if several else _figures(flights[0]),
         "passed": all(verdict.passed for verdict in judged),
         "safety": _safety_table(flights, judged, names),

@@ -156,10 +156,12 @@ def _data_as_flown(
     if disturbed := own.get("disturbances"):
         # What followed from a loss is among the phases
         kept = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
-        for table in (kept, kept.get("links", {})):
-            if "lost" in table:
-                table["lost"] = [lost for lost in table["lost"] if lost["time"] < end]
         data["disturbances"] = kept
+    if net := own.get("network"):
+        data["network"] = dict(net)
+    for table in (data.get("disturbances", {}), data.get("network", {})):
+        if "lost" in table:
+            table["lost"] = [lost for lost in table["lost"] if lost["time"] < end]
     return data
 
 

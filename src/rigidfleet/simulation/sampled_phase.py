@@ -12,13 +12,20 @@ from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.problem import TRACKING, Problem
+from rigidfleet.kernel.mail import Links, Mail, assign_edges
+from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
-from rigidfleet.planning.reference import ByEdge
-from rigidfleet.planning.vehicles import TickTables, YawTurn, first_yaw, sampled_flight, turn_from
+from rigidfleet.planning.vehicles import (
+    TickTables,
+    YawTurn,
+    fading,
+    first_yaw,
+    sampled_flight,
+    turn_from,
+)
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -29,6 +36,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
+from rigidfleet.simulation.own_laws import Law, OwnLaws, View
 from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
 from rigidfleet.typing import Floats
 
@@ -43,8 +51,12 @@ _FAR = 1e9
 class FleetState:
     """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
 
-    def __init__(self, mission: Mission, max_step: float) -> None:
+    def __init__(self, mission: Mission, max_step: float, agent: Law | type | None = None) -> None:
         self.flight = sampled_flight(mission, max_step)
+        self.laws = None if agent is None else OwnLaws(agent, self.flight)
+        if self.laws is not None:
+            commands = self.flight.commands._replace(kind=fleet.OWN)
+            self.flight = self.flight._replace(commands=commands)
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
@@ -52,10 +64,22 @@ class FleetState:
         yaw = float(self.yaw[0])
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
-        self.edges = np.zeros((0, 2), dtype=np.int64)  # of that state
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
         self.output_step = mission.output_step
+        self.burst = None if mission.network is None else mission.network.burst
         self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
+
+    @property
+    def network(self) -> tuple[Links, Mail] | None:
+        """The network, and what was sent on it; None without one, or before the flight."""
+        links = self.flight.network
+        return (links, self.state.mail) if links.every and self.state is not None else None
+
+    def lose(self, loss: float) -> None:
+        """Let links lose a share of the messages from now on."""
+        worsens, recovers = fading(loss, self.burst)
+        network = self.flight.network._replace(worsens=worsens, recovers=recovers)
+        self.flight = self.flight._replace(network=network)
 
 
 class SampledPhase(Stepper):
@@ -94,35 +118,31 @@ class SampledPhase(Stepper):
         phase.state = phase.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
         lost = self.flight.vehicles._replace(lost=phase.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
-        if phase.parted.any():
-            parted = np.ascontiguousarray(plan.links_lost[0][phase.parted])
-            sensing = self.flight.sensing._replace(parted=parted)
-            self.flight = self.flight._replace(sensing=sensing)
-            phase.evaluate()  # the slots by which vehicles without a link presume each other
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], fleet_state.state
-        begun = fleet.begin(self.flight, fleet_state.S, phase.workspace, frame=frame)
+        law = plan.problem.law
+        begun = fleet.begin(
+            self.flight, fleet_state.S, phase.workspace, frame=frame,
+            iterations=law.iterations if law.solver == ITERATED else 1,
+        )  # fmt: skip
         if before is None:
             begun.integral[:] = integral
         else:
             renewed = fleet.under_problem(before, phase.workspace, integral, frame=frame)
-            if phase.parted.any():  # without a link, vehicles do not come to the same integrals
-                own = [
-                    ByEdge().with_values(fleet_state.edges, x).of(plan.edges, integral)
-                    for x in before.integral
-                ]
-                renewed.integral[:] = own
             if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
+        lose = (
+            self.first_tick is not None
+        )  # edges that end within a phase are those of what is lost
+        assign_edges(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
         )
         if fleet_state.avoidance is not None:
             fleet_state.avoidance = avoidance.holding(fleet_state.avoidance, m)
-        fleet_state.edges = plan.edges
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
             self.gone = phase.lost.copy()  # (N,) vehicles that do not fly in this phase
@@ -177,12 +197,10 @@ class SampledPhase(Stepper):
 
     def seen_by_controller(self, observation: Observation) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
-        phase, S = self.phase, self.sampled.S
+        S = self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
-            self._supply()
-            now = fleet.segment(len(S), len(phase.plan.edges), phase.t, max_steps=0)  # to measure
-            fly_ticks(phase.plan.problem, phase.workspace, self.flight, self.sampled, now)
+            self._look()
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
             # About the path of that tick, if there are any
             seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
@@ -190,6 +208,23 @@ class SampledPhase(Stepper):
             observation, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
             rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
+
+    def _look(self) -> None:
+        """Measure what the law will know if a tick is due."""
+        self._supply()
+        now = fleet.segment(
+            len(self.sampled.S), len(self.phase.plan.edges), self.phase.t, max_steps=0
+        )
+        fly_ticks(self.phase.plan.problem, self.phase.workspace, self.flight, self.sampled, now)
+
+    def views(self) -> list[View | None]:
+        """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
+        self._look()
+        phase, laws = self.phase, self.vehicles.laws
+        assert laws is not None
+        return laws.views(
+            phase.plan.phase.name, phase.plan.problem, phase.workspace, self.flight, self.sampled
+        )
 
     def drop_command(self) -> None:
         """Drop the last command of vehicles."""
@@ -247,14 +282,22 @@ class SampledPhase(Stepper):
         self.flown = problem
         times = phase.times(t_end)
         phase.begun, arrays = True, self.vehicles.avoidance
-        call = fleet.segment(n, m, t_end, times, _STEPS)
+        network = self.vehicles.flight.network
+        self.flight = self.flight._replace(network=network)
+        links = len(network.links)
+        call = fleet.segment(n, m, t_end, times, _STEPS, links=links)
         sampled.count[fleet.SAMPLES] = 0
-        status = records.PAUSED
+        status, laws = records.PAUSED, self.vehicles.laws
         try:
-            while status == records.PAUSED:
-                self._supply()
+            while status in (records.PAUSED, records.ASKS):
+                if status == records.PAUSED:
+                    self._supply()
+                elif laws is not None:
+                    laws.ask(plan.phase.name, problem, phase.workspace, self.flight, sampled)
                 status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, arrays)
                 self._follow()
+                if status == records.ASKS:
+                    continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     phase.state.clock[records.TIME] = t_end
                 if phase.external is not None:
@@ -302,7 +345,7 @@ class SampledPhase(Stepper):
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn)
         if before is not None:  # states that were measured about another path
             s, moved = self.sampled, before - made.path[0]
-            for known in (s.seen, s.history, s.sent, s.heard):
+            for known in (s.seen, s.history):
                 np.add(known, moved, out=known)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
@@ -311,7 +354,7 @@ class SampledPhase(Stepper):
         plan, state, sampled = self.phase.plan, self.phase.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y
         y[: 3 * n], y[3 * n : 6 * n] = sampled.S[:, :3].ravel(), sampled.S[:, 3:6].ravel()
-        y[6 * n : 6 * n + m] = sampled.integral[0]
+        y[6 * n : 6 * n + m] = sampled.integral
         if plan.frame is not None:
             y[6 * n + m : 6 * n + m + 4] = sampled.frame[0]
         state.clock[records.TIME] = sampled.clock[fleet.TIME]
@@ -341,7 +384,7 @@ class SampledPhase(Stepper):
         planned = native.record(
             plan.problem, self.phase.workspace, times, np.concatenate(parts, axis=1)
         )
-        out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem)
+        out, kept = _as_flown(planned, call, done, self.flight, problem)
         self.phase.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
     def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
@@ -358,11 +401,11 @@ def _as_flown(
     planned: Record,
     call: fleet.SampledSegment,
     done: int,
-    vehicles: fleet.Quadrotors,
+    flight: fleet.SampledFlight,
     problem: Problem,
 ) -> tuple[Record, VehicleSamples]:
     """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
-    S, a = call.S[:done], call.dS[:done, :, 3:6]
+    S, a, vehicles = call.S[:done], call.dS[:done, :, 3:6], flight.vehicles
     curves = vehicles.thrust.T[..., None]
     rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
     T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
@@ -377,7 +420,10 @@ def _as_flown(
         a=a, f_E=rest, f_D=air, f_u=call.f_u[:done], f_C=call.f_C[:done],
         r_seen=seen[..., :3], v_seen=seen[..., 3:],
     )  # fmt: skip
+    stamp = call.stamp[:done]
+    sent = np.where(stamp < 0, np.nan, flight.start + stamp * flight.steps * flight.h)
     kept = VehicleSamples(
-        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done]
-    )
+        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done],
+        call.times[:done, None] - sent,
+    )  # fmt: skip
     return out, kept

@@ -49,9 +49,9 @@ _LEAST = 2.0**-54
 #: Greatest number of runs.
 _RUNS = 10**8
 #: Tables with seeds of random numbers.
-_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("disturbances", "links"), ("avoidance",)  # fmt: skip
+_SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("network",), ("avoidance",)
 #: Keys that stores have since there are any: they are kept where they are not their defaults.
-_LATER = {"random_numbers", "controller", "rate", "drill"}
+_LATER = {"random_numbers", "controller", "rate", "agent", "drill"}
 
 
 class SweepHeader(Part):
@@ -73,7 +73,7 @@ class SweepHeader(Part):
     )
     random_numbers: Literal["shared", "own"] = Field(
         "shared",
-        description="of noise, gusts and links: shared: every run has the seeds of the mission, so that runs differ "
+        description="of noise, gusts and network: shared: every run has the seeds of the mission, so that runs differ "
         "only in what varies; own: each run has a seed of its own",
     )
     controller: str = Field(
@@ -84,9 +84,19 @@ class SweepHeader(Part):
     rate: Annotated[float, Strict(), Field(gt=0, le=1e6)] = Field(
         50.0, description="rate at which the controller is called [Hz]"
     )
+    agent: str = Field(
+        "",
+        description="law of each vehicle's own, MODULE:NAME: a function of what it knows, or a class, of which each "
+        "vehicle has a new object; for missions with [network]; default: the laws of the mission",
+    )
     drill: Drill | None = Field(
         None, description="faults of the day, in turn, instead of what varies: [drill]"
     )
+
+    @property
+    def own(self) -> tuple[str, str]:
+        """Key of the user's law and its name; the name is "" if the laws of the mission fly."""
+        return ("agent", self.agent) if self.agent else ("controller", self.controller)
 
 
 @dataclass(frozen=True)
@@ -155,6 +165,8 @@ class Sweep:
         controller : a controller of your own, "MODULE:NAME" of a function, or of a class, of which each run has a new
             object; the module is installed or in the current folder
         rate : rate at which the controller is called [Hz]; default: 50
+        agent : a law of each vehicle's own, "MODULE:NAME" of a function, or of a class, of which each vehicle has a
+            new object; see `simulate`
         drill : faults of the day, as the table `[drill]` of a sweep file; nothing else varies then
 
         Raises
@@ -179,7 +191,8 @@ class Sweep:
         Parameters
         ----------
         more : lines of additional variations
-        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate, drill
+        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate, agent,
+            drill
 
         Raises
         ------
@@ -232,29 +245,31 @@ class Sweep:
 
     @cached_property
     def law(self) -> tuple[Any, str]:
-        """The user's controller, or its class, with a digest of its file; None if the mission's laws fly.
+        """The user's controller or law, or its class, with a digest of its file; None if the mission's laws fly.
 
         Raises
         ------
         RigidfleetError
             It cannot be imported.
         """
-        if not (name := self.header.controller):
+        key, name = self.header.own
+        if not name:
             return None, ""
         try:
             return controllers.import_law(name)
         except ImportError as error:
-            raise RigidfleetError(f"controller: {error}\n    {controllers.REMEDY}") from error
+            raise RigidfleetError(f"{key}: {error}\n    {controllers.REMEDY}") from error
 
     @property
     def version(self) -> str:
         """What flies it: the version of rigidfleet, and the user's controller."""
-        law = f" with {self.header.controller} {self.law[1][:8]}" if self.header.controller else ""
+        name = self.header.own[1]
+        law = f" with {name} {self.law[1][:8]}" if name else ""
         return f"rigidfleet {__version__}{law}"
 
     @property
     def random(self) -> bool:
-        """Whether the first run has random numbers: of noise, gusts, links or sensing."""
+        """Whether the first run has random numbers: of noise, gusts, network or sensing."""
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.varied(0), keys) for keys in tables)
 
@@ -456,14 +471,21 @@ def _check(
             collector.add(("evaluate",), why, _WHOLE, "final")
     if mission is not None and whole is not None:
         _taken(collector, lacked, mission, whole)
-    if header is not None and (name := header.controller):
+    if header is not None and header.own[1]:
+        key, name = header.own
         try:
             controllers.import_law(name)
         except ImportError as error:
-            collector.add(("controller",), str(error), controllers.REMEDY)
+            collector.add((key,), str(error), controllers.REMEDY)
         if by_final_states:
-            collector.add(("controller",), "does not act on final states alone", _WHOLE)
-    elif "rate" in data:
+            collector.add((key,), "does not act on final states alone", _WHOLE)
+        if key == "agent" and mission is not None and mission.network is None:
+            collector.add(
+                (key,), "needs a network", "add [network] to the mission, or remove agent"
+            )
+        if key == "agent" and header.controller:
+            collector.add((key,), "does not go with a controller", "give one of them")
+    if "rate" in data and not data.get("controller"):
         collector.add(("rate",), "is that of a controller", "give a controller, or remove rate")
     _same_length(collector, variations)
     if "vary" not in data or data["vary"] == []:
@@ -484,6 +506,9 @@ def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -
             collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
     if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
         collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
+    if drill.links and mission is not None and mission.network is None:
+        problem = "has no effect: without [network], one law knows all states"
+        collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
     grids = drill.grids(1 if mission is None else mission.n_agents)
     if not grids:
         collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")

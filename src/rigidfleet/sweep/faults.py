@@ -115,7 +115,8 @@ def disturb(
     """Put a fault, if it is flown, into the document of a mission of n vehicles that ends at a time [s]."""
     if fault not in FLOWN:
         return
-    table = document["disturbances"] = {**document.get("disturbances", {})}
+    place = "network" if fault == "links" else "disturbances"
+    table = document[place] = {**document.get(place, {})}
     if fault == "wind":
         wind = np.array(table.get("wind", (0.0, 0.0, 0.0)))
         wind[:2] += size * _heading(stream.uniform(0.0, _TURN))[0]
@@ -124,8 +125,6 @@ def disturb(
     key, things = "agent", range(1, n + 1)
     if fault == "links":
         key, things = "between", (1 + proximity.all_pairs(n).T).tolist()
-        table["links"] = {**table.get("links", {})}
-        table = table["links"]
     there = [*table.get("lost", ())]
     rest = [x for x in things if x not in [each[key] for each in there]]
     some = stream.permutation(len(rest))[: int(size)].tolist()

@@ -189,22 +189,21 @@ def _merge(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any
 
 def _seed_paths(mission: Mission) -> list[str]:
     """Paths of the seeds of the random numbers that act on a mission's flight."""
-    d = mission.disturbances
-    if d is None:
-        return []
-    noise, gusts, links = d.noise, d.gusts, d.links
+    d, net = mission.disturbances, mission.network
+    noise, gusts = (None, None) if d is None else (d.noise, d.gusts)
     acting = {
-        "noise": noise is not None and bool(noise.position or noise.velocity or noise.dropped),
-        "gusts": gusts is not None,
-        "links": links is not None and bool(links.dropped),
+        "disturbances.noise": noise is not None
+        and bool(noise.position or noise.velocity or noise.dropped),
+        "disturbances.gusts": gusts is not None,
+        "network": net is not None and bool(net.loss or net.jitter),
     }
-    return [f"disturbances.{name}.seed" for name, acts in acting.items() if acts]
+    return [f"{name}.seed" for name, acts in acting.items() if acts]
 
 
 class _StudySweeps:
     """Sweeps of a study, one after the other, by at most ``count`` processes, which end with the context ``stack``.
 
-    Seeds are the same for noise, gusts and links, at their ``paths``: each draws its own numbers from them.
+    Seeds are the same for noise, gusts and the network, at their ``paths``: each draws its own numbers from them.
     """
 
     def __init__(

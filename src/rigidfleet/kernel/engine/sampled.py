@@ -108,9 +108,9 @@ def _check(flight: SampledFlight, state: SampledState, workspace: Workspace) -> 
     """
     n, m, t, sensing = len(flight.vehicles.m), len(workspace.c), flight.tables, flight.sensing
     each = len(range(t.first, t.last)) if t.last < ENDLESS else 0
-    seen, heard = (-(-t.last // k) - -(-t.first // k) for k in (sensing.every, sensing.link_every))
+    seen = -(-t.last // sensing.every) - -(-t.first // sensing.every)
     needed = {"yaw": each, "jerk": each, "snap": each}
-    needed |= {"noise_r": seen, "noise_v": seen, "dropped": seen, "unheard": heard}
+    needed |= {"noise_r": seen, "noise_v": seen, "dropped": seen}
     for name, rows in needed.items():
         table = getattr(t, name)
         if len(table) and (len(table) < rows or t.last == ENDLESS or table.shape[1] != n):
@@ -118,10 +118,9 @@ def _check(flight: SampledFlight, state: SampledState, workspace: Workspace) -> 
                 f"the table {name!r} of shape {table.shape} does not cover ticks {t.first} to {t.last} of {n} vehicles:"
                 f" it needs {rows} rows"
             )
-    depth = int(sensing.delay.max()) + (int(sensing.link_delay.max()) if sensing.linked else 0)
-    sizes = len(state.S), state.integral.shape, state.work.law_state.shape[1], len(state.heard)
-    views = n if sensing.linked else 0
-    if len(state.history) <= depth or sizes != (n, (views or 1, m), 6 * n + m + 4, views):
+    links = len(flight.network.links)
+    sizes = len(state.S), len(state.integral), state.work.law_state.shape[1], len(state.mail.stamp)
+    if len(state.history) <= sensing.delay.max() or sizes != (n, m, 6 * n + m + 4, links):
         raise ValueError(
             "the state is of another flight or problem: begin a flight by `fleet.begin`, and a phase by"
             " `fleet.under_problem`"
