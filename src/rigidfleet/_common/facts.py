@@ -15,11 +15,15 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
-#: How a fact is judged: not at all, as kept, as worth a note, or as broken.
-Level = Literal["", "ok", "note", "fails"]
+#: How a fact is judged: not at all, as kept, as worth a note, as broken, or as neither kept nor broken for sure.
+Level = Literal["", "ok", "note", "fails", "undecided"]
 #: Words and colours of levels. A row that is not judged has no mark.
-MARKS: dict[Level, str] = {"": "", "ok": "ok", "note": "note", "fails": "FAILED"}
-_STYLES: dict[Level, str] = {"": "", "ok": "green", "note": "yellow", "fails": "bold red"}
+MARKS: dict[Level, str] = {
+    "": "", "ok": "ok", "note": "note", "fails": "FAILED", "undecided": "undecided",
+}  # fmt: skip
+_STYLES: dict[Level, str] = {
+    "": "", "ok": "green", "note": "yellow", "fails": "bold red", "undecided": "bold yellow",
+}  # fmt: skip
 #: Number of columns from which they stand close on a console, to fit 80 characters.
 _MANY = 7
 #: Notebooks set cells to the right, which suits no words.

@@ -40,6 +40,8 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     if words := measured.mission.landings_in_words(measured.result.position[-1]):
         yield words
     yield from avoidance_notes(measured)
+    if "doubt" in measured.result.statistics:
+        yield "a log is judged here as if it were exact; `assess MISSION LOG...` judges it with doubt"
     yield from _samples_note(measured)
     yield from _foreign_flight_notes(measured)
 

@@ -50,6 +50,8 @@ class CheckResult:
     judged : whether the check could fail; False for a value that is only reported
     at_samples : whether the worst is that of the samples, because nothing is known between them
     first : of things that touch, the first contact, where it is known
+    interval : of what was measured, from what to what [`unit`] the true value is
+    undecided : whether the interval has the limit inside; then it has not passed, nor failed
     """
 
     check: str
@@ -65,6 +67,8 @@ class CheckResult:
     judged: bool = True
     at_samples: bool = False
     first: Extreme | None = None
+    interval: tuple[float, float] | None = None
+    undecided: bool = False
 
     @property
     def name(self) -> str:
@@ -78,6 +82,7 @@ class CheckResult:
         if self.first is not None:
             when, who = self.first.when, f"first {self.first.who}"
         level = "fails" if not self.passed else "ok" if self.judged else ""
+        level = "undecided" if self.undecided else level
         return Fact(self.name, self.worst, self.unit, self.limit, self.at_least, when, who, level)
 
     def fill(self, words: str) -> str:

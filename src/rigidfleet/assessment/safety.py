@@ -27,6 +27,7 @@ class Safety:
     limit : None if the mission sets none
     worst : None if there is nothing to measure
     passed : whether the limit is kept; True if there is none
+    undecided : whether it may be kept or not, as far as was measured
     """
 
     quantity: str
@@ -36,6 +37,7 @@ class Safety:
     limit: float | None
     worst: Extreme | None
     passed: bool
+    undecided: bool = False
 
     @property
     def margin(self) -> float | None:
@@ -82,5 +84,6 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             )
             beyond = check is None and worst is not None and limit is not None
             beyond = beyond and not keeps_limit(q, worst.value, limit)
-            rows.append(replace(row, passed=passed and not beyond))
+            unsure = check is not None and check.undecided
+            rows.append(replace(row, passed=passed and not beyond, undecided=unsure))
     return rows

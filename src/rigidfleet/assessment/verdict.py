@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown, worst_values
+from rigidfleet._common.facts import FactTable, Level, Line, Row, Sheet, Shown, worst_values
 from rigidfleet._common.plain import plain
 from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold
@@ -21,6 +21,8 @@ from rigidfleet.assessment.outcome import (
 
 #: Checks that say nothing of a flight without edges.
 _OF_EDGES = {"constraint", "constraint_force", "tension", "singular_value"}
+#: Levels of words for a verdict.
+_LEVELS: dict[str, Level] = {"passed": "ok", "failed": "fails", "undecided": "undecided"}
 #: What a passed verdict says about a check's worst value.
 _PRAISE = {
     "shape": "shapes are within {worst}",
@@ -52,6 +54,7 @@ class Verdict(Shown):
     uncalled : in which phases a user's controller was not called, so that the verdict is on another law; "" if in none
     covers : of a flight that others made, whom and what time "passed" covers; "" for a flight of our own
     read : of a flight that others made, what was read: vehicles, span, columns used and ignored, units and axes
+    doubt : of a log that was judged with doubt: its noise, clock, set-up and vehicles
 
     >>> import rigidfleet as rf
     >>> verdict = rf.assess(rf.simulate("square"))
@@ -68,11 +71,27 @@ class Verdict(Shown):
     uncalled: str = ""
     covers: str = ""
     read: list[dict[str, Any]] = field(default_factory=list)
+    doubt: dict[str, Any] | None = None
 
     @property
     def passed(self) -> bool:
-        """Whether every check holds."""
+        """Whether every check holds, for sure."""
         return all(check.passed for check in self.checks)
+
+    @property
+    def failures(self) -> list[CheckResult]:
+        """Checks that do not hold, for sure."""
+        return [check for check in self.checks if not (check.passed or check.undecided)]
+
+    @property
+    def open_checks(self) -> list[CheckResult]:
+        """Checks of what was measured that may hold or not."""
+        return [check for check in self.checks if check.undecided]
+
+    @property
+    def word(self) -> str:
+        """Passed, failed or undecided."""
+        return "failed" if self.failures else "undecided" if self.open_checks else "passed"
 
     @property
     def by_name(self) -> dict[str, CheckResult]:
@@ -108,10 +127,11 @@ class Verdict(Shown):
 
     def _judgement(self) -> str:
         judged = [check for check in self.checks if check.judged]
-        failed = [check for check in judged if not check.passed]
-        if failed:
-            head = f"Failed: {len(failed)} of {len(judged)} checks."
-            return "\n".join([head, *(f"- {check.message}" for check in failed)])
+        if self.word != "passed":
+            some = self.failures or self.open_checks
+            lines = [*self.failures, *self.open_checks]
+            head = f"{self.word.capitalize()}: {len(some)} of {len(judged)} checks."
+            return "\n".join([head, *(f"- {check.message}" for check in lines)])
         by_check = {f.check: f for f in self.checks if f.worst is not None}
         praise = dict(_PRAISE)
         if "thrust_peak" in by_check:
@@ -135,12 +155,13 @@ class Verdict(Shown):
                     "waypoint": WAYPOINT_TOLERANCE,
                     "flip": FLIPPED,
                 },
-                "checks": [asdict(check) for check in self.checks],
+                "checks": [_plain_check(check) for check in self.checks],
                 "notes": self.notes,
                 "read": self.read,
                 "worst": {name: asdict(extreme) for name, extreme in self.worst.items()},
                 "phases": [asdict(phase) for phase in self.phases],
             }
+            | ({} if self.doubt is None else {"verdict": self.word, "doubt": self.doubt})
         )
 
     def json(self) -> str:
@@ -149,7 +170,9 @@ class Verdict(Shown):
 
     def __repr__(self) -> str:
         judged = [check for check in self.checks if check.judged]
-        failed = sum(not check.passed for check in judged)
+        failed = len(self.failures)
+        if self.word == "undecided":
+            return f"<Verdict {self.mission}: undecided in {len(self.open_checks)} of {len(judged)} checks>"
         ending = f"failed {failed} of {len(judged)}" if failed else f"passed all {len(judged)}"
         return f"<Verdict {self.mission}: {ending} checks>"
 
@@ -171,9 +194,17 @@ class Verdict(Shown):
             _waypoint_table(self.phases),
             worst_values("check", checks),
             *(Line(f"Note: {note}.", "note") for note in self.notes),
-            Line(self.summary, "ok" if self.passed else "fails"),
+            Line(self.summary, _LEVELS[self.word]),
         ]
         return Sheet(self.mission, self.title, parts)
+
+
+def _plain_check(check: CheckResult) -> dict[str, Any]:
+    """A check as plain data; what belongs to doubt is there of what was measured alone."""
+    data = asdict(check)
+    if check.interval is None and not check.undecided:
+        del data["interval"], data["undecided"]
+    return data
 
 
 def _phase_table(phases: list[PhaseVerdict]) -> FactTable:

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from rigidfleet._common.quantities import LIMITS_OF_CURVES
 from rigidfleet.cli import console
-from rigidfleet.cli.codes import FAILED, PASSED
+from rigidfleet.cli.codes import FAILED, PASSED, UNDECIDED
 from rigidfleet.cli.outputs import Files
 from rigidfleet.errors import RigidfleetError
+
+if TYPE_CHECKING:
+    from rigidfleet.assessment import Verdict
+    from rigidfleet.foreign.curves import Trajectories
+    from rigidfleet.result import Result
+    from rigidfleet.simulation.as_logged import Doubts
 
 #: Options that a mission replaces.
 _OWN = ("separation", "separation_altitude", "radius", "ground", "limits")
@@ -34,6 +40,8 @@ def assess(
     gaps: Literal["refuse", "bridge"] | None = None,
     units: str | None = None,
     axes: str | None = None,
+    noise: str | None = None,
+    clock: Literal["recorded", "offset", "own"] | None = None,
     topic: list[str] | None = None,
     origin: tuple[float, float, float] | None = None,
     explain: bool = False,
@@ -42,14 +50,15 @@ def assess(
     force: bool = False,
     json: bool = False,
 ) -> int:
-    """Judge a flight: a result, or trajectories that another program made.
+    """Judge a flight: a result, trajectories that another program made, or logs against their plan.
 
     Parameters
     ----------
     files : Path
         A result (NAME.nc), or trajectories: setpoints (CSV with columns time, x, y, z and, for several vehicles,
         agent), Crazyswarm2's polynomials (CSV, one a vehicle), a Skybrush show (.skyc), a recording of ROS 2 (.mcap,
-        .db3), a log of an autopilot (.ulg, .tlog, .bin), or folders of these.
+        .db3), a log of an autopilot (.ulg, .tlog, .bin), or folders of these. If the first is a mission (its name, or a
+        .toml), or the result of one, the others are logs of what flew it: they are judged against it, with doubt.
     mission : str
         Judge trajectories by this mission's radii, limits and obstacles.
     separation : float
@@ -83,6 +92,14 @@ def assess(
     origin : str
         Origin of positions of a log: latitude and longitude [deg], and height above mean sea level [m]. Default: the
         mission's, that of the estimator, or the first place.
+    noise : str
+        Of measured positions: its standard deviation in a coordinate [m], and its correlation time [s] if it is known,
+        such as 0.003 or 0.003,0.2; log: as the log says; or data: as the samples show it. What is judged then has an
+        interval, and may be undecided. Default: trajectories are exact; of logs against a plan, log if it says it, or
+        data.
+    clock : str
+        Of logs against a plan: recorded (that of the plan), offset (one for all, which is estimated), or
+        own (each vehicle has one; separation is then not judged). Default: recorded.
     explain : bool
         Say first what was read: vehicles, span, columns used and ignored, units and axes.
     out : Path
@@ -104,35 +121,47 @@ def assess(
         "units": units, "axes": axes, "topic": topic, "origin": origin,
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
+    plan = len(files) > 1 and _is_plan(files[0])
     if len(files) == 1 and files[0].suffix == ".nc":
         from rigidfleet.result import Result
 
+        if noise or clock:
+            chosen += ["noise" if noise else "clock"]
         if chosen:
             words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(words)
         result = Result.load(files[0])
+        verdict = judge(result)
     else:
         from rigidfleet.foreign.files import read_trajectories
         from rigidfleet.mission import as_mission
-        from rigidfleet.simulation.trajectories import of_curves
 
         own = [key for key in _OWN if key in chosen]
-        if mission is not None and own:
-            words = f"--{own[0].replace('_', '-')}: no effect with --mission, which has its own; remove one"
+        if (mission is not None or plan) and own:
+            other = "a plan" if plan else "--mission"
+            words = f"--{own[0].replace('_', '-')}: no effect with {other}, which has its own; remove one"
             raise RigidfleetError(words)
+        if plan and mission is not None:
+            raise RigidfleetError(f"--mission: no effect with the plan {files[0]}; remove one")
+        if clock and not plan:
+            raise RigidfleetError(
+                "--clock: needs a plan to compare clocks with; give a mission before the logs"
+            )
         higher = {} if separation_altitude is None else {"separation_altitude": separation_altitude}
-        place = None if mission is None else as_mission(mission).geodetic_origin
-        if origin is None and place is not None:
-            options["origin"] = place.latitude_deg, place.longitude_deg, place.altitude
+        place = mission if mission is not None else files[0] if plan else None
+        if origin is None and place is not None and Path(place).suffix != ".nc":
+            place = as_mission(str(place)).geodetic_origin
+            options["origin"] = place and (place.latitude_deg, place.longitude_deg, place.altitude)
         own = {key: options[key] for key in _READ if options[key] is not None}
-        read = read_trajectories(files, **own)
+        read = read_trajectories(files[plan:], **own)
         if origin is not None and not any("origin" in part for part in read.read):
             raise RigidfleetError("--origin: no file says where on the Earth it is; remove it")
-        result = of_curves(
-            read, mission=mission, separation=separation, limits=_limits(limits or []) | higher,
-            radius=radius or 0.0, ground=ground, name=flight_name(files[0]),
-        )  # fmt: skip
-    verdict = judge(result)
+        judged: dict[str, Any] = {} if plan else {
+            "mission": mission, "separation": separation, "limits": _limits(limits or []) | higher,
+            "radius": radius or 0.0, "ground": ground, "name": flight_name(files[0]),
+        }  # fmt: skip
+        doubts = _doubts(noise, clock) if noise or plan else None
+        result, verdict = _judge(read, files[0] if plan else None, doubts, judged)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
         made.claim(replace=force)
@@ -152,7 +181,65 @@ def assess(
         write_figures(result, of_formats(made.figures, figures, None), quiet=json)
         if not json:
             made.show()
-    return PASSED if verdict.passed else FAILED
+    return {"passed": PASSED, "failed": FAILED, "undecided": UNDECIDED}[verdict.word]
+
+
+def _is_plan(file: Path) -> bool:
+    """Whether a file is a mission or a result, or the name of a shipped mission."""
+    from rigidfleet.mission import mission_names
+
+    return file.suffix in (".toml", ".nc") or (not file.exists() and str(file) in mission_names())
+
+
+def _judge(
+    read: Trajectories, plan: Path | None, doubts: Doubts | None, judged: dict[str, Any]
+) -> tuple[Result, Verdict]:
+    """Trajectories that were read as a flight, and the verdict on it; with doubt, if something may be in doubt."""
+    from rigidfleet.assessment import assess as judge
+
+    if doubts is None:
+        from rigidfleet.foreign.samples import looks_measured
+        from rigidfleet.simulation.trajectories import of_curves
+
+        result = of_curves(read, **judged)
+        verdict = judge(result)
+        if looks_measured(read.curves, read.assumed):
+            verdict.notes.append(
+                "the trajectory looks measured, and is taken as exact: its noise is judged, too. Say --noise"
+            )
+        return result, verdict
+    from rigidfleet.result import Result
+    from rigidfleet.simulation.as_logged import judge_log
+    from rigidfleet.simulation.flight import simulate
+
+    planned = None
+    if plan is not None:
+        planned = Result.load(plan) if plan.suffix == ".nc" else simulate(str(plan))
+    return judge_log(read, planned, doubts, **judged)
+
+
+def _doubts(noise: str | None, clock: Literal["recorded", "offset", "own"] | None) -> Doubts:
+    """What is stated of noise and clock.
+
+    Raises
+    ------
+    RigidfleetError
+        The noise is no number, or not positive.
+    """
+    from rigidfleet.simulation.as_logged import Doubts
+
+    if noise in (None, "data", "log"):
+        return Doubts(noise or "", None, clock or "recorded")
+    try:
+        size, *more = (float(part) for part in noise.split(","))
+    except ValueError:
+        size, more = 0.0, []
+    if not 0.0 < size < 1e3 or len(more) > 1 or not all(0.0 <= tau < 1e3 for tau in more):
+        raise RigidfleetError(
+            f"--noise {noise}: give a standard deviation [m], such as 0.003, with a correlation time [s] if it is"
+            " known: 0.003,0.2; or log, or data"
+        )
+    return Doubts(size, more[0] if more else None, clock or "recorded")
 
 
 def _limits(limits: list[str]) -> dict[str, float]:

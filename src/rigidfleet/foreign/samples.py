@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -16,6 +16,29 @@ ASSUMED = {
     "linear": "straight lines between samples",
     "cubic": "cubic splines through the positions",
 }
+
+#: Correlation of third differences, one after the other, below which they are those of noise (of white noise -3/4, of a
+#: random walk -2/3, of smooth motion near 1), and the least such noise [m].
+_OF_NOISE, _SHOWN = -0.6, 2e-4
+#: Fewest samples by which noise is seen.
+_SAMPLES = 50
+
+
+def looks_measured(curves: Sequence[Piecewise], assumed: str) -> bool:
+    """Whether samples of a vehicle have noise, as they were measured; ``assumed``: what is between them."""
+    if assumed not in ASSUMED.values():
+        return False
+    for curve in curves:
+        third = np.diff(curve.at(curve.time)[:, :3], 3, axis=0)
+        if len(third) < _SAMPLES:
+            continue
+        square = (third**2).mean(axis=0)
+        both = (third[1:] * third[:-1]).mean(axis=0)
+        if (
+            (square > 20.0 * _SHOWN**2) & (both < _OF_NOISE * square)
+        ).any():  # 20: that of white noise
+            return True
+    return False
 
 
 def curve_through_samples(

@@ -30,6 +30,7 @@ from rigidfleet.plotting.curves import (
     limited_motions,
     motion,
 )
+from rigidfleet.plotting.logged import plan_and_flight
 from rigidfleet.plotting.messages import messages
 from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
@@ -60,6 +61,7 @@ __all__ = [
     "messages",
     "motion",
     "operation",
+    "plan_and_flight",
     "plot",
     "rotors",
     "summary",
@@ -72,7 +74,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
         clearance, formations, disturbance, rotors, vehicles, operation, motion,
-        messages,
+        messages, plan_and_flight,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -108,6 +110,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "operation": not leaves_ground(result),
         "messages": result.message_age is None or not result.message_age.size,
         "motion": not limited_motions(result),
+        "plan_and_flight": "bands" not in result.statistics,
     }
     # Of trajectories that others made, most panels of the summary would be empty.
     empty["summary"] = empty["distances"] and empty["inputs"] and empty["attitude"]

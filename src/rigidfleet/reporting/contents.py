@@ -103,7 +103,7 @@ def _names_of(flights: Sequence[Result]) -> list[str]:
 def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[str, Any]:
     mission = result.mission
     judged = [check for check in verdict.checks if check.judged]
-    failed = [finding for finding in judged if not finding.passed]
+    failed = verdict.failures or verdict.open_checks
     return {
         "label": label,
         "head_cell": Cell(label, colour=colour),
@@ -111,8 +111,11 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "title": mission.title,
         "source": mission.source,
         "passed": verdict.passed,
-        "head": _head(len(judged), len(failed)),
-        "words": [f.message for f in failed]
+        "word": verdict.word,
+        "head": _head(
+            len(judged), len(failed), "undecided" if verdict.word == "undecided" else "failed"
+        ),
+        "words": [f.message for f in (*verdict.failures, *verdict.open_checks)]
         or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
         "facts": _facts(result),
@@ -127,14 +130,18 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
     }
 
 
-def _head(judged: int, failed: int) -> str:
-    return f"{failed} of {judged} checks failed" if failed else all_hold(judged)
+def _head(judged: int, failed: int, word: str) -> str:
+    return f"{failed} of {judged} checks {word}" if failed else all_hold(judged)
 
 
 def _covers(flights: Sequence[Result]) -> str:
     """What the flights are, and what the report does not cover."""
     if all(flight.interpolation is not None for flight in flights):
         return "Others made this flight: its curve is judged, not whether vehicles can fly it."
+    if any("doubt" in flight.statistics for flight in flights):
+        return (
+            "This is a log of a flight: what was measured is judged, with what it leaves in doubt."
+        )
     if any(flight.rotor_force is not None for flight in flights):
         return "This is a simulation: real vehicles differ from their models."
     return (
@@ -161,7 +168,7 @@ def _facts(result: Result) -> list[tuple[str, str]]:
         ("formations", ", ".join(forms) or "none"),
         ("control", mission.architecture),
         ("duration", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
-        ("simulated", made),
+        ("judged" if "doubt" in result.statistics else "simulated", made),
     ]
 
 
@@ -262,6 +269,8 @@ def _safety_table(
 
 
 def _level(row: Safety) -> Level:
+    if row.undecided:
+        return "undecided"
     return "" if row.limit is None else "ok" if row.passed else "fails"
 
 

@@ -292,13 +292,7 @@ def of_curve(
     # The end of a step tells whether a vehicle that came near an obstacle below it has landed there, or passed.
     near = max(_STEP, span * n / _WATCHED) if mission.obstacles else np.inf
     grid = time[0] + near * np.arange(1, math.ceil(span / near))
-    fastest: dict[str, Extremum] = {}
-    together = max(1, _TOGETHER // (4 * n * powers))
-    for k in range(0, len(parts), together):  # in blocks, to save memory
-        block = curve.part(k, k + together)
-        way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
-        _watch(watch, way, grid, spans)
-        _accelerations(fastest, way, directed=watch.directed)
+    fastest = watch_curve(watch, curve, grid, spans)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
     watch.only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
     record.extremes.update(watch.phase())
@@ -411,6 +405,20 @@ def _split(time: Floats, parts: Ints) -> Floats:
     k = np.repeat(np.arange(len(parts)), parts)
     share = (np.arange(len(k)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[k]
     return np.append(time[k] + np.diff(time)[k] * share, time[-1])
+
+
+def watch_curve(
+    watch: CurveWatch, curve: Piecewise, grid: Floats, spans: Sequence[Sequence[float]]
+) -> dict[str, Extremum]:
+    """Watch a curve (K, N, 3 or more, P), see `_watch`, and return its greatest accelerations."""
+    fastest: dict[str, Extremum] = {}
+    together = max(1, _TOGETHER // (4 * curve.pieces.shape[1] * curve.pieces.shape[-1]))
+    for k in range(0, len(curve.pieces), together):  # in blocks, to save memory
+        block = curve.part(k, k + together)
+        way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
+        _watch(watch, way, grid, spans)
+        _accelerations(fastest, way, directed=watch.directed)
+    return fastest
 
 
 def _watch(

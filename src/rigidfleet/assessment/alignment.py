@@ -1,0 +1,166 @@
+"""What of the distance between a flight and its plan a clock and a set-up explain: offsets, a turn, a shift, a scale.
+
+A place p of the plan at its time t is at scale Rz(turn) p + shift in the log, at t + offset. All are fitted at once by
+least squares. Errors are those of a fit whose remains are independent from one part of the flight to another alone, not
+from sample to sample ("sandwich"), as what a controller leaves is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rigidfleet.typing import Bools, Floats
+
+#: Positions and velocities (K, 3) of vehicle i at times (K,) of the plan.
+PlanStates = Callable[[int, Floats], tuple[Floats, Floats]]
+#: Times (K,) [s] and smoothed positions (K, 3) [m] of each vehicle.
+Logs = Sequence[tuple[Floats, Floats]]
+#: Parts of a flight that count as independent; turns of the fit; step of the search for a clock far off [s], and
+#: samples of a vehicle that are used for it, and for the fit.
+_PARTS, _TURNS, _STEP, _FEW, _MANY = 16, 12, 0.25, 150, 2000
+#: Parameters: offset [s], turn [rad], logarithm of the scale, shift [m]. What moves places less than this tells none
+#: of the first three [m/s, m, m]; errors from which on they are not told, and least errors, as what a controller leaves
+#: looks like a little of each.
+_MOVES, _UNTOLD = (0.02, 0.05, 0.05), np.array([0.1, 0.1, 0.1, np.inf, np.inf, np.inf])
+_FLOOR = np.array([1e-3, 5e-4, 2e-4, 1e-3, 1e-3, 1e-3])
+#: Parameters of one vehicle beside those of all: its offset and its shift.
+_OF_ONE = np.array([True, False, False, True, True, True])
+#: Errors from which on a vehicle's offset differs from that of others, and the least that does [s].
+_SURE, _LATE = 4.0, 0.01
+
+
+class Alignment(NamedTuple):
+    """What of a log is explained by clock and set-up; values with their standard errors, NaN if they cannot be told.
+
+    Attributes
+    ----------
+    fit : (2, 6) offset by which stamps of the log are later than the plan [s], turn about the vertical [rad], logarithm
+        of the scale, shift x, y, z [m]
+    own : (2, N) offset of each vehicle [s]
+    as_logged, explained : root mean square distance from the plan [m], with clock and set-up, and without
+    """
+
+    fit: Floats
+    own: Floats
+    as_logged: float
+    explained: float
+
+    @property
+    def late(self) -> Bools:
+        """Vehicles (N,) whose own offset differs from that of all."""
+        value, error = self.own
+        usual = np.median(value[np.isfinite(value)]) if np.isfinite(value).any() else np.nan
+        return np.abs(value - usual) > np.maximum(_SURE * error, _LATE)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data: pairs of a value and its standard error."""
+        shown = self.fit.copy()
+        shown[:, 1], shown[0, 2] = np.degrees(shown[:, 1]), np.exp(shown[0, 2])
+        pairs = [x.tolist() if np.isfinite(x[1]) else None for x in shown.T]
+        facts = dict(zip(("offset_s", "turn_deg", "scale"), pairs, strict=False))
+        return facts | {
+            "shift_m": pairs[3:], "rms_as_logged_m": self.as_logged, "rms_explained_m": self.explained,
+        }  # fmt: skip
+
+
+def align(logs: Logs, plan: PlanStates, span: tuple[float, float], clock: str) -> Alignment:
+    """The clock and the set-up of logs against a plan from when to when [s].
+
+    ``clock``: "recorded", near that of the plan; "offset", anywhere; or "own", each log anywhere for itself
+    """
+    logs = [(t[:: -(-len(t) // _MANY)], x[:: -(-len(t) // _MANY)]) for t, x in logs]
+    start = np.zeros(6)
+    apart = np.zeros(len(logs))
+    if clock == "own":
+        for i, log in enumerate(logs):
+            apart[i] = _nearest_offset([log], lambda _, t, i=i: plan(i, t), span)
+        logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
+    start[0] = _nearest_offset(logs, plan, span) if clock == "offset" else 0.0
+    every = np.ones(6, dtype=np.bool_)
+    whole, errors, left = _fit(logs, plan, span, start, every)
+    own = np.empty((2, len(logs)))
+    for i, log in enumerate(logs):
+        alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, _OF_ONE)
+        own[:, i] = np.where(np.isfinite(error[0]), [alone[0], error[0]], np.nan)
+    own[0] += apart
+    errors[0] = errors[0] if np.ptp(apart) == 0.0 else np.nan  # all have none in common
+    whole[0] += apart[0]
+    fit = np.where(np.isfinite(errors), [whole, errors], np.nan)
+    return Alignment(fit, own, _fit(logs, plan, span, start, ~every)[2], left)
+
+
+def _residuals(
+    logs: Logs, plan: PlanStates, span: tuple[float, float], q: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Off (M, 3), its derivatives (M, 3, 6) by the parameters q, and to which part (M,) of the flight each belongs."""
+    rows = []
+    c, s = np.cos(q[1]), np.sin(q[1])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) * np.exp(q[2])
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    for i, (t, x) in enumerate(logs):
+        inside = (t - q[0] >= span[0]) & (t - q[0] <= span[1])
+        p, v = (y @ turn.T for y in plan(i, t[inside] - q[0]))
+        slope = np.zeros((len(p), 3, 6))
+        slope[:, :, 0], slope[:, :, 1], slope[:, :, 2], slope[:, :, 3:] = (
+            -v,
+            p @ quarter.T,
+            p,
+            np.eye(3),
+        )
+        part = _PARTS * i + (_PARTS * (t[inside] - t[0]) / (t[-1] - t[0] + 1e-9)).astype(np.int64)
+        rows.append((x[inside] - p - q[3:], slope, part))
+    off, slopes, parts = zip(*rows, strict=True)
+    return np.concatenate(off), np.concatenate(slopes), np.concatenate(parts)
+
+
+def _fit(
+    logs: Logs, plan: PlanStates, span: tuple[float, float], start: Floats, free: Bools
+) -> tuple[Floats, Floats, float]:
+    """The ``free`` parameters (6,) that a flight tells, from a start; their errors; the distance that is left."""
+    q, free, k = start.copy(), free.copy(), 0
+    while True:
+        off, slope, part = _residuals(logs, plan, span, q)
+        if not (len(off) and free.any()) or k == _TURNS:
+            break
+        for j in np.flatnonzero(free[:3]):  # what the others do not explain of it
+            rest, column = (
+                slope[..., free & (np.arange(6) != j)].reshape(3 * len(off), -1),
+                slope[..., j].ravel(),
+            )
+            alone = column - rest @ np.linalg.lstsq(rest, column, rcond=None)[0]
+            if np.sqrt(3.0 * (alone**2).mean()) < _MOVES[j]:
+                free[j], q[j] = False, start[j]
+        step = np.linalg.lstsq(slope[..., free].reshape(3 * len(off), -1), off.ravel(), rcond=None)[
+            0
+        ]
+        step[: int(free[0])] = np.clip(step[: int(free[0])], -0.5, 0.5)
+        q[free] += step
+        k = _TURNS if np.abs(step).max() < 1e-7 else k + 1
+    errors = np.full(6, np.nan)
+    if len(off) and free.any():
+        A = slope[..., free]
+        inverse = np.linalg.pinv(np.einsum("kij,kil->jl", A, A))
+        moments = np.einsum("kij,ki->kj", A, off)
+        sums = np.array([moments[part == j].sum(axis=0) for j in np.unique(part)])
+        spread = inverse @ sums.T @ sums @ inverse * len(sums) / max(len(sums) - 1, 1)
+        errors[free] = np.sqrt(np.diag(spread) + _FLOOR[free] ** 2)
+        errors[errors > _UNTOLD] = np.nan
+    return q, errors, float(np.sqrt((off**2).sum(axis=1).mean())) if len(off) else np.nan
+
+
+def _nearest_offset(logs: Logs, plan: PlanStates, span: tuple[float, float]) -> float:
+    """The offset on a grid at which shapes of ways agree best, whatever the set-up."""
+    few = [(t[:: -(-len(t) // _FEW)], x[:: -(-len(t) // _FEW)]) for t, x in logs]
+    begin, end = min(t[0] for t, _ in few), max(t[-1] for t, _ in few)
+    least = 0.5 * min(end - begin, span[1] - span[0])
+    best = np.inf, 0.0
+    for offset in np.arange(begin - span[1] + least, end - span[0] - least + _STEP, _STEP).tolist():
+        off, slope, _ = _residuals(few, plan, span, np.array([offset, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        A, b = slope[..., 1:].reshape(-1, 5), off.ravel()
+        if len(off) > 5:
+            left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
+            best = min(best, (float((left**2).mean()), offset))
+    return best[1]

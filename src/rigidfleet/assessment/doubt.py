@@ -1,0 +1,288 @@
+"""A verdict on what was measured: passed, failed, or undecided, by intervals of all that is judged.
+
+What is judged of places changes no more than the places do: a distance from a slot, a wall or a fence by at most the
+distance of a vehicle's true place from the likely one, a distance of two vehicles by that of their true difference from
+the likely one, a speed by that of velocities. How far these are apart is known from ways drawn beside the likely one
+(`deviations`). An extreme is worse than what it was taken from is wrong at one time: so the greatest deviation counts,
+over all times and vehicles at which the extreme may be. That is a simultaneous band, which has no bias.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from rigidfleet._common.quantities import quantity
+from rigidfleet.assessment.alignment import Alignment
+from rigidfleet.assessment.measure import Measurements
+from rigidfleet.assessment.outcome import CheckResult, keeps_limit, value
+from rigidfleet.assessment.verdict import Verdict
+from rigidfleet.math import proximity
+from rigidfleet.math.smoothing import NoiseEstimate
+from rigidfleet.result import Result
+from rigidfleet.result.quantities import SAMPLED
+from rigidfleet.typing import Floats, Ints
+
+#: What positions do not show: checks of a log leave it out.
+_UNSEEN = {
+    "record", "settled", "thrust", "thrust_peak", "rotor_force", "saturation", "tilt", "guarantee", "constraint_force",
+    "tension", "singular_value", "jerk", "horizontal_jerk", "vertical_jerk", "waypoint_attitude", "waypoint_rates",
+}  # fmt: skip
+#: Checks of shapes; those of a moment, at the end of a phase; those of which nothing is in doubt.
+_SHAPES = ("shape", "distances", "order", "handedness", "flip")
+_AT_END = (*_SHAPES, "waypoint_position", "waypoint_velocity", "touch_down", "corner")
+_CERTAIN = ("complete", "samples", "abandoned")
+#: Derivative of the position that a check is of, where no quantity says it.
+_ORDERS = {"waypoint_velocity": 1, "touch_down": 1, "corner": 1}
+#: Share of an interval within which a value is at its limit: no rate would decide it.
+_TOO_NEAR = 0.1
+#: What a vehicle is off its slot on average, at least, to be named [m]; errors from which on something is sure.
+_OFF, _SURE = 0.01, 4.0
+#: What a choice of clocks does, in words.
+_APPLIED = {
+    "recorded": "clocks count as recorded (--clock offset takes it out)", "offset": "that is taken out",
+    "own": "each vehicle's own offset is taken out, and separation is not judged",
+}  # fmt: skip
+#: Pairs and times that may be nearest, of which so many are compared, and distances that are computed together.
+_CANDIDATES, _AT_ONCE = 200_000, 4_000_000
+
+
+@dataclass(frozen=True)
+class DrawnWays:
+    """How ways drawn differ from the likely one at the samples of its result.
+
+    Attributes
+    ----------
+    states : (S, 3, K, N, 3) position, velocity, acceleration, of S ways; float32
+    """
+
+    result: Result
+    states: Floats
+
+    @cached_property
+    def measurements(self) -> Measurements:
+        """The likely flight."""
+        return Measurements(self.result)
+
+    def of_check(self, check: CheckResult) -> float:
+        """By how much what is judged may differ from what is true, in the unit of the check."""
+        name = re.sub("_(flight|start|end)$", "", check.check)
+        q, order, shifts = quantity(name), _ORDERS.get(name, quantity(name).order), self.states
+        if name in _AT_END:
+            k = int(np.abs(self.result.time - (check.when or 0.0)).argmin())
+            if name not in _SHAPES:
+                return float(_lengths(shifts[:, order, k]).max(initial=0.0))
+            i, j = proximity.all_pairs(self.result.n_agents)
+            by = float(_lengths(shifts[:, 0, k, i] - shifts[:, 0, k, j]).max(initial=0.0))
+            least = float(_lengths(self.result.position[k, i] - self.result.position[k, j]).min())
+            if (
+                check.worst is None
+            ):  # an order or a handedness is lost where vehicles may change places
+                return by if by > 0.5 * least else 0.0
+            return math.degrees(math.atan2(by, least)) if check.unit == "deg" else by
+        sizes = _lengths(shifts[:, order])
+        most = float(sizes.max(initial=0.0))
+        if q.name in ("separation", "separation_flying"):
+            k, i, j = self._near_pairs(float(check.worst or 0.0) + 4.0 * most)
+            return float(_lengths(shifts[:, 0, k, i] - shifts[:, 0, k, j]).max(initial=0.0))
+        if _is_of_pairs(name):
+            return 2.0 * most
+        if (
+            name == "people"
+        ):  # where a vehicle falls depends on its velocity, for the time of a fall
+            fall = math.sqrt(
+                2.0 * float(np.ptp(self.result.position[..., 2])) / self.result.mission.gravity
+            )
+            return most + fall * float(_lengths(shifts[:, 1]).max(initial=0.0))
+        values = -self.measurements.close.each if name == "clearance" else None
+        if name in SAMPLED and q.who == "agent":
+            values = self.measurements.samples_of(name).rank
+        if values is None or values.shape != sizes.shape[1:]:
+            return most
+        # Only what is near the worst value may be the worst in truth.
+        return float(sizes[:, values >= q.rank(check.worst) - 2.0 * most].max(initial=0.0))
+
+    def _near_pairs(self, reach: float) -> tuple[Ints, Ints, Ints]:
+        """Samples and pairs whose surfaces are nearer than a distance: the nearest ones, if they are many."""
+        radius, (i, j) = self.result.mission.fleet.radius, proximity.all_pairs(self.result.n_agents)
+        parts = np.array_split(self.result.position, -(-len(self.result.time) * len(i) // _AT_ONCE))
+        apart = np.concatenate([_lengths(r[:, i] - r[:, j]).astype(np.float32) for r in parts])
+        apart = (apart - (radius[i] + radius[j])).ravel()
+        near = np.flatnonzero(apart <= max(reach, float(apart.min())))
+        if len(near) > _CANDIDATES:
+            near = near[np.argpartition(apart[near], _CANDIDATES)[:_CANDIDATES]]
+        k, pair = np.divmod(near, len(i))
+        return k, i[pair], j[pair]
+
+
+def _lengths(x: Floats) -> Floats:
+    return np.sqrt(np.einsum("...a,...a->...", x, x))
+
+
+def _is_of_pairs(name: str) -> bool:
+    """Whether a check is of two vehicles or more: without a common clock it is not judged."""
+    return name in (*_SHAPES, "separation_as_planned") or quantity(name).who in ("pair", "edge")
+
+
+def verdict_with_doubt(
+    verdict: Verdict, deviations: DrawnWays | None, facts: dict[str, Any], *, shared: bool
+) -> Verdict:
+    """A verdict with intervals.
+
+    Parameters
+    ----------
+    verdict : on the likely flight
+    deviations : of ways drawn; None: the noise is not known, and nothing with a limit is decided
+    facts : what is told of noise, clock, set-up and vehicles
+    shared : whether all vehicles have one clock
+    """
+    checks = []
+    for check in verdict.checks:
+        why = "" if deviations else "the noise is not told. State it: --noise"
+        if not shared and _is_of_pairs(check.check):
+            why = "vehicles have no common clock"
+            check = replace(check, worst=None, first=None)  # noqa: PLW2901
+        if check.check in _UNSEEN:
+            continue
+        if check.check in _CERTAIN or not (why or deviations):
+            checks.append(check)
+        elif why or deviations is None:
+            words = f"{check.check.replace('_', ' ')} is not judged: {why}"
+            checks.append(
+                replace(check, passed=False, undecided=True, message=words)
+                if check.judged
+                else check
+            )
+        else:
+            checks.append(_with_interval(check, deviations.of_check(check), facts["noise_m"]))
+    return replace(verdict, checks=checks, doubt=facts, notes=[*doubt_notes(facts), *verdict.notes])
+
+
+def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
+    """A check with its interval, decided only if all of the interval is on one side of the limit."""
+    worst, limit = check.worst, check.limit
+    if worst is None:
+        sure = by == 0.0 or check.passed
+        words = "" if sure else ": undecided, as vehicles may be where others seem to be"
+        return replace(check, undecided=not sure, message=check.message + words)
+    at_least = check.at_least or quantity(check.check).at_least
+    low, high = worst - by, worst + by
+    low = low if at_least or worst < 0.0 else max(low, 0.0)
+    words = f"{check.message}; {value(low)} to {value(high)} {check.unit}".rstrip()
+    check = replace(check, interval=(low, high), message=words)
+    if not check.judged or limit is None:
+        return check
+    sense = replace(quantity(check.check), sense="least" if at_least else "greatest")
+    worse, better = (low, high) if at_least else (high, low)
+    if keeps_limit(sense, worse, limit):
+        return replace(check, passed=True)
+    if not keeps_limit(sense, better, limit):
+        return replace(check, passed=False)
+    share = abs(worst - limit) / by
+    rate = (
+        f", or, if it is white, {math.ceil(share**-2.4)} times the rate"
+        if share > _TOO_NEAR
+        else ""
+    )
+    remedy = f"noise of {value(1e3 * sigma * share)} mm would decide it{rate}"
+    words = (
+        words.replace(" is missed,", " may be missed,")
+        .replace(" is met,", " may be missed,")
+        .replace(" is not reached", " may not be reached")
+    )
+    return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
+
+
+def facts_of(
+    flown: Result, deviations: DrawnWays | None, estimate: NoiseEstimate, alignment: Alignment | None, clock: str
+) -> dict[str, Any]:  # fmt: skip
+    """What is told of noise, clock, set-up and, beside a plan, of vehicles: how far off their slots, and when."""
+    noise = estimate.noise
+    facts: dict[str, Any] = {
+        "noise_m": None if noise is None else noise.sigma,
+        "correlation_s": None if noise is None else noise.tau,
+        "source": estimate.source, "remark": estimate.words, "clock": clock,
+    }  # fmt: skip
+    if alignment is None:
+        return facts
+    off = np.where(flown.left[..., None], flown.position - flown.slot_position, np.nan)
+    mean, far = np.nanmean(off, axis=0), np.nan_to_num(np.linalg.norm(off, axis=2))
+    worst, each = far.argmax(axis=0), np.arange(flown.n_agents)
+    shifts = np.full((1, 1, *mean.shape), np.nan) if deviations is None else deviations.states[:, 0]
+    by = np.linalg.norm(shifts.mean(axis=1), axis=2).max(axis=0)
+    size = np.linalg.norm(mean, axis=1)
+    aside = size - np.nan_to_num(by) > np.maximum(_OFF, 2.0 * np.median(size) * (len(size) > 1))
+    columns = {
+        "name": flown.statistics["names"], "mean_off_m": size, "mean_error_m": by, "mean_off_xyz_m": mean,
+        "worst_off_m": far[worst, each], "worst_at_s": flown.time[worst], "offset_s": alignment.own.T,
+        "off_its_slot": aside, "late": alignment.late,
+    }  # fmt: skip
+    rows = zip(*(np.asarray(x).tolist() for x in columns.values()), strict=True)
+    vehicles = [dict(zip(columns, row, strict=True)) for row in rows]
+    return facts | {"alignment": alignment.to_dict(), "vehicles": vehicles}
+
+
+def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
+    """What is told of noise, clock, set-up and vehicles, in sentences without a full stop."""
+    remark = f": {facts['remark']}" if facts["remark"] else ""
+    if facts["noise_m"] is None:
+        yield f"the noise is not told{remark}. State it: --noise"
+    else:
+        tau = facts["correlation_s"]
+        kind = f"with a correlation time of {value(tau, 's')}" if tau else "white"
+        source = "stated" if facts["source"] == "stated" else "as samples show"
+        yield f"the noise of a coordinate is {value(1e3 * facts['noise_m'], 'mm')}, {kind}, {source}{remark}"
+    if "alignment" not in facts:
+        return
+    explained = facts["alignment"]
+    applied = _APPLIED[facts["clock"]]
+    if facts["clock"] == "own":
+        own = (
+            _lateness(*x["offset_s"]) if np.isfinite(x["offset_s"][0]) else "?"
+            for x in facts["vehicles"]
+        )
+        yield f"against the plan, clocks of vehicles are {', '.join(own)}; {applied}"
+    elif explained["offset_s"] is None:
+        yield f"the offset of the clock cannot be told, as the plan hardly moves; {applied}"
+    else:
+        late = _lateness(*explained["offset_s"])
+        yield f"the log is {late} against the plan; {applied}. Positions alone do not tell a clock from a lag"
+    parts = []
+    for key, one, words in (
+        ("turn_deg", 0.0, "turned by {} deg about the vertical"),
+        ("scale", 1.0, "scaled by {}"),
+    ):
+        if (x := explained[key]) and abs(x[0] - one) > _SURE * x[1]:
+            parts.append(words.format(_pair(*x)))
+    if any(x and abs(x[0]) > max(_SURE * x[1], _OFF) for x in explained["shift_m"]):
+        parts.append(f"shifted by ({', '.join(value(x[0]) for x in explained['shift_m'])}) m")
+    if parts:
+        far, left = (value(explained[key], "m") for key in ("rms_as_logged_m", "rms_explained_m"))
+        yield (
+            f"against the plan the log is {' and '.join(parts)}. It is judged as flown, {far} off (root mean square); "
+            f"without clock and set-up, {left} are left"
+        )
+    for each in facts["vehicles"]:
+        if each["off_its_slot"]:
+            off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])
+            x, y, z = (value(1e3 * x) for x in each["mean_off_xyz_m"])
+            peak = f"{value(1e3 * each['worst_off_m'], 'mm')} at {each['worst_at_s']:.2f} s"
+            yield f"{each['name']!r} is {_pair(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
+        if each["late"]:
+            yield f"{each['name']!r} is {_lateness(*each['offset_s'])} by itself: its clock, or its tracking"
+
+
+def _lateness(offset: float, error: float) -> str:
+    return f"{_pair(abs(offset), error)} s {'late' if offset >= 0.0 else 'early'}"
+
+
+def _pair(x: float, error: float) -> str:
+    """A value with its error, to the digits that the error has."""
+    digits = max(0, 1 - math.floor(math.log10(error))) if error > 0.0 else 2
+    return f"{x:.{digits}f} +- {error:.{digits}f}"

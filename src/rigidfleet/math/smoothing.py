@@ -1,0 +1,298 @@
+"""Smoothing of measured positions: the likely way of a vehicle, ways drawn from what is left in doubt, and the noise.
+
+A way is a quartic spline with even knots, whose third derivative wanders (penalised splines: Eilers and Marx,
+Statistical Science 11, 1996; the limit of dense knots is an integrated Wiener process of third order). The noise of a
+measurement has a standard deviation and, if it is not white, a correlation time (a process AR(1), which is whitened).
+All matrices are banded, so that the cost is linear in samples and knots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from rigidfleet.math.piecewise import Piecewise
+from rigidfleet.typing import Floats, Ints
+
+#: Weights (5, 5) of five control points, and powers of the share of a span, of a uniform quartic B-spline.
+QUARTIC = np.array(
+    [[1, -4, 6, -4, 1], [11, -12, -6, 12, -4], [11, 12, -6, -12, 6], [1, 4, 6, 4, -4], [0, 0, 0, 0, 1]]
+) / 24.0  # fmt: skip
+#: Control points of a span, and spans by which two samples whose noise is correlated may be apart.
+_POINTS, _APART = 5, 3
+_WINDOW = _POINTS + _APART
+#: Third differences of control points, and the search for their variance in that of the noise (natural logarithm; from,
+#: to, close enough). The least smooths over 40 knots: beyond it, matrices are no longer positive definite in rounding.
+_THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
+_SMALLEST, _LARGEST, _CLOSE = -22.0, 25.0, 0.1
+#: Turns in which third differences get sizes of their own, ways drawn in each, and degrees of freedom of the sizes.
+_TURNS, _DRAWN, _FREEDOM = 8, 8, 0.3
+#: Vehicles and samples of each by which noise is judged; correlation times that are tried, and the longest [s].
+_SOME, _ENOUGH, _TAUS, _SLOWEST = 4, 10_000, 12, 10.0
+#: Longest correlation time that samples themselves can show beside motion [s].
+_SHOWN = 0.4
+#: Difference of -2 log of a likelihood from which on one noise is clearly likelier than another.
+_CLEAR = 12.0
+#: Lags at which what remains is correlated if it is not white, and the greatest such correlation.
+_LAGS, _WHITE = 5, 0.1
+
+
+class PositionNoise(NamedTuple):
+    """Noise of positions: standard deviation [m] of a coordinate, and its correlation time [s]; 0: white."""
+
+    sigma: float
+    tau: float = 0.0
+
+
+class Positions(NamedTuple):
+    """Measured positions of a vehicle.
+
+    Attributes
+    ----------
+    time : (K,) [s], increasing
+    position : (K, 3) [m]
+    scale : (K,) standard deviation of each, in that of the noise
+    """
+
+    time: Floats
+    position: Floats
+    scale: Floats
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """The likely way of a vehicle and what is left in doubt, as control points of a spline.
+
+    Attributes
+    ----------
+    knots : (M + 1,) even [s]
+    points : (M + 4, 3) [m], the likely ones
+    factor : (8, M + 4) Cholesky factor of their precision, the same for all axes: lower, banded
+    calm : (M + 1,) inverse variances of third differences of control points, in those where the vehicle is calm
+    noise : of the samples
+    deviance : -2 log of the likelihood of noise and size
+    residual : (K, 3) whitened: independent, of variance near one, if the noise is what it is taken for
+    """
+
+    knots: Floats
+    points: Floats
+    factor: Floats
+    calm: Floats
+    noise: PositionNoise
+    deviance: float
+    residual: Floats
+
+    @property
+    def way(self) -> Piecewise:
+        """The likely way: pieces (M, 3, 5)."""
+        return _way_of(self.knots, self.points)
+
+    def deviation(self, random: np.random.Generator) -> Piecewise:
+        """By what a way as likely as the true one, given the samples, differs from the likely one."""
+        return _way_of(self.knots, _draws(self.factor, random.standard_normal(self.points.shape)))
+
+
+def _way_of(knots: Floats, points: Floats) -> Piecewise:
+    h, spans = knots[1] - knots[0], len(knots) - 1
+    windows = np.stack([points[k : k + spans] for k in range(_POINTS)], axis=-1)
+    return Piecewise(knots, windows @ QUARTIC / h ** np.arange(5.0))
+
+
+def knots_over(time: Floats, zero: float, step: float) -> Floats:
+    """Even knots at multiples of a step after a zero [s] that cover times (K,), and a step before and after them."""
+    first, last = np.floor((time[0] - zero) / step), np.ceil((time[-1] - zero) / step)
+    return zero + step * np.arange(first - 1.0, max(last, first + 1.0) + 2.0)
+
+
+class _WhitenedRows(NamedTuple):
+    """Whitened samples: rows of a banded system, (K, 8) from control points (K,) on, and what they give (K, 3)."""
+
+    first: Ints
+    weight: Floats
+    value: Floats
+    deviance: float
+
+    @classmethod
+    def of(cls, samples: Positions, noise: PositionNoise, knots: Floats) -> _WhitenedRows:
+        h, spans, count = knots[1] - knots[0], len(knots) - 1, len(samples.time)
+        span = np.clip(((samples.time - knots[0]) / h).astype(np.int64), 0, spans - 1)
+        share = (samples.time - knots[0]) / h - span
+        sigma = noise.sigma * samples.scale
+        basis = (share[:, None] ** np.arange(5.0)) @ QUARTIC.T / sigma[:, None]
+        value = samples.position / sigma[:, None]
+        weight, first, left = np.zeros((count, _WINDOW)), span.copy(), np.ones(count)
+        shift = np.zeros(count, dtype=np.int64)
+        if noise.tau > 0.0:
+            # Over a longer gap, the noise counts as new: a little is left out of what is known of it.
+            near = np.append(False, np.diff(span) <= _APART)
+            share = np.where(near, np.exp(-np.diff(samples.time, prepend=0.0) / noise.tau), 0.0)
+            shift[1:] = np.where(near[1:], np.diff(span), 0)
+            first -= shift
+            left = 1.0 / np.sqrt(-np.expm1(2.0 * np.log(np.maximum(share, 1e-300))))
+            weight[1:, :_POINTS] = -share[1:, None] * basis[:-1]
+            value[1:] -= share[1:, None] * value[:-1]
+        row = np.arange(count)
+        for k in range(_POINTS):
+            weight[row, shift + k] += basis[:, k]
+        # The windows of the last spans would reach beyond the last control point: they begin earlier.
+        over = np.maximum(first + _WINDOW - (spans + _POINTS - 1), 0)
+        for k in np.unique(over[over > 0]):
+            some = np.flatnonzero(over == k)
+            weight[some] = np.roll(weight[some], k, axis=1)
+        deviance = 6.0 * float((np.log(sigma) - np.log(left)).sum())
+        return cls(first - over, weight * left[:, None], value * left[:, None], deviance)
+
+    def normal_equations(self, count: int) -> tuple[Floats, Floats]:
+        """The band (8, C) of the matrix, lower, and the right-hand sides (C, 3), of C control points."""
+        band, right = np.zeros((_WINDOW, count)), np.zeros((count, 3))
+        for i in range(_WINDOW):
+            at, own = self.first + i, self.weight[:, i]
+            for axis in range(3):
+                right[:, axis] += np.bincount(at, own * self.value[:, axis], count)
+            for j in range(i, _WINDOW):
+                band[j - i] += np.bincount(at, own * self.weight[:, j], count)
+        return band, right
+
+    def times(self, points: Floats) -> Floats:
+        """The rows times control points (C, 3)."""
+        return sum(self.weight[:, [i]] * points[self.first + i] for i in range(_WINDOW))
+
+
+def smooth(
+    samples: Positions, noise: PositionNoise, knots: Floats, calm: Floats | None = None
+) -> Smoothed:
+    """The likely way of a vehicle on even knots (M + 1,) [s].
+
+    First, all third differences have one size, the likeliest; if the noise has no standard deviation (NaN), it is the
+    likeliest, too. Then, differences get sizes of their own, of Student's distribution, as vehicles are calm for long
+    and at times are not (variational Bayes: Tipping and Lawrence, Neurocomputing 69, 2005); or they keep to how
+    ``calm`` (M + 1,) the vehicle is.
+    """
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+    from scipy.optimize import minimize_scalar
+
+    free = np.isnan(noise.sigma)
+    unit = PositionNoise(1.0, noise.tau) if free else noise
+    rows, count = _WhitenedRows.of(samples, unit, knots), len(knots) + _POINTS - 2
+    band, right = rows.normal_equations(count)
+    whole, turns = count - 3, _TURNS if calm is None else 0
+    calm = np.ones(whole) if calm is None else calm
+    squares, numbers = float((rows.value**2).sum()), 3 * max(len(samples.time) - 3, 1)
+
+    def solve(weight: Floats) -> tuple[Floats, Floats]:
+        full = band.copy()
+        for i in range(4):
+            for j in range(i, 4):
+                full[j - i, i : i + whole] += _THIRD[i] * _THIRD[j] * weight
+        factor = cholesky_banded(full, lower=True)
+        return cho_solve_banded((factor, True), right), factor
+
+    def evaluate(log_variance: float) -> tuple[float, float]:
+        points, factor = solve(calm * np.exp(-log_variance))
+        quadratic = max(squares - float((points * right).sum()), 1e-12 * squares)
+        of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
+        variance = quadratic / numbers if free else 1.0
+        return rows.deviance + numbers * np.log(
+            variance
+        ) + quadratic / variance + 3.0 * of_points, variance
+
+    zero = 0.0 if free else 2.0 * np.log(noise.sigma)  # in units of the noise, where it is known
+    bounds = _SMALLEST + zero, _LARGEST + zero
+    best = minimize_scalar(
+        lambda x: evaluate(x)[0], bounds=bounds, method="bounded", options={"xatol": _CLOSE}
+    )
+    deviance, variance = evaluate(best.x)
+    weight = calm * np.exp(-best.x)
+    random = np.random.default_rng(0)
+    for _ in range(turns):
+        points, factor = solve(weight)
+        drawn = _draws(factor, random.standard_normal((count, _DRAWN)))
+        size = (np.diff(points, 3, axis=0) ** 2).sum(axis=1)
+        size = size / variance + 3.0 * (np.diff(drawn, 3, axis=0) ** 2).mean(axis=1)
+        weight = (_FREEDOM + 3.0) / (_FREEDOM / weight.mean() + size)
+        weight = np.minimum(weight, np.exp(-bounds[0]))
+    points, factor = solve(weight)
+    sigma = float(np.sqrt(variance))
+    residual = (rows.value - rows.times(points)) / sigma
+    known = PositionNoise(sigma * unit.sigma, noise.tau)
+    calm = np.minimum(weight / np.median(weight), 1.0)
+    return Smoothed(knots, points, factor / sigma, calm, known, deviance, residual)
+
+
+def _draws(factor: Floats, normal: Floats) -> Floats:
+    """Normal numbers (C, ...) with the precision of a banded Cholesky factor."""
+    from scipy.linalg import get_lapack_funcs
+
+    (solve,) = get_lapack_funcs(("tbtrs",), (factor, normal))
+    return solve(factor, normal, uplo="L", trans="T")[0]
+
+
+class NoiseEstimate(NamedTuple):
+    """What the noise is taken for, and whether what remains of samples contradicts it; None: it cannot be known."""
+
+    noise: PositionNoise | None
+    source: str
+    words: str
+
+
+def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) -> NoiseEstimate:
+    """The noise of some vehicles alike: of a stated standard deviation [m], or else of one that they show themselves.
+
+    The correlation time is the likeliest. Without a stated size it must stand out from white noise, and from noise so
+    slow that it cannot be told from motion; and what remains must be white.
+    """
+    some = [_stretch(own) for own in sorted(vehicles, key=lambda own: -len(own.time))[:_SOME]]
+    knots = [knots_over(own.time, 0.0, step) for own in some]
+    usual = float(np.median([np.median(np.diff(own.time)) for own in some]))
+    size = np.nan if sigma is None else sigma
+
+    calm = [
+        smooth(*pair).calm
+        for pair in zip(some, [PositionNoise(size)] * len(some), knots, strict=True)
+    ]
+
+    def fit(tau: float) -> tuple[float, list[Smoothed]]:
+        parts = zip(some, knots, calm, strict=True)
+        every = [smooth(own, PositionNoise(size, tau), k, each) for own, k, each in parts]
+        return sum(each.deviance for each in every), every
+
+    taus = [0.0, *np.geomspace(0.5 * usual, _SLOWEST, _TAUS).tolist()]
+    fits = [fit(tau) for tau in taus]
+    deviances = [deviance for deviance, _ in fits]
+    k = int(np.argmin(deviances))
+    if deviances[0] < deviances[k] + _CLEAR:
+        k = 0
+    every, tau = fits[k][1], taus[k]
+    if 0 < k < len(taus) - 1:
+        # The least of a parabola through the three nearest.
+        before, here, after = deviances[k - 1 : k + 2]
+        by = 0.5 * (before - after) / (before - 2.0 * here + after) if before > here else 0.0
+        ratio = taus[-1] / taus[-2]
+        tau = tau * ratio ** float(np.clip(by, -0.5, 0.5))
+        every = fit(tau)[1]
+    size = float(np.median([each.noise.sigma for each in every]))
+    residual = np.concatenate([each.residual for each in every])
+    lags = [
+        float((residual[j:] * residual[:-j]).mean() / residual.var()) for j in range(1, _LAGS + 1)
+    ]
+    white = max(map(abs, lags)) < _WHITE + 3.0 / np.sqrt(residual.size)
+    clear = k == 0 or (tau < _SHOWN and min(deviances[-1], deviances[0]) > deviances[k] + _CLEAR)
+    known = PositionNoise(size, tau)
+    if sigma is None and not (white and clear):
+        return NoiseEstimate(
+            None,
+            "data",
+            "what remains of the samples is not white, nor noise of one correlation time",
+        )
+    return NoiseEstimate(
+        known, "data" if sigma is None else "stated", "" if white else "what remains is not white"
+    )
+
+
+def _stretch(own: Positions) -> Positions:
+    """The middle of the samples, so many that the noise shows."""
+    first = max(0, (len(own.time) - _ENOUGH) // 2)
+    return Positions(*(x[first : first + _ENOUGH] for x in own))

@@ -1,0 +1,299 @@
+"""Logs of a flight: smoothed, aligned with its plan, and judged like a flight of our own, with what is left in doubt.
+
+The likely way of each vehicle (`math.smoothing`) is watched in continuous time and judged as every flight is. How far
+the true ones may be from it is known from ways drawn beside it; `assessment.doubt` makes intervals of that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from rigidfleet.assessment import Verdict, assess
+from rigidfleet.assessment.alignment import Alignment, align
+from rigidfleet.assessment.doubt import DrawnWays, facts_of, verdict_with_doubt
+from rigidfleet.errors import TrajectoryError
+from rigidfleet.foreign.curves import Trajectories
+from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.math.piecewise import Piecewise, join
+from rigidfleet.math.smoothing import (
+    NoiseEstimate,
+    PositionNoise,
+    Positions,
+    Smoothed,
+    knots_over,
+    noise_of,
+    smooth,
+)
+from rigidfleet.result import Extremum, Result, presence
+from rigidfleet.result.result import CLOSE, VARIABLES
+from rigidfleet.setpoints import ways_of
+from rigidfleet.simulation.extremes import CurveWatch
+from rigidfleet.simulation.recording import Places, distances, text_of
+from rigidfleet.simulation.trajectories import of_curve, watch_curve
+from rigidfleet.typing import Floats
+
+#: What is believed of clocks: that they are those of the plan as recorded, that one offset is all that they differ from
+#: it, or that each vehicle has its own.
+Clock = Literal["recorded", "offset", "own"]
+#: Time between knots of smoothed ways [s], unless samples are rarer: so short that a corner of a velocity is seen.
+_STEP = 0.025
+#: Ways that are drawn: as many as fit into so many knots, within bounds.
+_KNOTS, _MOST, _LEAST = 8_000_000, 40, 12
+#: Standard deviations of a position by which a vehicle that stands on something may be in it.
+_TOUCH = 4.0
+#: Times for which a result keeps how far places are in doubt.
+_BANDS = 500
+#: Share by which the noise that samples show is more than the one stated.
+_MORE = 1.5
+#: Correlation times of noise of which no more is known than its size [s].
+_COURSES = (0.0, 0.05, 0.2)
+#: Time between the places that are aligned, at least [s], and that between samples beside obstacles.
+_ALIGNED, _NEAR = 0.05, 0.05
+#: What nobody can say of a flight of which positions alone are known.
+_FORCES = {
+    "input_force", "constraint_force", "external_force", "thrust", "wrench_asked", "wrench_achieved", "multiplier",
+    "singular_value", "integral", "attitude", "rates", "disturbance_force", "measured_position", "measured_velocity",
+}  # fmt: skip
+WORDS = "a smoothing spline, with doubt"
+
+
+class Doubts(NamedTuple):
+    """What is stated: the noise [m] or who tells it ("": the log or data), its correlation time [s], the clock."""
+
+    noise: float | Literal["log", "data", ""]
+    tau: float | None = None
+    clock: Clock = "recorded"
+
+
+def judge_log(
+    read: Trajectories, plan: Result | None, doubts: Doubts, **judged: Any
+) -> tuple[Result, Verdict]:
+    """The flight of a log and the verdict on it, with doubt.
+
+    Parameters
+    ----------
+    read : the log
+    plan : the flight that was planned; None: there is none, and limits are those ``judged``, see `of_curve`
+
+    Raises
+    ------
+    TrajectoryError
+        The log has no samples, or other vehicles or times than the plan.
+    """
+    if read.assumed not in ASSUMED.values():
+        raise TrajectoryError(f"{read.names[0]}: has curves, which are exact. Remove --noise.")
+    if plan is not None and plan.n_agents != len(read.names):
+        words = f"has {plan.n_agents} agents, and the log {len(read.names)} vehicles"
+        raise TrajectoryError(f"the plan {plan.mission.name!r} {words}. Give the log of each.")
+    logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
+    own_sizes = [
+        x.deviation for x in read.measured if x.deviation is not None and (x.deviation > 0.0).all()
+    ]
+    if doubts.noise == "log" and len(own_sizes) < len(logs):
+        raise TrajectoryError(
+            f"{read.names[0]}: the log does not say its noise. State it: --noise."
+        )
+    if doubts.noise in ("log", "") and len(own_sizes) == len(logs):
+        # The least of a log is the unit.
+        least = float(min(x.min() for x in own_sizes))
+        doubts = doubts._replace(noise=least)
+        sizes = (np.sqrt((x**2).mean(axis=1)) / least for x in own_sizes)
+        logs = [log._replace(scale=size) for log, size in zip(logs, sizes, strict=True)]
+    if read.own_clocks:
+        if plan is None:
+            raise TrajectoryError(
+                "each vehicle has a clock of its own. Give a plan to compare them with."
+            )
+        doubts = doubts._replace(clock="own")
+    step = max(_STEP, *(float(np.median(np.diff(log.time))) for log in logs))
+    estimate = _noise_of_logs(logs, doubts, step)
+    noise = estimate.noise or PositionNoise(math.nan)
+    planned = None if plan is None else _planned_ways(plan)
+    alignment, offsets = None, np.zeros(len(logs))
+    if planned is not None:
+        smoothed = _smooth_all(logs, noise, step)
+        alignment = _alignment(smoothed, logs, planned, doubts.clock)
+        offsets = _offsets(alignment, doubts.clock)
+        logs = [log._replace(time=log.time - by) for log, by in zip(logs, offsets, strict=True)]
+    smoothed = _smooth_all(logs, noise, step)
+    # Beside a plan, a sample counts a usual step beyond it, by part of which clocks may be off.
+    ends = np.array([log.time[[0, -1]] for log in logs])
+    if planned is not None:
+        ends += np.array([[-1.0, 1.0]]) * [[np.median(np.diff(log.time))] for log in logs]
+    whole = join(
+        [each.way.between(*end) for each, end in zip(smoothed, ends.tolist(), strict=True)]
+    )
+    spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else []
+    if plan is None or planned is None:
+        blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
+        flown = of_curve(
+            whole.beside(blank), WORDS, names=read.names, spans=spans, since=read.since, **judged
+        )
+    else:
+        flown = flight_of_plan(plan, planned, whole, spans)
+    touch = _TOUCH * np.nan_to_num(noise.sigma)
+    more = {
+        "names": list(read.names),
+        "notes": list(read.notes),
+        "read": list(read.read),
+        "touch": touch,
+    }
+    flown.statistics |= more
+    deviations = None
+    if estimate.noise is not None:
+        # Noise of a known size and an unknown course may be any of several; each gives ways of its own.
+        unknown = _COURSES if estimate.words and estimate.source == "stated" else ()
+        models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau), step) for tau in unknown)]
+        late = alignment.fit[1, 0] if alignment and doubts.clock == "offset" else 0.0
+        deviations = DrawnWays(flown, _deviations(flown, models, late))
+        if plan is not None:
+            step = -(-len(flown.time) // _BANDS)
+            place = np.linalg.norm(deviations.states[:, 0, ::step], axis=3).max(axis=0).round(6)
+            flown.statistics["bands"] = {
+                "time": flown.time[::step].tolist(),
+                "place": place.tolist(),
+            }
+    facts = facts_of(flown, deviations, estimate, alignment, doubts.clock)
+    verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
+    flown.statistics["doubt"] = facts
+    return flown, verdict
+
+
+def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts, step: float) -> NoiseEstimate:
+    """The noise as it is stated, unless samples show more; or as they show it."""
+    size, tau = doubts.noise, doubts.tau
+    if not isinstance(size, str) and tau is not None:
+        return NoiseEstimate(PositionNoise(size, tau), "stated", "")
+    shown = noise_of(logs, None, step)
+    if isinstance(size, str):
+        return shown
+    if shown.noise is None or shown.noise.sigma <= _MORE * size:
+        return noise_of(logs, size, step)
+    words = f"that is more than the {1e3 * size:.3g} mm stated"
+    return shown._replace(words=words)
+
+
+def _smooth_all(logs: Sequence[Positions], noise: PositionNoise, step: float) -> list[Smoothed]:
+    return [smooth(log, noise, knots_over(log.time, 0.0, step)) for log in logs]
+
+
+def _planned_ways(plan: Result) -> Piecewise:
+    """The plan: ways of slots, and of vehicles as they fly in the simulator where no slots are tracked."""
+    slots, flown = plan.motion(), plan.motion(flown=True)
+    state = np.where(np.isnan(slots.state), flown.state, slots.state)
+    still = np.zeros_like(slots.yaw)
+    return ways_of(slots._replace(state=state, yaw=still, yaw_rate=still), slice(None))
+
+
+def _alignment(
+    smoothed: Sequence[Smoothed], logs: Sequence[Positions], planned: Piecewise, clock: Clock
+) -> Alignment:
+    alone = [Piecewise(planned.time, pieces) for pieces in planned.pieces[:, :, :3].swapaxes(0, 1)]
+    places = []
+    for each, log in zip(smoothed, logs, strict=True):
+        t = np.arange(log.time[0], log.time[-1], _ALIGNED)
+        places.append((t, each.way.at(t)))
+    states = lambda i, t: tuple(alone[i].states(t, 2))  # noqa: E731
+    return align(places, states, (float(planned.time[0]), float(planned.time[-1])), clock)
+
+
+def _offsets(alignment: Alignment, clock: Clock) -> Floats:
+    """By how much the stamps of each vehicle (N,) are late [s], as far as that is taken out.
+
+    Raises
+    ------
+    TrajectoryError
+        The offset cannot be told.
+    """
+    own, every = alignment.own[0], alignment.fit[0, 0]
+    if clock == "recorded":
+        return np.zeros(len(own))
+    offsets = np.full(len(own), every) if clock == "offset" else np.where(np.isnan(own), every, own)
+    if np.isnan(offsets).any():
+        raise TrajectoryError(
+            "the clock cannot be told: the plan hardly moves. Use --clock recorded."
+        )
+    return offsets
+
+
+def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: float) -> Any:
+    """By how much ways drawn differ from the likely one (S, 3, K, N, 3); ``late``: the error of a common clock [s]."""
+    random, time = np.random.default_rng(0), flown.time + flown.statistics.get("clock", 0.0)
+    count = int(np.clip(_KNOTS // sum(len(x.knots) for x in models[0]), _LEAST, _MOST))
+    off = np.zeros((count, 3, *flown.position.shape), dtype=np.float32)
+    for i, each in enumerate(models[0]):
+        inside = flown.left[:, i]
+        t = time[inside]
+        ways = [(model[i], model[i].way.states(t, 3) - each.way.states(t, 3)) for model in models]
+        for s in range(count):
+            other, apart = ways[s % len(ways)]
+            off[s][:, inside, i] = apart + other.deviation(random).states(t, 3)
+    rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
+    for s, by in enumerate(late * random.standard_normal(count)):
+        off[s, :2] += by * rates
+    return off
+
+
+def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list[Any]) -> Result:
+    """A result of a plan with ways (K, N, 3, P) in place of what it flew, at the times that both have.
+
+    Forces and attitudes are unknown; those of single vehicles are the planned ones, and are not judged.
+
+    Raises
+    ------
+    TrajectoryError
+        They have no time in common.
+    """
+    mission, n = plan.mission, plan.n_agents
+    inside = (plan.time >= way.time[0] - 1e-9) & (plan.time <= way.time[-1] + 1e-9)
+    if np.count_nonzero(inside) < 2:
+        words = f"{way.time[0]:.6g} to {way.time[-1]:.6g} s, and the plan {plan.time[0]:g} to {plan.time[-1]:g} s"
+        raise TrajectoryError(f"the log covers {words}. If the clocks differ, say --clock offset.")
+    time, at_phase = plan.time[inside], plan.phase[inside]
+    begin, end = float(time[0]), float(time[-1])
+    watch = CurveWatch(mission, begin)
+    grid = np.arange(begin, end, _NEAR if mission.obstacles else np.inf)
+    records = []
+    for record in plan.phases[: at_phase[-1] + 1]:
+        since, until, extremes = (
+            max(record.t_start, begin),
+            min(record.t_end, end),
+            dict[str, Extremum](),
+        )
+        if until - since > 1e-9:
+            fastest = watch_curve(watch, way.between(since, until), grid, spans)
+            extremes = watch.phase() | fastest
+        records.append(replace(record, extremes=extremes, settled=None, controller=None))
+    watch.only(np.ones(n, dtype=np.bool_))
+    watch.flight(records)
+    known: dict[str, Any] = {"edges": plan.edges}
+    for name in VARIABLES:
+        if name not in (*CLOSE, "edges") and (x := getattr(plan, name)) is not None:
+            known[name] = np.full_like(x[inside], np.nan) if name in _FORCES else x[inside]
+    (r, v, a), slots = way.states(time, 3), planned.states(time, 3)[..., :3]
+    share, (i, j) = mission.fleet.mass / mission.fleet.mass.sum(), plan.edges.T
+    length = np.linalg.norm(r[:, i] - r[:, j], axis=2)
+    known |= {
+        "position": r, "velocity": v, "acceleration": a, "slot_position": slots[0], "slot_velocity": slots[1],
+        "slot_acceleration": slots[2], "cm": share @ r, "cm_velocity": share @ v, "distance": length,
+        "constraint": length - known["distance_reference"],
+    }  # fmt: skip
+    left = presence(time, spans, n) if spans else None
+    worst = [record.extremes for record in records]
+    whole = end >= plan.time[-1] - 1e-6
+    result = Result(
+        **known, **dict.fromkeys(CLOSE), phases=records, mission_text="", statistics={"spans": spans},
+        complete=plan.complete and whole, ending=plan.ending if whole else "the log ends",
+        later=[
+            (CLOSE, partial(distances, mission, worst, Places([r], n), time, left)),
+            (("mission_text",), partial(text_of, mission)),
+        ],
+    )  # fmt: skip
+    vars(result)["mission"] = mission
+    return result

@@ -1,0 +1,271 @@
+"""Logs judged with doubt. The oracles are flights of which the truth is known, with noise that the test makes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter
+
+import rigidfleet as rf
+from rigidfleet.assessment.alignment import align
+from rigidfleet.cli.app import main
+from rigidfleet.foreign.curves import Trajectories
+from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.math.smoothing import PositionNoise, Positions, knots_over, noise_of, smooth
+from rigidfleet.simulation.as_logged import Doubts, judge_log
+
+SIGMA, RATE, END = 0.003, 100.0, 12.0
+KINDS = ["white", "ar 0.05", "ar 0.2", "ar 1", "filtered", "quantised", "dropouts"]
+
+
+def places(t: np.ndarray, gap: float = 0.4) -> np.ndarray:
+    """Two vehicles (K, 2, 3) that pass each other at a gap [m]."""
+    one = np.stack([0.5 * (t - 6.0), 0.1 * np.sin(t), 2.0 + 0.2 * np.cos(0.8 * t)], axis=1)
+    other = np.stack([-0.4 * (t - 6.0), gap + 0.1 * np.sin(t), 2.0 + 0.2 * np.cos(0.8 * t)], axis=1)
+    return np.stack([one, other], axis=1)
+
+
+def correlated(random: Any, shape: tuple[int, ...], tau: float) -> np.ndarray:
+    """PositionNoise of a correlation time [s] at `RATE`, by its recursion."""
+    e = SIGMA * random.standard_normal(shape)
+    if tau > 0.0:
+        share = np.exp(-1.0 / (RATE * tau))
+        for k in range(1, len(e)):
+            e[k] = share * e[k - 1] + np.sqrt(1.0 - share**2) * e[k]
+    return e
+
+
+def noisy(
+    kind: str, random: Any, truth: Any = places, end: float = END, **more: Any
+) -> Trajectories:
+    """A log of a flight with noise of a kind."""
+    stamps = np.arange(0.0, end + 1e-9, 1.0 / RATE)
+    t = stamps
+    if kind == "quantised":
+        t = np.sort(stamps + random.uniform(-0.004, 0.004, len(stamps)))
+        t[[0, -1]] = 0.0, end
+        t = t[np.append(True, np.diff(np.round(t, 3)) > 0.0)]
+        stamps = np.round(t, 3)
+    x = truth(t, **more)
+    if kind == "filtered":
+        e = lfilter(
+            *butter(2, 2.0 / (0.5 * RATE)),
+            random.standard_normal((len(t) + 500, *x.shape[1:])),
+            axis=0,
+        )
+        e = SIGMA * e[500:] / e[500:].std()
+    else:
+        e = correlated(random, x.shape, float(kind.split()[1]) if " " in kind else 0.0)
+    kept = np.ones(x.shape[:2], dtype=bool)
+    if kind == "dropouts":
+        kept = random.random(kept.shape) > 0.3
+        kept[[0, -1]] = True
+    return logged(
+        [stamps[kept[:, i]] for i in range(x.shape[1])],
+        [(x + e)[kept[:, i], i] for i in range(x.shape[1])],
+    )
+
+
+def logged(times: list[np.ndarray], positions: list[np.ndarray]) -> Trajectories:
+    curves = (
+        curve_through_samples(t, x, None, "cubic", str)
+        for t, x in zip(times, positions, strict=True)
+    )
+    names = tuple(f"v{i + 1}" for i in range(len(times)))
+    return Trajectories(names, tuple(curves), ASSUMED["cubic"], away=True)
+
+
+many = pytest.mark.parametrize("count", [3, pytest.param(500, marks=pytest.mark.long)])
+
+
+@many
+@pytest.mark.parametrize("kind", KINDS)
+def test_intervals_hold(kind: str, count: int) -> None:
+    """Of a stated size of noise, intervals of the least separation and the speed hold in nine of ten flights."""
+    random, fine = np.random.default_rng(3), np.linspace(0.0, END, 20_001)
+    true = places(fine)
+    least = np.linalg.norm(true[:, 0] - true[:, 1], axis=1).min()
+    fastest = np.linalg.norm(np.gradient(true, fine, axis=0), axis=2).max()
+    held = np.zeros(2)
+    for _ in range(count):
+        _, verdict = judge_log(noisy(kind, random), None, Doubts(SIGMA), separation=0.3)
+        assert verdict.passed
+        for k, (name, value) in enumerate((("separation", least), ("speed", fastest))):
+            low, high = verdict.by_name[name].interval or (np.inf, np.inf)
+            held[k] += low <= value <= high
+    assert (held >= 0.9 * count - 0.4).all(), held / count
+
+
+@many
+@pytest.mark.parametrize("kind", KINDS[:4])
+def test_intervals_of_positions_hold(kind: str, count: int) -> None:
+    """A place is within 1.96 standard deviations of the ways drawn in nine of ten cases."""
+    random, t = np.random.default_rng(4), np.linspace(0.5, END - 0.5, 45)
+    tau = float(kind.split()[1]) if " " in kind else 0.0
+    held = []
+    for _ in range(count):
+        curve = noisy(kind, random).curves[0]
+        log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
+        likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
+        drawn = np.std([likely.deviation(random).at(t) for _ in range(40)], axis=0)
+        held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)
+    assert np.mean(held) > 0.9
+
+
+@many
+def test_a_near_limit_is_undecided(count: int) -> None:
+    """A flight that keeps its limit is never failed, one that collides by more than the noise never passed."""
+    random = np.random.default_rng(5)
+    words = []
+    for gap in (0.4, 0.39, 0.37):
+        for _ in range(max(count // 3, 1)):
+            log = noisy("white", random, gap=gap)
+            _, verdict = judge_log(log, None, Doubts(SIGMA), separation=0.385)
+            words.append((gap, verdict.word))
+    assert {word for gap, word in words if gap == 0.4} == {"passed"}
+    assert "failed" not in {word for gap, word in words if gap == 0.39}
+    assert {word for gap, word in words if gap == 0.37} == {"failed"}
+
+
+@pytest.mark.parametrize(("kind", "tau"), [("white", 0.0), ("ar 0.05", 0.05)])
+def test_noise_is_shown_by_samples(kind: str, tau: float) -> None:
+    """White noise and noise of a short correlation time are estimated from the samples alone."""
+    log = noisy(kind, np.random.default_rng(6), end=40.0)
+    samples = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in log.curves]
+    noise = noise_of(samples, None, 0.05).noise
+    assert noise is not None
+    assert noise.sigma == pytest.approx(SIGMA, rel=0.1)
+    assert noise.tau == pytest.approx(tau, rel=0.3)
+
+
+@pytest.mark.parametrize("kind", ["ar 1", "filtered"])
+def test_noise_that_looks_like_motion_is_not_told(kind: str) -> None:
+    """Slow noise, and that of an estimator, is not estimated: the verdict is undecided and asks for --noise."""
+    _, verdict = judge_log(
+        noisy(kind, np.random.default_rng(7)), None, Doubts("data"), separation=0.3
+    )
+    assert verdict.word == "undecided"
+    assert "--noise" in verdict.summary
+
+
+# -- against a plan -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plan() -> rf.Result:
+    return rf.simulate("narrow-passage")
+
+
+def flown(
+    plan: rf.Result, random: Any, *, late: Any = 0.0, turn: float = 0.0, shift: Any = 0.0
+) -> Trajectories:
+    """A log of a flight of the plan: its clock late [s], its axes turned [deg], its vehicles shifted [m]."""
+    motion = plan.motion(flown=True)
+    late, angle = np.broadcast_to(late, plan.n_agents), np.radians(turn)
+    t = np.arange(plan.time[0], plan.time[-1], 1.0 / 25.0)
+    c, s = np.cos(angle), np.sin(angle)
+    x = np.stack(
+        [
+            [np.interp(t, motion.time, motion.state[:, 0, i, a]) for a in range(3)]
+            for i in range(plan.n_agents)
+        ]
+    )
+    x = x.transpose(2, 0, 1) + np.broadcast_to(shift, (plan.n_agents, 3))
+    x = x @ np.array(
+        [[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]
+    ).T + SIGMA * random.standard_normal(x.shape)
+    return logged([t + by for by in late], list(x.swapaxes(0, 1)))
+
+
+def test_an_offset_of_the_clock_is_recovered(plan: rf.Result) -> None:
+    """An offset of .1 s and a turn of 7 degrees are estimated to 5 ms and .1 degrees, within their errors."""
+    log = flown(plan, np.random.default_rng(8), late=0.1, turn=7.0)
+    _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0, "offset"))
+    assert verdict.doubt is not None
+    found = verdict.doubt["alignment"]
+    for key, true, least in (("offset_s", 0.1, 0.005), ("turn_deg", 7.0, 0.1)):
+        value, error = found[key]
+        assert abs(value - true) < min(least, 3.0 * error)
+    assert verdict.failures  # a turned flight is judged as flown
+    assert any("turned by 7.0" in note for note in verdict.notes)
+
+
+def test_hovering_tells_no_clock() -> None:
+    """Where nothing moves, the offset cannot be told."""
+    random, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.05)
+    still = lambda _i, t: (np.ones((len(t), 3)), np.zeros((len(t), 3)))  # noqa: E731
+    logs = [(t, 1.0 + 1e-4 * random.standard_normal((len(t), 3)))]
+    found = align(logs, still, (0.0, 20.0), "recorded").to_dict()
+    assert found["offset_s"] is None
+    assert found["turn_deg"] is None
+
+
+def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
+    """A vehicle's own offset is reported; its separation is judged as it flew, unless it has a clock of its own."""
+    log = flown(plan, np.random.default_rng(10), late=[0.0, 0.0, 0.2])
+    result, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0))
+    late = verdict.doubt["vehicles"][2] if verdict.doubt else {}
+    assert late["late"]
+    assert late["offset_s"][0] == pytest.approx(0.2, abs=0.005)
+    apart = np.linalg.norm(result.position[:, 1] - result.position[:, 2], axis=1) - 0.5  # radii
+    assert verdict.by_name["separation"].worst == pytest.approx(apart.min(), abs=0.01)
+    assert verdict.word == "failed"
+    _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0, "own"))
+    assert "separation is not judged" in verdict.summary
+    assert verdict.word == "undecided"
+
+
+def test_a_vehicle_off_its_slot_is_named(plan: rf.Result) -> None:
+    """A vehicle 50 mm off its slot is named, with how far and where to; no other is."""
+    shift = np.zeros((3, 3))
+    shift[1, 0] = 0.05
+    _, verdict = judge_log(
+        flown(plan, np.random.default_rng(11), shift=shift), plan, Doubts(SIGMA, 0.0)
+    )
+    named = [note for note in verdict.notes if "off its slot" in note]
+    assert len(named) == 1
+    assert named[0].startswith("'v2'")
+    off = float(named[0].split()[2])
+    assert off == pytest.approx(50.0, abs=0.5)
+    low, high = verdict.by_name["shape"].interval or (0.0, 0.0)
+    assert low < 0.05 < high
+
+
+def test_the_command_says_undecided(
+    plan: rf.Result, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The command reads a plan and its log; undecided has an exit code of its own, and JSON has the intervals."""
+    log = flown(plan, np.random.default_rng(12))
+    rows = ["time_s,agent,x_m,y_m,z_m"]
+    for i, curve in enumerate(log.curves, 1):
+        x = curve.at(curve.time)
+        rows += [
+            f"{t:.4f},{i},{a:.6f},{b:.6f},{c:.6f}"
+            for t, (a, b, c, _) in zip(curve.time, x, strict=True)
+        ]
+    table = tmp_path / "log.csv"
+    table.write_text("\n".join(rows) + "\n")
+    plan.save(tmp_path / "plan.nc")
+    code = main(
+        ["assess", str(tmp_path / "plan.nc"), str(table), "--noise", "0.003,0.02", "--json"]
+    )
+    data = json.loads(capsys.readouterr().out)
+    assert code == {"passed": 0, "failed": 1, "undecided": 3}[data["verdict"]]
+    assert all(
+        c["interval"] for c in data["checks"] if c["check"] in ("separation", "speed", "shape")
+    )
+    assert main(["assess", str(table), "--separation", "3.162", "--noise", "0.003"]) == 3
+    assert "undecided; noise of" in capsys.readouterr().out
+    assert main(["assess", str(table), "--separation", "0.5"]) == 0
+    assert "looks measured" in capsys.readouterr().out
+
+
+def test_without_doubt_nothing_changes(capsys: pytest.CaptureFixture[str]) -> None:
+    """A verdict on an exact trajectory has no words of doubt in its data."""
+    t = np.linspace(0.0, END, 601)
+    verdict = rf.assess(rf.trajectories(t, places(t), separation=0.3))
+    data = verdict.to_dict()
+    assert not {"doubt", "verdict"} & set(data)
+    assert not any({"interval", "undecided"} & set(check) for check in data["checks"])
