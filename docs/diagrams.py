@@ -19,7 +19,10 @@ from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, bernstein
 from rigidfleet.math import attitude, pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
-from rigidfleet.mission import load_mission
+from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning.abort import Aborts
+from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.losses import legs_from
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.plotting.style import DASHES, FAINT, FLOWN, GREY, INK, PALETTE, TONES
@@ -472,6 +475,32 @@ def moving_obstacles() -> Figure:
     return fig
 
 
+def way_home() -> Figure:
+    """An abort of change-of-picture from the side: along the plan at a slowing clock, then home from rest."""
+    fig = Figure(figsize=(9.0, 3.4), layout="constrained")
+    for ax, to in zip(fig.subplots(1, 2, sharey=True), ("any", "own"), strict=True):
+        data = load_mission("change-of-picture").to_dict() | {"abort": {"to": to}}
+        mission = complete_times(Mission.from_dict(data))
+        aborts = Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
+        abort = aborts.at(19.0)
+        before = aborts.plan.states(np.linspace(16.0, abort.begins, 20), 1)[:, 0]
+        t = abort.begins
+        parts = [(before, FAINT, 1.0)]
+        for k, step in enumerate(abort.steps):
+            r = abort.at(np.linspace(t, t + step.duration - 1e-9, 2 if k else 12))
+            parts.append((r, ORANGE if k == 0 else BLUE, 2.0 if k == 0 else 1.0))
+            t += step.duration
+        for r, colour, width in parts:
+            ax.plot(r[..., 0], r[..., 2], color=colour, linewidth=width)
+        ax.plot(*abort.steps[0].end[:, [0, 2]].T, "o", color=ORANGE, markersize=4)
+        ax.plot(*abort.steps[-1].end[:, [0, 2]].T, "o", color=INK, markersize=4)
+        ax.set(xlabel="x [m]", title=abort.way)
+        ax.set_aspect("equal")
+        ax.spines[["top", "right"]].set_visible(False)
+    fig.axes[0].set_ylabel("z [m]")
+    return fig
+
+
 def monitor() -> Figure:
     """The trail, from which the integrator's steps are searched, and the bound by which a step is passed over."""
     fig = Figure(figsize=(9.0, 3.1))
@@ -564,5 +593,5 @@ def by_messages() -> Figure:
 DIAGRAMS: Sequence[Callable[[], Figure]] = (
     edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
     overshoot, solvers, blend, no_inverse, realisations, error_budget, way_found,
-    moving_obstacles, monitor, by_messages,
+    moving_obstacles, monitor, by_messages, way_home,
 )  # fmt: skip

@@ -166,4 +166,5 @@ if __name__ == "__main__":
     words()
     others()
     own_laws()
+    drill()
     drawings()

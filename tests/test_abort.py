@@ -18,6 +18,7 @@ from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.losses import legs_from
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.preflight.aborts import check_aborts
+from rigidfleet.simulation.together import simulate_together
 
 
 def show(**abort: Any) -> Mission:
@@ -277,6 +278,21 @@ def test_what_stands_in_the_way_is_named() -> None:
     abort = aborts_of(mission).at(2.0)
     assert not abort.way
     assert "'roof' stands in the way" in abort.reason
+    result = rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 2.0}}))
+    assert not result.complete
+    assert "'roof' stands in the way" in result.ending
+    assert "no way home is proved" in str([x.text for x in rf.check(result.mission).remarks])
+
+
+def test_flights_side_by_side_abort_like_one_alone() -> None:
+    """Missions that a sweep flies together abort as each does alone."""
+    missions = [show(at=t) for t in (8.0, 8.0)]
+    both = simulate_together(missions)
+    alone = rf.simulate(missions[0])
+    assert alone.phases[-1].name == "abort: down"
+    for result in both:
+        assert [p.name for p in result.phases] == [p.name for p in alone.phases]
+        assert np.abs(result.position[-1] - alone.position[-1]).max() < 1e-6
 
 
 def test_ways_home_stay_within_fences() -> None:

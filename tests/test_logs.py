@@ -4,6 +4,7 @@ import lzma
 import os
 import re
 import struct
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,6 +28,8 @@ def log(tmp_path):
     """A kept log, unpacked."""
 
     def unpack(name: str) -> Path:
+        needs = {".bin": "pymavlink", ".tlog": "pymavlink", ".mcap": "mcap", ".db3": "sqlite3"}
+        pytest.importorskip(needs[Path(name).suffix])
         path = tmp_path / name
         path.write_bytes(lzma.decompress((LOGS / f"{name}.xz").read_bytes()))
         return path
@@ -434,6 +437,23 @@ def test_rosbag2_is_read(log, tmp_path):
     path.write_bytes(path.read_bytes()[:50_000])
     with pytest.raises(TrajectoryError, match="the recording is damaged"):
         read_trajectories(path)
+
+
+def test_damaged_logs_are_one_error(log, tmp_path, capfd):
+    """Whatever bytes a log has, it is read or refused by one kind of error, without a word of its library."""
+    random = np.random.default_rng(5)
+    for name in ("copter.tlog", "odometry.mcap", "transforms.db3"):
+        path = log(name)
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        for k in range(8):
+            bad = data.copy()
+            bad[random.integers(0, len(bad), 10 ** (k % 3))] = random.integers(
+                0, 256, 10 ** (k % 3)
+            )
+            path.write_bytes(bad[: len(bad) - (k % 2) * random.integers(len(bad))].tobytes())
+            with suppress(TrajectoryError):
+                read_trajectories(path, gaps="bridge")
+    assert capfd.readouterr() == ("", "")
 
 
 # -- Crazyflie ---------------------------------------------------------------------------------------

@@ -135,16 +135,17 @@ def read_trajectories(
         again = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
     curves = tuple(curve for part in parts for curve in part.curves)
-    several = len(parts) > 1
-    notes = [f"{group[0].stem}: {note}" if several and "clock" in part.read[0] else note
-             for part, group in zip(parts, listed, strict=True) for note in part.notes]  # fmt: skip
-    notes = [*dict.fromkeys(notes)]
+    whose: dict[str, list[str]] = {}
+    for part, group in zip(parts, listed, strict=True):
+        who = group[0].stem if len(parts) > 1 and "clock" in part.read[0] else ""
+        for note in part.notes:
+            whose.setdefault(note, []).append(who)
+    notes = [*logs.of_all(whose)]
     if len(parts) > 1 and any(part.read[0].get("clock") == logs.GNSS for part in parts):
         notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
     if own_clocks:
-        notes.insert(
-            0, "each vehicle has a clock of its own: times of one say nothing of another's"
-        )
+        words = "each vehicle has a clock of its own: times of one say nothing of another's"
+        notes.insert(0, words)
     if len(notes) > _NOTES:
         notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
     sampled = parts[0].assumed in ASSUMED.values()

@@ -12,7 +12,7 @@ import io
 import math
 from array import array
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, redirect_stderr, redirect_stdout
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
@@ -145,16 +145,26 @@ def read_log(path: Path) -> Log:
         package, read = "pyulog", _read_ulog
     if find_spec(package) is None:
         raise fault(f"needs the package {package!r}", "Run: pip install rigidfleet[logs]")
-    words = io.StringIO()
+    complaints = _Complaints()
     try:
-        with redirect_stdout(words), redirect_stderr(words):
+        with redirect_stdout(complaints), redirect_stderr(complaints):
             log = read(path)
     except Exception as error:  # a damaged log leads the packages to any
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise fault(f"the log is damaged ({reason})", "Copy it again") from None
-    if words.getvalue():
-        log = log._replace(notes=(*log.notes, DAMAGED))
-    return log
+    damaged = complaints.count and DAMAGED not in log.notes
+    return log._replace(notes=(*log.notes, DAMAGED)) if damaged else log
+
+
+class _Complaints(io.TextIOBase):
+    """What a package prints of a damaged log: that it does, since it may be a line for each byte."""
+
+    count = 0
+
+    def write(self, text: str, /) -> int:
+        """Count a text."""
+        self.count += 1
+        return len(text)
 
 
 def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
@@ -185,7 +195,7 @@ def trajectories_of(
     ContentError
         A vehicle has no valid position.
     """
-    tracks, notes = {}, [*log.notes]
+    tracks, notes = {}, {note: [""] for note in log.notes}
     for who, channels in log.vehicles.items():
         reasons: list[str] = []
         for channel in choose(channels, topics):
@@ -197,11 +207,11 @@ def trajectories_of(
         else:
             raise fault("; ".join(reasons[:_LISTED]), "Name a topic that has valid positions")
         others = ", ".join([c.topic for c in channels if c is not channel and not topics][:_LISTED])
-        own = [
-            f"positions are those of {channel.topic}"
-            + f"; --topic may name {others}" * bool(others)
-        ]
-        notes += [f"{who}: {x}" if who else x for x in (*own, *reasons[:1], *track.notes)]
+        words = f"positions are those of {channel.topic}" + f"; --topic may name {others}" * bool(
+            others
+        )
+        for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
+            notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
     first = min(int(track.time[0]) for track in tracks.values())
     zero = first if first > _DATES else 0
@@ -218,7 +228,7 @@ def trajectories_of(
     frames = [*dict.fromkeys(track.frame for track in tracks.values())]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
-        notes.append(f"positions are in frames {words}: where one is in another is not known")
+        notes[f"positions are in frames {words}: where one is in another is not known"] = [""]
     record: dict[str, Any] = {
         "topics": [*dict.fromkeys(track.topic for track in tracks.values())][:20], "frame": frames[0],
         "clock": log.clock or "the vehicle's own, from its start", "since_1970_ns": zero or None,
@@ -231,10 +241,16 @@ def trajectories_of(
         k = np.flatnonzero(np.diff(np.concatenate([[0], on != 0, [0]])))
         spans = (np.append(time, time[-1:])[k].reshape(-1, 2) - zero) / 1e9
         record["armed"] = [f"{a:.6g} to {b:.6g} s" for a, b in spans[:_LISTED]] or "never"
-    read = Trajectories(
-        tuple(tracks), tuple(curves), ASSUMED[interpolation], tuple(notes), (record,)
-    )
+    lines = tuple(of_all(notes))
+    read = Trajectories(tuple(tracks), tuple(curves), ASSUMED[interpolation], lines, (record,))
     return read._replace(measured=tuple(measured), own_clocks=not log.clock)
+
+
+def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
+    """Notes with the names of those whom they are on, unless it is the only one ("")."""
+    for note, names in notes.items():
+        more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
+        yield f"{', '.join(names[:_LISTED])}{more}: {note}" if any(names) else note
 
 
 class _Track(NamedTuple):
@@ -430,7 +446,13 @@ def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
 def _read_bin(path: Path) -> Log:
     from pymavlink.DFReader import DFReader_binary
 
-    with closing(DFReader_binary(str(path))) as log:
+    class Reader(DFReader_binary):
+        """Reader with the index in Python, which gets over what is damaged, and whose messages can be caught."""
+
+        def init_arrays_fast(self, progress_callback: Any = None) -> None:
+            self.init_arrays(progress_callback)
+
+    with closing(Reader(str(path))) as log:
         table = _collect(log)
         last = max(int(own[-1]) for own in log.offsets if len(own))
         notes = (DAMAGED,) if log.data_len - last > _PAGES else ()

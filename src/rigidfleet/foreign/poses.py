@@ -29,8 +29,19 @@ MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _BILLION = 1_000_000_000
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
+#: What no position [m] or quaternion reaches.
+_FAR = 1e9
 #: What reading a damaged recording raises, besides the errors of `mcap`.
-_DAMAGED = (ValueError, EOFError, KeyError, struct.error, RuntimeError, MemoryError, sqlite3.Error)
+_DAMAGED = (
+    ValueError,
+    OverflowError,
+    EOFError,
+    KeyError,
+    struct.error,
+    RuntimeError,
+    MemoryError,
+    sqlite3.Error,
+)
 #: Numbers of a message after its names: a position and a quaternion (7), the covariance of a pose (36, by rows), and a
 #: velocity in the vehicle's axes (3).
 _NUMBERS = {
@@ -162,10 +173,10 @@ def _decode(kind: str, data: bytes) -> Iterator[tuple[str, str, int, Sequence[fl
 def _columns(rows: _Rows) -> dict[str, Floats]:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
     table = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1)
-    known = np.isfinite(table[:, :7]).all(axis=1)
+    known = np.asarray(np.abs(table[:, :7]).max(axis=1) < _FAR)
     columns: dict[str, Any] = {
         "time": np.frombuffer(rows.stamps, dtype=np.int64), "x": np.where(known, table[:, 0], np.nan),
-        "y": table[:, 1], "z": table[:, 2], "yaw": yaws_of(table[:, 3:7]),
+        "y": table[:, 1], "z": table[:, 2], "yaw": yaws_of(np.where(known[:, None], table[:, 3:7], 0.0)),
     }  # fmt: skip
     if table.shape[1] > 7:
         columns |= {f"var_{axis}": table[:, 7 + 7 * k] for k, axis in enumerate("xyz")}

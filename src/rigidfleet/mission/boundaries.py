@@ -80,13 +80,12 @@ class Boundaries:
         d = mission.disturbances
         self.wind = np.array((0.0, 0.0, 0.0) if d is None else d.wind)
         self.g = mission.gravity
+        kind_of = [fence.kind for fence in mission.fences]
         self.every = [
             _Boundary("people", k, partial(self._falls, region), CLOSE_FALL)
             for k, region in areas_of(mission, "people")
         ] + [
-            _Boundary(
-                name, k, partial(_outside, region, mission.fences[k].kind == "inclusion"), CLOSE
-            )
+            _Boundary(name, k, partial(_outside, region, kind_of[k] == "inclusion"), CLOSE)
             for name in ("fence", "soft_fence")
             for k, region in areas_of(mission, name)
         ]
@@ -97,13 +96,9 @@ class Boundaries:
         who = np.tile(np.arange(r.shape[1]), len(r))
         own = [x for x in self.every if x.quantity == quantity]
         blocks = [slice(k, k + _CACHED) for k in range(0, len(who), _CACHED)]
-        ranks = np.array(
-            [np.concatenate([x.measure(states[b], who[b])[0] for b in blocks]) for x in own]
-        ).reshape(len(own), *r.shape[:2])
-        worst = ranks.argmax(axis=0)
-        return QUANTITIES[quantity].rank(ranks.max(axis=0)), np.array([x.number for x in own])[
-            worst
-        ]
+        values = [np.concatenate([x.measure(states[b], who[b])[0] for b in blocks]) for x in own]
+        ranks, number = np.reshape(values, (len(own), *r.shape[:2])), [x.number for x in own]
+        return QUANTITIES[quantity].rank(ranks.max(axis=0)), np.array(number)[ranks.argmax(axis=0)]
 
     def landings(self, r: Floats, v: Floats, level: float) -> Floats:
         """Where vehicles fall to a level [m] that fail at states (K, N, 3): places (K, N, 2) [m]."""
@@ -123,14 +118,12 @@ class Boundaries:
 
         tau = times(m)
         first, last = (tau, tau) if points.shape[2] == 1 else (times(low), times(high))
-        spread = np.linalg.norm(
-            (points - m)[:, [0, 1, 3, 4]].reshape(len(m), 2, 2, -1), axis=2
-        ).max(axis=2)
+        off = (points - m)[:, [0, 1, 3, 4]].reshape(len(m), 2, 2, -1)
+        spread = np.linalg.norm(off, axis=2).max(axis=2)
         place = falls.landing(m[:, None, :3, 0], m[:, None, 3:, 0], tau, k, self.wind)
         away = region.across(place.reshape(-1, 2)).reshape(tau.shape) - self.radius[who][:, None]
-        speed = np.maximum(np.linalg.norm(m[:, 3:5, 0], axis=1), np.linalg.norm(self.wind[:2]))[
-            :, None
-        ]
+        blown = np.linalg.norm(self.wind[:2])
+        speed = np.maximum(np.linalg.norm(m[:, 3:5], axis=1), blown)
         early = np.maximum(last - tau, tau - first)
         reach = spread[:, :1] + spread[:, 1:] * falls.weights(k, last)[0] + speed * early
 
@@ -199,12 +192,10 @@ class BoundaryWatch:
         if not len(agents):
             return
         points, starts = points[:, agents], np.arange(0, len(clock), _BOXED)
+        # Of few numbers beside each other, `min` takes five times as long.
         low, high = (
             f.reduceat(reduce(f, np.moveaxis(points, 3, 0)), starts, axis=0).reshape(-1, 6, 1)
-            for f in (
-                np.minimum,
-                np.maximum,
-            )  # of few numbers beside each other, `min` takes five times as long
+            for f in (np.minimum, np.maximum)
         )
         boxes = 0.5 * (low + high) + 0.5 * (high - low) * np.tile(_CORNERS, (2, 1))
         states = points[starts, :, :, :1].reshape(-1, 6, 1)

@@ -387,5 +387,9 @@ def _areas(m: Draft) -> Breaches:
                 m.keep(path, fences.rules(m, area, path))
                 areas.append(area)
         m.parts[table] = tuple(areas)
+    if m.people and m.right((), "gravity") and m.gravity < 1.0:
+        yield Breach(
+            "gravity", "is too low for falls onto people", "raise it, or remove [[people]]"
+        )
     if m.limits.model_fields_set & {"people"} and not m.data.get("people"):
         yield Breach(("limits", "people"), "has no effect without people", "add [[people]]")

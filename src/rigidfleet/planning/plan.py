@@ -85,7 +85,7 @@ class PhasePlan(Leg):
     damping: Callable[[Bools], float]  # damping mu, from which vehicles are lost (N,)
     lost_at: Floats  # (N,) times at which vehicles are lost [s]
     links_lost: tuple[Ints, Floats]  # pairs (L, 2) and times (L,) of links that are lost
-    loses: bool  # whether vehicles or links are lost at any time of the mission
+    loses: bool  # whether vehicles or links are lost at any time of the mission, or it is aborted
     through: tuple[dict[str, Any], ...]  # points to pass on the way (`points_passed`)
 
     @cached_property
@@ -273,7 +273,8 @@ def plan_phase(
         lies=phase.establishing is not None and not mission.free_attitude(phase), method=method,
         integrator=mission.integrator,
         damping=partial(mission.damping, held), lost_at=mission.lost_at, links_lost=mission.links_lost,
-        loses=mission.first_loss < math.inf, through=points_passed(phase.points, motion),
+        loses=min(mission.first_loss, mission.abandons_at) < math.inf,
+        through=points_passed(phase.points, motion),
     )  # fmt: skip
     if now.lost is not None or len(plan.links_lost[1]):
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost

@@ -34,8 +34,8 @@ def rows(
     beside = [f"{check.message}." for check in verdict.checks if check.check in _AREAS]
     beside = [x[0].upper() + x[1:] for x in beside]
     return [
-        ("Planned", _planned(result)),
-        ("Proved", _proved(result, verdict)),
+        ("Planned", _plan(result)),
+        ("Proved", _proofs(result, verdict)),
         ("Rehearsed", [*rehearsed] or ["No drill belongs to this report."]),
         ("Aborted", [*abort] or ["No way home belongs to this report."]),
         ("Fences and people", beside or ["The mission has neither."]),
@@ -44,7 +44,7 @@ def rows(
     ]
 
 
-def _planned(result: Result) -> list[str]:
+def _plan(result: Result) -> list[str]:
     n, z = result.n_agents, result.position[..., 2]
     lasting = value(float(result.time[-1] - result.time[0]), "s")
     vehicles = "One vehicle flies" if n == 1 else f"{n:,} vehicles fly"
@@ -56,7 +56,7 @@ def _planned(result: Result) -> list[str]:
     return [f"{vehicles} for {lasting}{what}.", f"{ends}."]
 
 
-def _proved(result: Result, verdict: Verdict) -> list[str]:
+def _proofs(result: Result, verdict: Verdict) -> list[str]:
     """The least of the plan's certificates, and how many checks of the flight hold, at all times."""
     proofs = [phase.planned for phase in result.phases if phase.planned is not None]
     lines = []

@@ -153,6 +153,8 @@ def _data_as_flown(
         data["assignment"] = "given"
         data["formations"] = {name: _formation_table(mission, name) for name in mission.formations}
     data["phases"] = [_phase_table(*each) for each in zip(begun, records, strict=True)]
+    if options := own.get("abort"):  # what followed from an order is among the phases
+        data["abort"] = {key: x for key, x in options.items() if key != "at"}
     if disturbed := own.get("disturbances"):
         # What followed from a loss is among the phases
         kept = {key: x for key, x in disturbed.items() if key not in ("on_loss", *ON_LOSS)}
