@@ -251,10 +251,11 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
         They have no time in common.
     """
     mission, n = plan.mission, plan.n_agents
-    inside = (plan.time >= way.time[0] - 1e-9) & (plan.time <= way.time[-1] + 1e-9)
-    if np.count_nonzero(inside) < 2:
+    both = (plan.time >= way.time[0] - 1e-9) & (plan.time <= way.time[-1] + 1e-9)
+    if np.count_nonzero(both) < 2:
         words = f"{way.time[0]:.6g} to {way.time[-1]:.6g} s, and the plan {plan.time[0]:g} to {plan.time[-1]:g} s"
         raise TrajectoryError(f"the log covers {words}. If the clocks differ, say --clock offset.")
+    inside = slice(*(np.flatnonzero(both)[[0, -1]] + [0, 1]))  # a view, to save memory
     time, at_phase = plan.time[inside], plan.phase[inside]
     begin, end = float(time[0]), float(time[-1])
     watch = CurveWatch(mission, begin)
