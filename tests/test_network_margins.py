@@ -147,7 +147,7 @@ def random_formation(seed: int) -> dict[str, Any]:
 
 def grows(tables: dict[str, Any], delay: int, seconds: float) -> bool:
     """Whether what is SMALL at the start grows 100 times within a time [s] in the product's flight."""
-    m = still({"delay": delay / tables["rate"]}, **tables)
+    m = still({"delay": delay / tables["rate"], "silence": 5.0}, **tables)
     problem, work, flight, state = disturbed(m)
     for _ in range(round(seconds / 10.0)):
         fly(problem, work, flight, state, round(10.0 * tables["rate"]))

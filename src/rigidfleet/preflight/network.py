@@ -30,12 +30,14 @@ from rigidfleet.preflight.linear_flight import Arrivals, LinearFlight, Radio
 from rigidfleet.preflight.margins import feedback
 from rigidfleet.typing import Floats
 
+#: Number of links beyond which a formation is not checked: that would take minutes.
+_LARGEST = 6_000
 #: Delays beyond this are not looked at [s].
 _LATEST = 2.0
 #: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius.
 _PERIOD, _VECTORS, _ACCURACY = 1.0, 20, 1e-4
 #: Losses that are tried first; the limit is then found to the hundredth.
-_LOSSES = (0.3, 0.6, 0.8, 0.95)
+_LOSSES = (0.5, 0.8, 0.95)
 #: Time for which second moments move [s].
 _TIME = 12.0
 #: Growth [1/s] from which they count as unstable: more than the error of sampling.
@@ -80,7 +82,7 @@ def linear_flights(
             continue
         edges = mission.formation_edges(name)
         near = np.linalg.norm(slots[edges[:, 0]] - slots[edges[:, 1]], axis=1) <= net.range
-        if near.any():
+        if 0 < 2 * near.sum() <= _LARGEST:
             flight = LinearFlight(slots, edges[near], mission.fleet.mass, law, radio, lags, drag)
             yield name, flight, int((~near).sum())
 
@@ -92,12 +94,8 @@ def _law_ticks(mission: Mission) -> tuple[int, float]:
 
 
 def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
-    own, net, radio, (every, tick) = (
-        mission.network,
-        network_of(mission),
-        flight.radio,
-        _law_ticks(mission),
-    )
+    own, net, radio = mission.network, network_of(mission), flight.radio
+    every, tick = _law_ticks(mission)
     assert own is not None
     latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
     loss = loss_borne(flight) if radio.delay <= delay else None
@@ -270,7 +268,13 @@ def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
 
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:
-    """Remarks on formations whose network is beyond what they bear."""
+    """Remarks on formations whose network is beyond what they bear, or was not checked."""
+    mission, planned = preflight.mission, preflight.planned_phases
+    for name in dict.fromkeys(name for p in planned if (name := p.shapes[1]) is not None):
+        unchecked = mission.network is not None and name not in preflight.network
+        if unchecked and len(mission.formation_edges(name)):
+            text = f"'{name}': not checked over its network: it has no slots, no edge in range, or too many edges"
+            yield Remark("note", "network", text)
     for name, f in preflight.network.items():
         if f.unheard:
             text = f"'{name}': {f.unheard} edges are longer than the range of the network: nobody hears along them"
