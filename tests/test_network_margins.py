@@ -287,9 +287,8 @@ def grown(count: int, flights: int, seconds: float) -> Bools:
     for seed in range(1, count + 1):
         tables = random_formation(seed)
         linear = linear_flight(still({}, **tables))
-        loss = loss_borne(linear)
-        assert (loss is None) == (last_stable_delay(linear) == 0)
-        if loss is not None:
+        if last_stable_delay(linear):
+            loss = loss_borne(linear)
             squares = squares_flown(still({"loss": loss}, **tables), flights, seconds, 50)
             flown.append(squares.max(axis=1) > (100.0 * SMALL) ** 2)
     return np.concatenate(flown)

@@ -130,18 +130,20 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
     # No class of its own: what scipy declares of this one is not how it is made.
     operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
     start = np.random.default_rng(0).normal(size=size)
-    options: dict[str, Any] = {
-        "k": 1,
-        "v0": start,
-        "ncv": _VECTORS,
-        "tol": _ACCURACY,
-        "maxiter": 20,
-    }
-    try:
-        values = eigs(operator, return_eigenvectors=False, **options)
-    except ArpackNoConvergence as stopped:
-        values = stopped.eigenvalues
-    return math.log(np.abs(values).max(initial=1e-300)) / (ticks * flight.radio.tick)
+    options: dict[str, Any] = {"k": 1, "v0": start, "tol": _ACCURACY, "maxiter": 20}
+    values = np.zeros(0)
+    for vectors in (_VECTORS, 3 * _VECTORS):  # many, where several motions grow alike
+        try:
+            values = eigs(
+                operator, return_eigenvectors=False, ncv=min(vectors, size - 1), **options
+            )
+        except ArpackNoConvergence as stopped:
+            values = stopped.eigenvalues
+        if len(values):
+            break
+    return math.log(np.abs(values).max(initial=1e-300) if len(values) else 1.0) / (
+        ticks * flight.radio.tick
+    )
 
 
 def _all(flight: LinearFlight, delay: int) -> Arrivals:
@@ -213,8 +215,8 @@ def _growth(squares: Floats, time: float) -> Floats:
     return 0.5 * np.log(after.mean(axis=0) / before.mean(axis=0)) / (0.5 * time)
 
 
-def loss_borne(flight: LinearFlight) -> float | None:
-    """Share of messages lost up to which the formation is stable in mean square at its own delay; None if at none."""
+def loss_borne(flight: LinearFlight) -> float:
+    """Share of messages lost up to which the formation is stable in mean square at its own delay."""
     few, many, links = _STATES
     states = min(max(links // len(flight.links), few), many)
     tried = np.array(_LOSSES)
