@@ -30,12 +30,14 @@ from rigidfleet.preflight.linear_flight import Arrivals, LinearFlight, Radio
 from rigidfleet.preflight.margins import feedback
 from rigidfleet.typing import Floats
 
+#: Number of links beyond which a formation is not checked: that would take minutes.
+_LARGEST = 6_000
 #: Delays beyond this are not looked at [s].
 _LATEST = 2.0
 #: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius.
 _PERIOD, _VECTORS, _ACCURACY = 1.0, 20, 1e-4
 #: Losses that are tried first; the limit is then found to the hundredth.
-_LOSSES = (0.3, 0.6, 0.8, 0.95)
+_LOSSES = (0.5, 0.8, 0.95)
 #: Time for which second moments move [s].
 _TIME = 12.0
 #: Growth [1/s] from which they count as unstable: more than the error of sampling.
@@ -80,7 +82,7 @@ def linear_flights(
             continue
         edges = mission.formation_edges(name)
         near = np.linalg.norm(slots[edges[:, 0]] - slots[edges[:, 1]], axis=1) <= net.range
-        if near.any():
+        if 0 < 2 * near.sum() <= _LARGEST:
             flight = LinearFlight(slots, edges[near], mission.fleet.mass, law, radio, lags, drag)
             yield name, flight, int((~near).sum())
 
@@ -92,12 +94,8 @@ def _law_ticks(mission: Mission) -> tuple[int, float]:
 
 
 def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
-    own, net, radio, (every, tick) = (
-        mission.network,
-        network_of(mission),
-        flight.radio,
-        _law_ticks(mission),
-    )
+    own, net, radio = mission.network, network_of(mission), flight.radio
+    every, tick = _law_ticks(mission)
     assert own is not None
     latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
     loss = loss_borne(flight) if radio.delay <= delay else None
@@ -132,18 +130,20 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
     # No class of its own: what scipy declares of this one is not how it is made.
     operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
     start = np.random.default_rng(0).normal(size=size)
-    options: dict[str, Any] = {
-        "k": 1,
-        "v0": start,
-        "ncv": _VECTORS,
-        "tol": _ACCURACY,
-        "maxiter": 20,
-    }
-    try:
-        values = eigs(operator, return_eigenvectors=False, **options)
-    except ArpackNoConvergence as stopped:
-        values = stopped.eigenvalues
-    return math.log(np.abs(values).max(initial=1e-300)) / (ticks * flight.radio.tick)
+    options: dict[str, Any] = {"k": 1, "v0": start, "tol": _ACCURACY, "maxiter": 20}
+    values = np.zeros(0)
+    for vectors in (_VECTORS, 3 * _VECTORS):  # many, where several motions grow alike
+        try:
+            values = eigs(
+                operator, return_eigenvectors=False, ncv=min(vectors, size - 1), **options
+            )
+        except ArpackNoConvergence as stopped:
+            values = stopped.eigenvalues
+        if len(values):
+            break
+    return math.log(np.abs(values).max(initial=1e-300) if len(values) else 1.0) / (
+        ticks * flight.radio.tick
+    )
 
 
 def _all(flight: LinearFlight, delay: int) -> Arrivals:
@@ -215,8 +215,8 @@ def _growth(squares: Floats, time: float) -> Floats:
     return 0.5 * np.log(after.mean(axis=0) / before.mean(axis=0)) / (0.5 * time)
 
 
-def loss_borne(flight: LinearFlight) -> float | None:
-    """Share of messages lost up to which the formation is stable in mean square at its own delay; None if at none."""
+def loss_borne(flight: LinearFlight) -> float:
+    """Share of messages lost up to which the formation is stable in mean square at its own delay."""
     few, many, links = _STATES
     states = min(max(links // len(flight.links), few), many)
     tried = np.array(_LOSSES)
@@ -270,7 +270,13 @@ def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
 
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:
-    """Remarks on formations whose network is beyond what they bear."""
+    """Remarks on formations whose network is beyond what they bear, or was not checked."""
+    mission, planned = preflight.mission, preflight.planned_phases
+    for name in dict.fromkeys(name for p in planned if (name := p.shapes[1]) is not None):
+        unchecked = mission.network is not None and name not in preflight.network
+        if unchecked and len(mission.formation_edges(name)):
+            text = f"'{name}': not checked over its network: it has no slots, no edge in range, or too many edges"
+            yield Remark("note", "network", text)
     for name, f in preflight.network.items():
         if f.unheard:
             text = f"'{name}': {f.unheard} edges are longer than the range of the network: nobody hears along them"
