@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.assessment.avoidance import avoidance_notes
+from rigidfleet.assessment.avoidance import avoidance_notes, clock_notes
 from rigidfleet.assessment.checks import abandonment_check
 from rigidfleet.assessment.fits import angle_between
 from rigidfleet.assessment.measure import Measurements
@@ -36,6 +36,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             who = agent_names(np.flatnonzero(full.any(axis=0)))
             since = measured.first_time(full.max(axis=1))
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
+    yield from clock_notes(measured.result)
     yield from avoidance_notes(measured)
     yield from _samples_note(measured)
     yield from _foreign_flight_notes(measured)

@@ -14,8 +14,9 @@ from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: Columns of a message: position [m], velocity [m/s], acceleration and the input's share of it [m/s^2], whether the
-#: vehicle is saturated, and the acceleration by each iterate of the constraint force [m/s^2], three columns each.
-R, V, A, U, SATURATED, PULL = 0, 3, 6, 9, 12, 13
+#: vehicle is saturated, its clock (4, see `clocks.post_clock`), and the acceleration by each iterate of the constraint
+#: force [m/s^2], three columns each.
+R, V, A, U, SATURATED, CLOCK, PULL = 0, 3, 6, 9, 12, 13, 17
 #: Rows of `Mail.count`: messages sent, heard, lost.
 SENT, HEARD, LOST = range(3)
 #: Kinds of random numbers.
@@ -160,7 +161,7 @@ def empty_mail(net: Network, iterations: int) -> Mail:
     columns, shares = PULL + 3 * iterations, iterations + 1
     most = int(np.diff(net.first).max(initial=0))
     message, share = np.zeros((links, columns)), np.zeros((links, shares))
-    if not links:
+    if net.every == 0:
         n = 0
     return Mail(
         np.zeros((depth, n, columns)), np.zeros((depth, links, shares)), np.full((links, depth), _NEVER),
