@@ -13,7 +13,7 @@ BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints cons
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test versions door bench peers robustness avoidance exports replays docs package lint format constraints clean
+.PHONY: help setup demo test versions door bench peers robustness avoidance network exports replays docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -43,6 +43,9 @@ peers: .venv/.peers  ## Fly beside other programs (Octave, too, if it is on PATH
 
 robustness: .venv/.core  ## Fly 200 random formations under every graph and law
 	@$(BIN)/python benchmarks/robustness.py --write docs/robustness.md
+
+network: .venv/.core  ## Fly formations over networks that lose and delay (half an hour)
+	@$(BIN)/python benchmarks/network.py --write docs/network.md
 
 exports: .venv/.interchange  ## Measure every export of three flights
 	@$(BIN)/python benchmarks/exports.py --write docs/export.md

@@ -1,6 +1,6 @@
 """Formations whose vehicles know each other by messages, beside the law that knows all states at once.
 
-    python benchmarks/network.py [--seeds 30] [--time 60]
+    python benchmarks/network.py [--seeds 30] [--time 60] [--write docs/network.md]
 
 Each row flies the same seeds under both, in gusts that no law knows: Ornstein-Uhlenbeck accelerations of 1 m/s^2 with
 a time scale of 2 s on every vehicle of 1 kg. It gives the mean ratio of the root mean square errors of all distances,
@@ -12,11 +12,11 @@ forward by their commanded accelerations. It is not flown by the program: it is 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 from scipy.stats import t as student
 
 import rigidfleet as rf
@@ -54,6 +54,9 @@ PUSH = 0.5
 _DRAG = 1e-3
 #: Time after which errors count [s].
 _SETTLED = 10.0
+#: Broadcasts that the law of everyone keeps.
+_DEPTH = 128
+_BEGIN, _END = "<!-- network -->", "<!-- end -->"
 
 
 def mission(
@@ -103,42 +106,51 @@ def flown(m: rf.Mission) -> tuple[float, float]:
     return errors(slots, result.position[settled]), float(np.sqrt((push**2).sum(axis=1).mean()))
 
 
-def everyone(shape: str, rate: float, network: dict[str, float], seeds: int, time: float) -> Floats:
-    """Ratios (seeds,) of the law of everyone to the law that knows all, on point masses in gusts of their own.
+def everyone(
+    shape: str, rate: float, network: dict[str, float], seeds: int, time: float, noise: float
+) -> tuple[Floats, float]:
+    """Ratios (seeds,) of the law of everyone to the law that knows all, and its push [N], on point masses."""
+    arguments = shape, rate, seeds, time, noise
+    central, _ = _point_masses(*arguments, None)
+    theirs, push = _point_masses(*arguments, network)
+    return theirs / central, push
 
-    Losses are left out: what does not arrive is as late as the last message.
-    """
-    late = max(1, round(network.get("delay", 0.0) * rate))
-    central, theirs = (_point_masses(shape, rate, k, seeds, time) for k in (0, late))
-    return theirs / central
 
-
-def _point_masses(shape: str, rate: float, late: int, seeds: int, time: float) -> Floats:
-    """Errors (seeds,) of shapes whose vehicles know the others ``late`` ticks late; 0: one law knows all."""
+def _point_masses(
+    shape: str, rate: float, seeds: int, time: float, noise: float, network: dict[str, float] | None
+) -> tuple[Floats, float]:
+    """Errors (seeds,) of shapes whose vehicles know the others by a network, or all at once; and the push [N]."""
     slots, pairs = SHAPES[shape]
     edges, n, h = np.array(pairs) - 1, len(slots), 1.0 / rate
     lengths = np.linalg.norm(slots[edges[:, 0]] - slots[edges[:, 1]], axis=1)
-    k1, k2 = 1.0, 2.0**0.5
     rng = np.random.default_rng(7)
     r, v = slots + rng.normal(0, 0.3, (seeds, n, 3)), np.zeros((seeds, n, 3))
     gust, keep = rng.normal(size=r.shape), np.exp(-h / 2.0)
-    views = n if late else 1
+    chances = np.random.default_rng(8)
+    views = 1 if network is None else n
+    late = 0 if network is None else max(1, round(network.get("delay", 0.0) * rate))
+    loss = 0.0 if network is None else network.get("loss", 0.0)
     integral = np.zeros((seeds, views, len(edges)))
-    past: list[tuple[Floats, Floats, Floats]] = []
-    total, count = np.zeros(seeds), 0
-    own = np.arange(n)
+    past = np.zeros(
+        (_DEPTH, 3, seeds, n, 3)
+    )  # what each broadcast: position, velocity, acceleration
+    age = np.full((seeds, n, n), late)
+    a, own, total, pushed, count = np.zeros_like(r), np.arange(n), np.zeros(seeds), 0.0, 0
     for tick in range(round(time * rate)):
         gust = keep * gust + np.sqrt(1 - keep**2) * rng.normal(size=r.shape)
-        R, V = r[:, None], v[:, None]
-        if late and len(past) >= late:
-            r0, v0, a0 = past[-late]
-            age = late * h
-            R = np.repeat((r0 + v0 * age + 0.5 * a0 * age**2)[:, None], n, axis=1)
-            V = np.repeat((v0 + a0 * age)[:, None], n, axis=1)
-            R[:, own, own], V[:, own, own] = r, v
-        elif late:
-            R, V = np.repeat(R, n, axis=1), np.repeat(V, n, axis=1)
-        u = -k1 * (R - slots) - k2 * V
+        seen_r = r + rng.normal(0, noise, r.shape)
+        seen_v = v + rng.normal(0, 2 * noise, r.shape)
+        past[tick % _DEPTH] = seen_r, seen_v, a
+        R, V = seen_r[:, None], seen_v[:, None]
+        if network is not None:
+            heard = chances.uniform(size=age.shape) >= loss
+            age = np.minimum(np.where(heard, late, age + 1), min(tick, _DEPTH - 1))
+            age[:, own, own] = 0
+            then = (tick - age) % _DEPTH, slice(None), np.arange(seeds)[:, None, None], own
+            r0, v0, a0 = np.moveaxis(past[then], 3, 0)
+            old = h * age[..., None]
+            R, V = r0 + v0 * old + 0.5 * a0 * old**2, v0 + a0 * old
+        u = -(R - slots) - np.sqrt(2.0) * V
         J = jacobian(R.reshape(-1, n, 3), edges)
         A = J @ J.transpose(0, 2, 1)
         d, w = (x[..., edges[:, 0], :] - x[..., edges[:, 1], :] for x in (R, V))
@@ -151,15 +163,45 @@ def _point_masses(shape: str, rate: float, late: int, seeds: int, time: float) -
         for _ in range(3):
             y = (inverse @ (b + 0.03 * y)[..., None])[..., 0]
         force = (J.transpose(0, 2, 1) @ y[..., None])[..., 0].reshape(seeds, views, n, 3)
+        force, u = (x[:, own, own] if views > 1 else x[:, 0] for x in (force, u))
         integral += h * off
-        a = (u + force)[:, own, own] if late else (u + force)[:, 0]
-        past = [*past[-late:], (r, v, a)] if late else past
-        total_force = a + gust
-        r, v = r + h * v + 0.5 * h * h * total_force, v + h * total_force
+        a = u + force
+        moved = a + gust
+        r, v = r + h * v + 0.5 * h * h * moved, v + h * moved
         if tick * h > _SETTLED and tick % 10 == 0:
             total += np.array([errors(slots, x[None]) ** 2 for x in r])
+            pushed += float((force.sum(axis=1) ** 2).sum(axis=1).mean())
             count += 1
-    return np.sqrt(total / count)
+    return np.sqrt(total / count), float(np.sqrt(pushed / count))
+
+
+def lattice(network: dict[str, float] | None, seed: int, side: int) -> tuple[float, float]:
+    """Error of the shape [m] and processor time [s] of 20 s of a lattice whose cells have edges and diagonals."""
+    slots = 3.0 * np.indices((side, side, side)).reshape(3, -1).T
+    apart = np.abs(slots[:, None] - slots) / 3.0
+    near = (apart.max(axis=-1) == 1) & (apart.sum(axis=-1) <= 2)
+    edges = np.argwhere(np.triu(near)) + 1
+    SHAPES["lattice"] = slots, edges.tolist()
+    m = mission("lattice", 50.0, network, seed, 20.0, 0.0)
+    begun = process_time()
+    result = rf.simulate(m)
+    cost = process_time() - begun
+    return errors(slots, result.position[result.time > 5.0][::10]), cost
+
+
+def passage(name: str) -> rf.Verdict:
+    """The verdict of a passage of quadrotors in wind and gusts, of which each knows its neighbours by messages."""
+    data = rf.load_mission(name).to_dict()
+    for key in ("reference", "control"):  # slots hold against the wind from the start
+        data["phases"][0].pop(key, None)
+    data["tracking"]["Q"] = [600.0, 60.0]
+    data["limits"]["tracking_error"] = 0.06
+    data["disturbances"] = {
+        "wind": [3.0, 1.5, 0.0],
+        "gusts": {"model": "dryden", "altitude": 20.0, "correlation_length": 20.0, "seed": 1},
+    }
+    data["network"] = {"rate": 50.0, "delay": 0.02, "loss": 0.3, "burst": 3.0}
+    return rf.assess(rf.simulate(rf.Mission.from_dict(data)))
 
 
 def interval(x: Floats) -> str:
@@ -168,47 +210,103 @@ def interval(x: Floats) -> str:
     return f"{x.mean():.3f} +- {half:.3f}"
 
 
-def main() -> int:
-    """Print the table; 1 if a goal is missed."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--seeds", type=int, default=30)
-    parser.add_argument("--time", type=float, default=60.0, help="of each flight [s]")
-    arguments = parser.parse_args()
-    seeds, time = arguments.seeds, arguments.time
-    table = Table(
-        "shape",
-        "rate [Hz]",
-        "network",
-        "ratio",
-        "goal",
-        "push [N]",
-        "with noise",
-        "push [N]",
-        "everyone",
-    )
-    missed, central = 0, {}
-    for shape, rate, network, goal in ROWS:
-        cells = []
-        for noise in (0.0, 0.01):
-            key = shape, rate, noise
-            if key not in central:
-                central[key] = np.array(
-                    [flown(mission(shape, rate, None, k, time, noise))[0] for k in range(seeds)]
-                )
+class Page:
+    """Tables of what is measured, as Markdown, and how many goals are missed."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.missed = 0
+
+    def title(self, words: str, *head: str) -> None:
+        """Begin a table."""
+        self.lines += ["", words, "", f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+        print("\n".join(self.lines[-4:]), flush=True)
+
+    def row(self, *cells: str, kept: bool) -> None:
+        """Add a row; a goal that is missed stands out."""
+        self.missed += not kept
+        self.lines.append(f"| {' | '.join(cells)} |" + ("" if kept else " **missed**"))
+        print(self.lines[-1], flush=True)
+
+
+def laws(page: Page, seeds: int, time: float) -> None:
+    """The tables of shapes, without and with noise."""
+    for noise in (0.0, 0.01):
+        known = f"{100 * noise:g} cm and {200 * noise:g} cm/s of noise" if noise else "no noise"
+        head = (
+            "shape",
+            "Hz",
+            "network",
+            "ratio",
+            "goal",
+            "push [N]",
+            "law of everyone",
+            "push [N]",
+        )
+        page.title(f"{seeds} seeds of {time:g} s, {known}:", *head)
+        central: dict[tuple[str, float], Floats] = {}
+        for shape, rate, network, goal in ROWS:
+            if (shape, rate) not in central:
+                alone = [flown(mission(shape, rate, None, k, time, noise)) for k in range(seeds)]
+                central[shape, rate] = np.array(alone)[:, 0]
             ours = np.array(
                 [flown(mission(shape, rate, network, k, time, noise)) for k in range(seeds)]
             )
-            ratios, push = ours[:, 0] / central[key], float(np.sqrt((ours[:, 1] ** 2).mean()))
-            cells.append((ratios, push))
-        (plain, push), (noisy, noisy_push) = cells
-        missed += plain.mean() > goal or push > PUSH
-        words = ", ".join(f"{name} {value:g}" for name, value in network.items()) or "as sent"
-        table.add_row(
-            shape, f"{rate:g}", words, interval(plain), f"{goal:g}", f"{push:.2f}", interval(noisy),
-            f"{noisy_push:.2f}", interval(everyone(shape, rate, network, seeds, time)),
-        )  # fmt: skip
-    Console().print(table)
-    return int(missed > 0)
+            ratios, push = ours[:, 0] / central[shape, rate], np.sqrt((ours[:, 1] ** 2).mean())
+            theirs, their_push = everyone(shape, rate, network, min(seeds, 10), time, noise)
+            words = ", ".join(f"{name} {value:g}" for name, value in network.items()) or "as sent"
+            page.row(
+                shape, f"{rate:g}", words, interval(ratios), "" if noise else f"{goal:g}", f"{push:.2f}",
+                interval(theirs), f"{their_push:.2f}",
+                kept=bool(noise) or (ratios.mean() <= goal and push <= PUSH),
+            )  # fmt: skip
+
+
+def others(page: Page, seeds: int) -> None:
+    """What else is measured."""
+    page.title("Quadrotors, and lattices of points:", "what", "measured", "goal")
+    for name in ("passage-quadrotors", "cube-passage-quadrotors"):
+        verdict = passage(name)
+        words = "passed" if verdict.passed else str(verdict)
+        what = f"{name} in gusts, 50 Hz, 20 ms, 30 % lost in bursts of 3"
+        page.row(what, words, "passes", kept=verdict.passed)
+    for side in (2, 3, 5, 7):
+        runs = [
+            (lattice(None, k, side), lattice({"delay": 0.02}, k, side))
+            for k in range(min(seeds, 3))
+        ]
+        central, ours = np.moveaxis(np.array(runs), 1, 0)
+        ratio, cost = (
+            float((ours[:, 0] / central[:, 0]).mean()),
+            np.median(ours[:, 1] / central[:, 1]),
+        )
+        count = len(SHAPES["lattice"][1])
+        each = 1e3 * float(np.median(ours[:, 1])) / count
+        page.row(
+            f"lattice of {side**3} vehicles, {count:,} edges, 50 Hz, 20 ms",
+            f"ratio {ratio:.3f}; a flight costs {cost:.2f} times the central law's, {each:.1f} ms an edge",
+            "1.1; 2 times",
+            kept=ratio <= 1.1 and bool(cost <= 2.0),
+        )
+
+
+def main() -> int:
+    """Print the tables; 1 if a goal is missed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=30)
+    parser.add_argument("--time", type=float, default=60.0, help="of each flight [s]")
+    parser.add_argument("--write", type=Path, help="put the tables into a page (docs/network.md)")
+    options, page = parser.parse_args(), Page()
+    laws(page, options.seeds, options.time)
+    others(page, options.seeds)
+    if options.write:
+        text = options.write.read_text(encoding="utf-8")
+        begin, end = text.index(_BEGIN), text.index(_END)
+        tables = "\n".join(page.lines)
+        options.write.write_text(
+            f"{text[:begin]}{_BEGIN}\n{tables}\n\n{text[end:]}", encoding="utf-8"
+        )
+    return int(page.missed > 0)
 
 
 if __name__ == "__main__":

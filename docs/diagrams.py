@@ -521,8 +521,48 @@ def monitor() -> Figure:
     return fig
 
 
+def by_messages() -> Figure:
+    """What one vehicle knows of another: messages, late or lost, and where the other is taken to be in between."""
+    fig = Figure(figsize=(9.0, 4.0))
+    above = fig.add_axes((0.09, 0.66, 0.88, 0.31))
+    below = fig.add_axes((0.09, 0.12, 0.88, 0.5), sharex=above)
+    tick, late, end = 0.1, 0.14, 1.6
+    sent, lost = np.arange(0.0, end, tick), {3, 7, 8, 9, 10}
+    above.axis("off")
+    for y, name in ((1.0, "it sends"), (0.0, "this one\nhears")):
+        above.plot([0, end], [y, y], color=FAINT, linewidth=1.2)
+        above.text(-0.02, y, name, ha="right", va="center", fontsize=9, color=INK)
+    above.plot(sent, np.ones_like(sent), "|", color=INK, markersize=9)
+    heard = []
+    for k, t in enumerate(sent.tolist()):
+        if k in lost:
+            above.plot([t, t + 0.45 * late], [1.0, 0.55], color=RED, linewidth=1.0)
+            above.plot(t + 0.45 * late, 0.55, "x", color=RED, markersize=5)
+        elif t + late <= end:
+            arrow(above, (t, 1.0), (t + late, 0.04), colour=BLUE)
+            heard.append(t)
+    above.set_ylim(-0.25, 1.25)
+    x = np.linspace(0.0, end, 1601)
+    slot, gust = 1.1 * x - 0.25 * np.sin(2.6 * x), 0.12 * np.sin(4.2 * x + 0.8) - 0.05
+    below.plot(x, slot, color=FAINT, linewidth=1.4, label="its slot, as planned")
+    below.plot(x, slot + gust, color=INK, linewidth=1.6, label="where it is")
+    speed, pull = (np.gradient(gust, x), np.gradient(np.gradient(gust, x), x))
+    for k, t in enumerate(heard):
+        until = heard[k + 1] + late if k + 1 < len(heard) else end
+        part, at = (x >= t + late) & (x <= until), round(t / x[1])
+        age = x[part] - t
+        taken = slot[part] + gust[at] + age * (speed[at] + 0.5 * age * pull[at])
+        label = "where it is taken to be" if k == 0 else None
+        below.plot(x[part], taken, color=BLUE, linewidth=2.0, label=label)
+        below.plot(t, slot[at] + gust[at], "o", color=BLUE, markersize=4)
+    below.set(xlim=(0, end), xlabel="time [s]", ylabel="along the path [m]")
+    below.legend(loc="upper left", frameon=False)
+    below.spines[["top", "right"]].set_visible(False)
+    return fig
+
+
 DIAGRAMS: Sequence[Callable[[], Figure]] = (
     edge, frame, constraint_architecture, body_architecture, local_architecture, singular_line,
     overshoot, solvers, blend, no_inverse, realisations, error_budget, way_found,
-    moving_obstacles, monitor,
+    moving_obstacles, monitor, by_messages,
 )  # fmt: skip

@@ -82,6 +82,17 @@ def study() -> None:
     _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "gain-study")
 
 
+def radio() -> None:
+    """The map of the cube that is formed by messages, as its page flies it."""
+    mission = rf.load_mission(IMAGES.parents[1] / "examples" / "cube_by_radio.toml")
+    vary = ("network.loss = linspace(0, 0.95, 20)", "network.delay = linspace(0, 0.19, 20)")
+    with TemporaryDirectory() as folder:
+        table = fly(Sweep.of(mission, vary), folder, workers=2)
+        figure = map_over_two(table, ["network.delay", "network.loss"], "success")
+        assert figure is not None
+    _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "cube-by-radio")
+
+
 def _save_with_few_colours(path: Path | io.BytesIO, name: str) -> None:
     # A palette makes a third of the size; without refining it (kmeans), greys come out tinted.
     picture = Image.open(path).convert("RGB").quantize(256, kmeans=5, dither=Image.Dither.NONE)
@@ -131,6 +142,7 @@ if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     flight()
     study()
+    radio()
     show()
     words()
     others()

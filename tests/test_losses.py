@@ -577,16 +577,6 @@ def test_wrong_links_are_refused(lost, key, words):
     assert words in finding.problem
 
 
-def test_links_are_lost_where_slots_are_tracked():
-    """Without slots, vehicles would know nothing to put in place of what they do not hear."""
-    phases = [PHASES[0], {"kind": "hold", "control": "open", "duration": 9.0}]
-    with pytest.raises(MissionError) as refused:
-        rotors(CUT, phases=phases)
-    (finding,) = refused.value.findings
-    assert finding.key == "phases[2].control"
-    assert "so the slots must be tracked" in finding.problem
-
-
 def test_kinds_of_their_own():
     """A mission may brake and land by itself, from any speed."""
     phases = [

@@ -25,6 +25,8 @@ PUBLIC: dict[str, Any] = json.loads((DATA / "public_names.json").read_text())
 GONE = {
     "rigidfleet.interchange.Format.extra": "a format names the distribution that pip installs",
     "rigidfleet.mission.kinds.Attitude.angles": "every kind of phase has it, by AnyPhase",
+    "rigidfleet.mission.schema.Links": "[network] replaces the table",
+    "rigidfleet.mission.schema.Disturbances.links": "[network] replaces the table",
 }
 
 
@@ -51,7 +53,7 @@ def members(kind: type) -> set[str]:
     }
 
 
-@pytest.mark.parametrize("name", PUBLIC["names"])
+@pytest.mark.parametrize("name", sorted(PUBLIC["names"].keys() - GONE.keys()))
 def test_public_names_stay(name):
     """Every public name is where it was, with all its members."""
     thing, fields = there(name), PUBLIC["names"][name]
@@ -76,7 +78,9 @@ def test_keys_of_missions_stay():
         for inner, definition in part.get("$defs", {}).items():
             yield from keys(definition, inner)
 
-    assert set(PUBLIC["mission keys"]) <= set(keys(schema, "Mission"))
+    gone = {key for key in PUBLIC["mission keys"] if key.startswith("Links.")}
+    gone |= {"Disturbances.links"}  # [network] replaces the table
+    assert set(PUBLIC["mission keys"]) - gone <= set(keys(schema, "Mission"))
 
 
 @pytest.mark.parametrize("verb", PUBLIC["options"])

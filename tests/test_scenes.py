@@ -76,6 +76,11 @@ def timed_by_default(data: Data) -> None:
         phase.update({key: 4.0 for key, value in phase.items() if value == "auto"})
 
 
+def without_edges(data: Data) -> None:
+    """Let nothing but the slots hold the shape."""
+    data["formations"]["cube"]["edges"] = []
+
+
 def without_on_loss(data: Data) -> None:
     """Fly on after a loss, which is the default."""
     del data["disturbances"]["on_loss"], data["disturbances"]["landing_formation"]
@@ -94,6 +99,7 @@ SHOWN: list[tuple[str, str, Callable[[Data], None], str]] = [
     ("change-of-picture", "auto", timed_by_default, "acceleration"),
     ("falling-light", "on_loss", without_on_loss, "lost"),
     ("ferris-wheel", "[yaw]", without_key("yaw"), "saturation"),
+    ("cube-by-neighbours", "edges", without_edges, "shape"),
 ]  # fmt: skip
 SCENES = list(dict.fromkeys(name for name, *_ in SHOWN))
 

@@ -13,6 +13,7 @@ RENAMED: dict[str | tuple[str, str], str] = {
     ("evaluate", "ends"): "final",
     "judged": "evaluate",
     "--ends": "--final-states",
+    "links": "[network]",
 }
 
 

@@ -29,6 +29,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     for (i, j), t in zip(pairs + 1, times, strict=True):
         if t < measured.result.time[-1]:
             yield f"the link {i}-{j} is lost at {t:.2f} s: after that, no edge joins agents {i} and {j}"
+    yield from _network_notes(measured)
     agents = measured.mission.agents
     if agents.saturate:
         full = measured.samples_of("thrust").values >= np.array(agents.thrust_limit) * (1 - 1e-6)
@@ -40,6 +41,30 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     yield from avoidance_notes(measured)
     yield from _samples_note(measured)
     yield from _foreign_flight_notes(measured)
+
+
+def _network_notes(measured: Measurements) -> Iterator[str]:
+    """What the network carried, how old what was used became, and which edges were let go."""
+    result, net = measured.result, measured.mission.network
+    if net is None or result.oldest_message is None or not result.oldest_message.size:
+        return
+    assert result.messages is not None
+    sent, _, lost = result.messages.sum(axis=(0, 1))
+    edge, way = np.unravel_index(np.argmax(result.oldest_message), result.oldest_message.shape)
+    one, other = (result.edges[edge] + 1)[:: 1 if way == 0 else -1]
+    yield (
+        f"{sent:,} messages were sent, {lost / max(sent, 1):.0%} of them lost; the oldest that was used was "
+        f"{result.oldest_message[edge, way]:.2f} s old, agent {one}'s of agent {other}"
+    )
+    age = result.message_age
+    silent = np.zeros((1, len(result.edges))) if age is None else (age > net.silence).any(axis=2)
+    if silent.any():
+        names = [result.edge_labels[k] for k in np.flatnonzero(silent.any(axis=0))]
+        more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+        since = measured.first_time(silent.max(axis=1))
+        yield (
+            f"edges that let go for want of messages, first at {since:.2f} s: {', '.join(names[:_NAMED])}{more}"
+        )
 
 
 def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:

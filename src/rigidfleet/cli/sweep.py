@@ -31,6 +31,7 @@ def sweep(
     random_numbers: Literal["shared", "own"] | None = None,
     controller: str | None = None,
     rate: float | None = None,
+    agent: str | None = None,
     workers: Annotated[int | None, Parameter(converter=exact)] = None,
     cluster: str | None = None,
     shard: str = "",
@@ -74,6 +75,8 @@ def sweep(
         object.
     rate : float
         Calls of the controller per second [Hz]. Default: 50.
+    agent : str
+        Law of each vehicle's own, MODULE:NAME, for missions with [network].
     workers : int
         Number of processes on this machine. Default: number of cores.
     cluster : str
@@ -113,7 +116,7 @@ def sweep(
     else:
         keys = {
             "seed": seed, "evaluate": "final" if final_states else None, "random_numbers": random_numbers,
-            "controller": controller, "rate": rate,
+            "controller": controller, "rate": rate, "agent": agent,
         }  # fmt: skip
         definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys)
         folder = shards.shard_folder(whole, shard)

@@ -15,13 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.network import CLOCK
+from rigidfleet.kernel.mail import CLOCK
 from rigidfleet.kernel.problem import TRACKING
 from rigidfleet.typing import Floats, Ints
 
 #: Columns of `SampledState.tau`: tau - t [s]; dtau/dt; the pace s and ds/dt [1/s]; the greatest error known of any
-#: vehicle [m], and the tick at which it was measured; the place that a stuck vehicle holds (3) [m], NaN for none.
-OFF, RATE, PACE, SLOPE, WORST, SINCE, PLACE = range(7)
+#: vehicle [m], and the tick at which it was measured; the place that a stuck vehicle holds (3) [m], NaN for none;
+#: position, velocity and acceleration of the slot (9).
+OFF, RATE, PACE, SLOPE, WORST, SINCE, PLACE, SLOT = 0, 1, 2, 3, 4, 5, 6, 9
 #: Bandwidth of the pace [1/s]: two equal lags, so that the acceleration of a reference does not jump.
 _BANDWIDTH = 5.0
 #: Greatest rate: what a plan has to spare is not known, and forces grow with its square.
@@ -48,9 +49,9 @@ def same_clock(n: int) -> Clocks:
 
 
 def clocks_at_start(n: int) -> Floats:
-    """Clocks (N, 9) that are right, of vehicles that are not stuck."""
-    tau = np.zeros((n, PLACE + 3))
-    tau[:, [RATE, PACE]], tau[:, PLACE:] = 1.0, np.nan
+    """Clocks (N, 18) that are right, of vehicles that are not stuck."""
+    tau = np.zeros((n, SLOT + 9))
+    tau[:, [RATE, PACE]], tau[:, PLACE:SLOT] = 1.0, np.nan
     return tau
 
 
@@ -76,6 +77,13 @@ def take_row(k, i, tick, flight, state):
 
 
 @jit
+def clock_of_neighbour(l, k, tick, mail):
+    """What the clock of link l's sender differs by from the time at tick k [s] by its newest message, and its rate."""
+    rate = mail.heard[l, CLOCK + 1]
+    return mail.heard[l, CLOCK] + (k - mail.stamp[l]) * tick * (rate - 1.0), rate
+
+
+@jit
 def advance_clocks(k, tick, flight, state):
     """Advance all clocks to tick k, ``tick`` [s] after the one before, and choose their rates until the next.
 
@@ -98,9 +106,7 @@ def advance_clocks(k, tick, flight, state):
         pull, heard = 0.0, 0
         for l in range(net.first[i], net.first[i + 1]):
             if mail.stamp[l] >= 0 and k - mail.stamp[l] <= net.silence:
-                age = (k - mail.stamp[l]) * tick
-                there = mail.heard[l, CLOCK] + age * (mail.heard[l, CLOCK + 1] - 1.0)
-                pull += there - own[OFF]
+                pull += clock_of_neighbour(l, k, tick, mail)[0] - own[OFF]
                 heard += 1
         # Of the sum, the own clock counts at the end of the tick: stable at any gain
         pull *= clocks.gain / (1.0 + tick * clocks.gain * heard)
@@ -140,16 +146,19 @@ def follow_own_clock(i, k, t, p, w, flight, state):
     where it was when that began.
     """
     net, mail, own, g = flight.network, state.mail, state.tau[i], p.vehicles.g
-    rate, slope = own[RATE], own[SLOPE]
+    rate, slope, tick = own[RATE], own[SLOPE], flight.steps * flight.h
     tracks = p.control.kind == TRACKING
     early, error = min(t + own[OFF] - p.motion.knots[0], 0.0), 0.0
     for l in range(net.first[i] - 1, net.first[i + 1]):
-        j = net.links[l, 1] if l >= net.first[i] else i
+        j, ahead, pace = i, early, rate
+        if l >= net.first[i]:  # a neighbour's slot is where its own clock has it
+            there, pace = clock_of_neighbour(l, k, tick, mail)
+            j, ahead = net.links[l, 1], early + (there - own[OFF] if mail.stamp[l] >= 0 else 0.0)
         for q in range(3 if tracks else 0):
-            v = w.v_ref[j, q]
-            w.r_ref[j, q] += early * v
-            w.a_ref[j, q] = (rate * rate * w.a_ref[j, q] if early == 0.0 else 0.0) + slope * v
-            w.v_ref[j, q] = rate * v
+            v, a = w.v_ref[j, q], w.a_ref[j, q] if early == 0.0 else 0.0
+            w.r_ref[j, q] += ahead * (v + 0.5 * ahead * a)
+            v += ahead * a
+            w.v_ref[j, q], w.a_ref[j, q] = pace * v, pace * pace * a + slope * v
         c = mail.edge[l] if l >= net.first[i] else -1
         if c >= 0:
             w.d_ddot[c] = rate * rate * w.d_ddot[c] + slope * w.d_dot[c]
@@ -160,15 +169,13 @@ def follow_own_clock(i, k, t, p, w, flight, state):
             a = w.a_ref[i, q] - p.control.k1 * away - p.control.k2 * apart
             w.f_u[i, q] = p.vehicles.m[i] * (a + (g if q == 2 else 0.0))
             error += away * away
+            own[SLOT + q], own[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
+            own[SLOT + 6 + q] = w.a_ref[i, q]
     report_error(i, k, math.sqrt(error), net, mail, own)
     stuck = False
     for n in range(flight.clocks.stuck.shape[0]):
-        who, begin, end = (
-            flight.clocks.stuck[n, 0],
-            flight.clocks.stuck[n, 1],
-            flight.clocks.stuck[n, 2],
-        )
-        stuck = stuck or (who == i and begin <= k < end)
+        one = flight.clocks.stuck[n]
+        stuck = stuck or (one[0] == i and one[1] <= k < one[2])
     for q in range(3):
         if not stuck or math.isnan(own[PLACE + q]):
             own[PLACE + q] = w.r[i, q] if stuck else math.nan
@@ -179,12 +186,19 @@ def follow_own_clock(i, k, t, p, w, flight, state):
 
 
 @jit
+def take_own_slots(p, w, state):
+    """Put into w the slot of each vehicle by its own clock: what others know of it is no longer needed."""
+    for i in range(state.tau.shape[0] if p.control.kind == TRACKING else 0):
+        for q in range(3):
+            w.r_ref[i, q], w.v_ref[i, q] = state.tau[i, SLOT + q], state.tau[i, SLOT + 3 + q]
+            w.a_ref[i, q] = state.tau[i, SLOT + 6 + q]
+
+
+@jit
 def let_go(i, w, net, state):
     """Exert no constraint force as vehicle i; its integrals of constraints go on, as its neighbours' do."""
-    mail, state.saturated[i] = (
-        state.mail,
-        True,
-    )  # so that its own integral rests; steering says anew whether it is
+    mail = state.mail
+    state.saturated[i] = True  # its own integral rests; steering says anew whether it is
     for q in range(3):
         w.f_C[i, q] = 0.0
     for q in range(mail.pull.shape[1]):

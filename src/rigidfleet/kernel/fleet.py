@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.kernel.clocks import Clocks, clocks_at_start, same_clock
-from rigidfleet.kernel.network import Mail, Network, empty_mail, no_network
+from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
 from rigidfleet.solids.records import Solids, join
@@ -21,13 +21,14 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: State of a vehicle: r (3) [m], v (3) [m/s], q (4), omega (3) [rad/s, body axes], speeds of the rotors (4) [rad/s].
 STATES = 17
-#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors.
-FORCE, ATTITUDE, ROTORS = range(3)
+#: What commands the vehicles (`Commands.kind`): the desired forces of the formation law; thrust and attitude; rotors;
+#: forces by laws of their own, which the flight asks for.
+FORCE, ATTITUDE, ROTORS, OWN = range(4)
 #: Places in `SampledState.clock`: the time, and that of the last evaluation of the law [s].
 TIME, LAW_TIME = range(2)
 #: Places in `SampledState.count`: steps of the grid that are complete, attitude ticks done, law ticks done, samples
-#: written, steps in the trail.
-STEPS, TICKS, LAWS, SAMPLES, TRAILED = range(5)
+#: written, steps in the trail, ticks up to which own laws have answered.
+STEPS, TICKS, LAWS, SAMPLES, TRAILED, ANSWERED = range(6)
 #: Columns of `SampledState.worst`: least cosine of the tilt; greatest tracking error [m], acceleration [m/s^2], thrust
 #: [N], constraint force [N], horizontal and vertical acceleration [m/s^2].
 UPRIGHT, ERROR, ACCELERATION, LOAD, CONSTRAINT_FORCE, HORIZONTAL, VERTICAL = range(7)
@@ -221,7 +222,7 @@ class SampledFlight(NamedTuple):
     vehicles: Quadrotors
     air: Air
     sensing: Sensing
-    network: Network  # how vehicles know each other
+    network: Links  # how vehicles know each other
     clocks: Clocks  # and by which time they fly
     guidance: Guidance
     tables: TickInputs
@@ -240,7 +241,7 @@ class SampledState(NamedTuple):
 
     S: Floats  # (N, 17) true states
     clock: Floats  # (2,) see `TIME`
-    count: Ints  # (5,) see `STEPS`
+    count: Ints  # (6,) see `STEPS`
     integral: (
         Floats  # (m,) of the constraints [m s]; with a network, the mean of what both ends hold
     )
@@ -302,6 +303,7 @@ class SampledSegment(NamedTuple):
     tau: Floats  # (K, N, 3) clocks: tau - t [s], dtau/dt, ds/dt [1/s]
     integral: Floats  # (K, m) of the constraints
     frame: Floats  # (K, 4)
+    stamp: Ints  # (K, L) tick at which the newest message of each link was sent
 
 
 class Evaluation(NamedTuple):
@@ -451,7 +453,7 @@ def begin(
         none = np.zeros(0)
         trail = Trail(np.empty((rows, 2)), np.empty((rows, 5, 6 * n)), np.zeros((rows, 0)), none)
     return SampledState(
-        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(TRAILED + 1, dtype=np.int64),
+        S=S.copy(), clock=np.array([flight.start, flight.start]), count=np.zeros(ANSWERED + 1, dtype=np.int64),
         integral=np.zeros(m), frame=attitude, error=np.zeros((n, 3)),
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
@@ -494,14 +496,14 @@ def _work(n: int, m: int) -> SampledWork:
 
 
 def segment(
-    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS
+    n: int, m: int, t_end: float, times: ArrayLike = (), max_steps: int = ENDLESS, links: int = 0
 ) -> SampledSegment:
-    """A flight to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
+    """A flight of n vehicles with m edges to ``t_end`` [s], sampled at ``times`` (K,) [s]."""
     at = np.ascontiguousarray(times, dtype=float)
     k = len(at)
     return SampledSegment(
         t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
         np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
         np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, n, 3)), np.empty((k, m)),
-        np.empty((k, 4)),
+        np.empty((k, 4)), np.empty((k, links), dtype=np.int64),
     )  # fmt: skip

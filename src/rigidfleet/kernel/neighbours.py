@@ -18,16 +18,24 @@ import math
 
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
-from rigidfleet.kernel.network import PULL, SATURATED, A, R, U, V
+from rigidfleet.kernel.mail import (
+    FRESH,
+    NONE,
+    PULL,
+    SATURATED,
+    SLOT,
+    TOGETHER,
+    TRACKED,
+    UNDER_WAY,
+    A,
+    R,
+    U,
+    V,
+)
 from rigidfleet.kernel.problem import ITERATED, TRACKING
 
-#: Share that a vehicle believes of what its neighbour does not know yet of it.
-_FRESH = 0.5
-#: Share of the difference of two integrals that one message takes away, and how much longer it takes with each further
-#: message under way: more would overshoot.
-_TOGETHER, _UNDER_WAY = 0.1, 0.3
-# Columns of `Mail.rows`: unit vector, right side, multiplier, link, further force of the neighbour.
-_UNIT, _RIGHT, _UNKNOWN, _LINK, _REST = 0, 3, 4, 5, 6
+# Columns of `Mail.rows`: unit vector, right side, multiplier, link.
+_UNIT, _RIGHT, _UNKNOWN, _LINK = 0, 3, 4, 5
 
 
 @jit
@@ -48,7 +56,7 @@ def estimate_acceleration(i, dt, v, net, mail):
 def agree(l, messages, mail):
     """Draw i's integral of the edge of link l towards j's, both as when the newest message was sent."""
     share = mail.multiplier.shape[1] - 1
-    part = min(_TOGETHER, _UNDER_WAY / max(messages, 1.0))
+    part = min(TOGETHER, UNDER_WAY / max(messages, 1.0))
     mail.multiplier[l, share] -= part * (mail.ours[l, share] - mail.theirs[l, share])
 
 
@@ -59,10 +67,10 @@ def hold_edges(i, k, ticks, net, mail):
     ``ticks`` is the number of ticks since the last evaluation.
     """
     for l in range(net.first[i], net.first[i + 1]):
-        silent = mail.stamp[l] < 0 or k - mail.stamp[l] > net.silence or mail.edge[l] < 0
+        silent = mail.stamp[l] < 0 or k - mail.stamp[l] > net.silence
         step = ticks / net.silence
         mail.grip[l] = max(0.0, mail.grip[l] - step) if silent else min(1.0, mail.grip[l] + step)
-        if mail.edge[l] < 0 or mail.stamp[l] < 0:
+        if mail.edge[l] == NONE or mail.stamp[l] < 0:
             mail.grip[l] = 0.0
         elif mail.fresh[l]:
             agree(l, (k - mail.stamp[l]) / net.every, mail)
@@ -70,11 +78,27 @@ def hold_edges(i, k, ticks, net, mail):
 
 
 @jit
+def bring_forward(j, q, age, message, tracks, w, k1, k2):
+    """Coordinate q of where vehicle j is, how fast, and what its input accelerates it by, ``age`` [s] after a message.
+
+    What it is off its slot moves on by its acceleration; the slot moves as planned, whatever the age. Without a slot,
+    the vehicle itself moves on. Its input follows what it is off by the gains k1 [1/s^2] and k2 [1/s].
+    """
+    r, v, a, put = message[R + q], message[V + q], message[A + q], message[U + q]
+    if not tracks or message[TRACKED] == 0.0:  # or sent before slots were tracked
+        return r + age * (v + 0.5 * age * a), v + age * a, put
+    v, a = v - message[SLOT + 3 + q], a - message[SLOT + 6 + q]
+    place = w.r_ref[j, q] + r - message[SLOT + q] + age * (v + 0.5 * age * a)
+    put += w.a_ref[j, q] - message[SLOT + 6 + q] - age * (k1 * (v + 0.5 * age * a) + k2 * a)
+    return place, w.v_ref[j, q] + v + age * a, put
+
+
+@jit
 def constraint_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
     """Row of vehicle i's own equations for the edge of link l, from its state in w.r and w.v, and its message.
 
-    Fills the unit vector from the neighbour, the right side of Eq. (12) without any constraint force, and the
-    acceleration that the neighbour's input gives it now; integrates the constraint over dt [s].
+    Fills the unit vector from the neighbour and the right side of Eq. (12) without any constraint force; integrates the
+    constraint over dt [s].
     """
     i, j, c = net.links[l, 0], net.links[l, 1], mail.edge[l]
     rows, heard, own, law = mail.rows, mail.heard[l], mail.own[l], p.law
@@ -82,38 +106,32 @@ def constraint_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
     mail.oldest[l] = max(mail.oldest[l], k - mail.stamp[l])
     tracks = p.control.kind == TRACKING
     distance = along = square = pull = 0.0
-    x, y = rows[row, _UNIT:_RIGHT], rows[row, _REST : _REST + 3]
+    x, k1, k2 = rows[row, _UNIT:_RIGHT], p.control.k1, p.control.k2
     for q in range(3):
+        theirs, speed, put = bring_forward(j, q, age, heard, tracks, w, k1, k2)
+        mine, pace, _ = bring_forward(i, q, age, own, tracks, w, k1, k2)
         # Where both are by what both know, and half of what only i knows of itself.
-        theirs = heard[R + q] + age * (heard[V + q] + 0.5 * age * heard[A + q])
-        speed = heard[V + q] + age * heard[A + q]
-        mine = own[R + q] + age * (own[V + q] + 0.5 * age * own[A + q])
-        mine += _FRESH * (w.r[i, q] - mine)
-        pace = own[V + q] + age * own[A + q]
-        pace += _FRESH * (w.v[i, q] - pace)
-        x[q], y[q] = mine - theirs, pace - speed
+        x[q] = mine + FRESH * (w.r[i, q] - mine) - theirs
+        pace += FRESH * (w.v[i, q] - pace) - speed
         distance += x[q] * x[q]
+        along += x[q] * pace
+        square += pace * pace
+        pull += x[q] * (w.f_u[i, q] * p.vehicles.inverse[i] - put)
     distance = math.sqrt(distance)
+    along, pull = along / distance, pull / distance
     for q in range(3):
         x[q] /= distance
-        along += x[q] * y[q]
-        square += y[q] * y[q]
-    for q in range(3):
-        # The neighbour's input there: it follows its slot, whose motion is planned.
-        put = heard[U + q]
-        if tracks:
-            away, apart = heard[V + q] - w.v_ref[j, q], heard[A + q] - w.a_ref[j, q]
-            put -= age * (p.control.k1 * (away + 0.5 * age * apart) + p.control.k2 * apart)
-        y[q] = put
-        pull += x[q] * (w.f_u[i, q] * p.vehicles.inverse[i] - put)
-    off, share = distance - w.d[c], mail.multiplier.shape[1] - 1
+    d_dot = d_ddot = 0.0
+    if c >= 0:
+        mail.length[l], d_dot, d_ddot = w.d[c], w.d_dot[c], w.d_ddot[c]
+    off, share = distance - mail.length[l], mail.multiplier.shape[1] - 1
     if not saturated and heard[SATURATED] == 0.0:
         mail.multiplier[l, share] += dt * off
     rows[row, _RIGHT] = (
-        w.d_ddot[c]
+        d_ddot
         - (square - along * along) / distance
         - pull
-        - 2.0 * law.alpha * (along - w.d_dot[c])
+        - 2.0 * law.alpha * (along - d_dot)
         - law.beta * law.beta * off
         - law.gamma * mail.multiplier[l, share]
     )
@@ -143,7 +161,8 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
             for q in range(3):
                 dot += rows[a, _UNIT + q] * rows[b, _UNIT + q]
             matrix[a, b] = mbar * inverse[i] * dot
-        matrix[a, a] = mbar * (inverse[i] + inverse[j]) + mu
+        # An edge that slips gives way: without a grip it would have no force, and the others all of it.
+        matrix[a, a] = (mbar * (inverse[i] + inverse[j]) + mu) / mail.grip[int(rows[a, _LINK])]
     if d == 0 or not cholesky(matrix[:d, :d]):
         # Nobody to hold on to; or, without damping, no force at this shape: the law of all edges has none either.
         if d > 0:
@@ -165,7 +184,7 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
             mail.pull[i, 3 * n + q] = 0.0
         for a in range(d):
             l = int(rows[a, _LINK])
-            mail.multiplier[l, n] = mail.grip[l] * rows[a, _UNKNOWN]
+            mail.multiplier[l, n] = rows[a, _UNKNOWN]
             for q in range(3):
                 mail.pull[i, 3 * n + q] += mail.multiplier[l, n] * rows[a, _UNIT + q] * inverse[i]
     for q in range(3):

@@ -20,8 +20,8 @@ Pairs = Annotated[Ints, Extents((None, 2))]
 #: Of a `Recursion` that makes no rows, and of one that adds none.
 NO_ROWS, NO_FACTORS = np.zeros((0, 0)), np.zeros(0)
 
-#: Return values of an integration.
-FINISHED, PAUSED, COLLAPSED = range(3)
+#: Return values of an integration; a sampled flight asks for the forces of vehicles that follow laws of their own.
+FINISHED, PAUSED, COLLAPSED, ASKS = range(4)
 #: Places in `IntegratorState.clock`: the time [s], the next step to try [s], the logarithm of the last error.
 TIME, NEXT_STEP, LAST_ERROR = range(3)
 #: Places in `IntegratorState.count`: evaluations, steps accepted and rejected, samples written, steps in the trail, and

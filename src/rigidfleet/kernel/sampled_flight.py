@@ -18,12 +18,14 @@ from rigidfleet.kernel.clocks import (
     follow_own_clock,
     let_go,
     post_clock,
+    take_own_slots,
 )
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.control import local_law
 from rigidfleet.kernel.fleet import (
     ACCELERATION,
+    ANSWERED,
     CONSTRAINT_FORCE,
     ERROR,
     FORCE,
@@ -31,6 +33,7 @@ from rigidfleet.kernel.fleet import (
     LAW_TIME,
     LAWS,
     LOAD,
+    OWN,
     SAMPLES,
     STEPS,
     TICKS,
@@ -41,11 +44,17 @@ from rigidfleet.kernel.fleet import (
     speed_of,
     thrust_of,
 )
-from rigidfleet.kernel.neighbours import estimate_acceleration, hold_edges, solve_own_edges
-from rigidfleet.kernel.network import PULL, SATURATED, A, R, U, V, receive, send
+from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
+from rigidfleet.kernel.neighbours import (
+    bring_forward,
+    estimate_acceleration,
+    hold_edges,
+    solve_own_edges,
+)
+from rigidfleet.kernel.network import receive, send
 from rigidfleet.kernel.problem import SHAPE, TRACKING
 from rigidfleet.kernel.quadrotor import normalise, runge_kutta
-from rigidfleet.kernel.records import COLLAPSED, FINISHED, PAUSED
+from rigidfleet.kernel.records import ASKS, COLLAPSED, FINISHED, PAUSED
 from rigidfleet.kernel.references import blend_slots, distance_references
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
@@ -156,8 +165,8 @@ def expect_drag(i, v, share, vehicles, state):
 
 @jit
 def take_force(k, i, dt, p, w, flight, state):
-    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it."""
-    vehicles, guidance = flight.vehicles, flight.guidance
+    """Desired force of vehicle i [N] from the law just evaluated, with what is added after it, if it is not its own."""
+    vehicles, guidance, own = flight.vehicles, flight.guidance, flight.commands.kind == OWN
     m, pull = p.vehicles.m[i], 0.0
     for q in range(3):
         state.f_u[i, q], state.f_C[i, q] = w.f_u[i, q], w.f_C[i, q]
@@ -166,9 +175,9 @@ def take_force(k, i, dt, p, w, flight, state):
     if not vehicles.lost[i]:
         worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
-        if guidance.drag[i] > 0.0:
+        if guidance.drag[i] > 0.0 and not own:
             expect_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
-        for q in range(3):
+        for q in range(0 if own else 3):
             if not state.saturated[i]:
                 known = state.seen[i, q] + path_at(k, i, q, flight.tables)
                 state.error[i, q] += dt * (known - w.r_ref[i, q])
@@ -188,16 +197,23 @@ def worse(i, kind, value, t, state):
 
 
 @jit
+def know(k, t, p, w, flight, state):
+    """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
+    known_states(k, w, flight, state)
+    if not flight.clocks.own:
+        evaluate_plan(t, p, w)
+
+
+@jit
 def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
     """Desired force of each vehicle from its own measured state, the plan and its neighbours' messages.
 
     ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
+    Vehicles that follow laws of their own have answered in ``state.f_u`` with their whole force.
     """
     net, mail, tick, stuck = flight.network, state.mail, flight.steps * flight.h, False
     state.work.law_time[0] = t
-    known_states(k, w, flight, state)
-    if not flight.clocks.own:
-        evaluate_plan(t, p, w)
+    know(k, t, p, w, flight, state)
     state.integral[:] = 0.0
     last = mail.multiplier.shape[1] - 1
     for i in range(state.S.shape[0]):
@@ -208,7 +224,11 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             stuck = follow_own_clock(i, k, t, p, w, flight, state)
         estimate_acceleration(i, dt, w.v[i], net, mail)
         hold_edges(i, k, flight.every, net, mail)
-        solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
+        if flight.commands.kind == OWN:
+            for q in range(3):
+                w.f_u[i, q], w.f_C[i, q] = state.f_u[i, q], 0.0
+        else:
+            solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         if stuck:
             let_go(i, w, net, state)
         take_force(k, i, dt, p, w, flight, state)
@@ -218,6 +238,8 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
         for l in range(net.first[i], net.first[i + 1]):
             if mail.edge[l] >= 0:
                 state.integral[mail.edge[l]] += 0.5 * mail.multiplier[l, last]
+    if flight.clocks.own:
+        take_own_slots(p, w, state)
 
 
 @jit
@@ -256,6 +278,9 @@ def post(k, p, w, flight, state):
             message[R + q], message[V + q] = w.r[i, q], w.v[i, q]
             message[A + q] = mail.commanded[i, q] + mail.estimate[i, 3 + q]
             message[U + q] = m * state.f_u[i, q]
+            message[SLOT + q], message[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
+            message[SLOT + 6 + q] = w.a_ref[i, q]
+        message[TRACKED] = 1.0 if p.control.kind == TRACKING else 0.0
         message[SATURATED] = 1.0 if state.saturated[i] else 0.0
         post_clock(k, i, flight.clocks, state.tau[i], message)
         for q in range(mail.pull.shape[1]):
@@ -263,6 +288,32 @@ def post(k, p, w, flight, state):
     for l in range(mail.multiplier.shape[0]):
         for q in range(mail.multiplier.shape[1]):
             mail.posted[row, l, q] = mail.multiplier[l, q]
+
+
+@jit
+def is_foreseen(j, k, p, w, flight, mail):
+    """Whether neighbours guess at tick k where vehicle j is, in w.r, well enough by its last broadcast."""
+    net, since, square = flight.network, k - mail.said[j], 0.0
+    if net.event == 0.0 or mail.said[j] == NONE or since >= net.longest:
+        return False
+    age, tracks = since * flight.steps * flight.h, p.control.kind == TRACKING
+    for q in range(3):
+        place, _, _ = bring_forward(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
+        square += (w.r[j, q] - place) ** 2
+    return square < net.event**2
+
+
+@jit
+def fall_silent(k, p, w, flight, state):
+    """Decide which vehicles do not broadcast what they have posted at tick k; keep what the others send."""
+    mail = state.mail
+    for j in range(state.S.shape[0]):
+        quiet = flight.vehicles.lost[j] or mail.mute[j]
+        mail.silent[j] = quiet or is_foreseen(j, k, p, w, flight, mail)
+        if not mail.silent[j]:
+            mail.said[j] = k
+            for q in range(mail.last.shape[1]):
+                mail.last[j, q] = mail.post[k % mail.due.shape[1], j, q]
 
 
 @jit
@@ -316,7 +367,7 @@ def tick(k, t, p, w, flight, state, call):
     measure(k, flight, state)
     if flight.network.every > 0:
         receive(k, flight.network, state.mail)
-    due = flight.commands.kind == FORCE and k % flight.every == 0
+    due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
     if due and not desire(k, t, p, w, flight, state, call):
         return False
     for i in range(state.S.shape[0]):
@@ -326,7 +377,8 @@ def tick(k, t, p, w, flight, state, call):
     if flight.network.every > 0:
         post(k, p, w, flight, state)
         if k % flight.network.every == 0:
-            send(k, state.S, flight.vehicles.lost, flight.network, state.mail)
+            fall_silent(k, p, w, flight, state)
+            send(k, state.S, flight.network, state.mail)
     return True
 
 
@@ -410,6 +462,8 @@ def write_samples(t, h, p, flight, state, call):
                 state.frame[0, q] + (t + x - state.clock[LAW_TIME]) * state.frame[1, q]
             )
         normalise(call.frame[c])
+        for l in range(call.stamp.shape[1]):
+            call.stamp[c, l] = state.mail.stamp[l]
         count[SAMPLES] = c + 1
 
 
@@ -487,17 +541,28 @@ def advance_fleet(t, h, p, flight, state):
 
 
 @jit
+def look(k, t, p, w, flight, state):
+    """Measure at tick k, time t [s]; where vehicles follow laws of their own, have ready what they know there."""
+    measure(k, flight, state)
+    if flight.commands.kind == OWN:
+        receive(k, flight.network, state.mail)
+        know(k, t, p, w, flight, state)
+
+
+@jit
 def fly_ticks(p, w, flight, state, call):
     """Fly to ``call.t_end`` [s]; see `fleet` for the arguments.
 
     Returns FINISHED; PAUSED if the trail is full, the tables end or ``max_steps`` are done; or COLLAPSED if the law
     gives no force (a singular law) or a user's function none: states and time are then those before. A pause changes no
     bit of the flight, unless ``t_end`` lies between two steps, where it divides one. With no steps to do, a flight at a
-    tick measures what the law will know there; to measure once more changes nothing.
+    tick measures what the law will know there; to measure once more changes nothing. Where vehicles follow laws of
+    their own, it returns ASKS before each of their ticks, with what they know in w and the mail: their forces go into
+    ``state.f_u``, and tick + 1 into ``state.count``.
     """
     count, clock = state.count, state.clock
     if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
-        measure(count[TICKS], flight, state)
+        look(count[TICKS], clock[TIME], p, w, flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[TIME], count[STEPS]
@@ -509,6 +574,9 @@ def fly_ticks(p, w, flight, state, call):
         if step % flight.steps == 0 and count[TICKS] == k:
             if k >= flight.tables.last:
                 return PAUSED
+            if flight.commands.kind == OWN and k % flight.every == 0 and count[ANSWERED] <= k:
+                look(k, t, p, w, flight, state)
+                return ASKS
             if not tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1

@@ -39,6 +39,23 @@ def mission_of_file(text: str, origin: str) -> Mission:
     return Mission.from_plain(data, origin, text=text)
 
 
+def recorded_mission(text: str, origin: str) -> Mission:
+    """The mission of a text that a result keeps; an earlier version may have written it.
+
+    Links of [disturbances.links] are those of [network]: each vehicle heard all others, not only its neighbours.
+
+    Raises
+    ------
+    MissionError
+        With a finding for each error.
+    """
+    data = parse_toml(text, origin)
+    links = data.get("disturbances", {}).pop("links", None)
+    if links is not None and "network" not in data:
+        data["network"] = {{"dropped": "loss"}.get(key, key): value for key, value in links.items()}
+    return Mission.from_plain(data, origin, text=text)
+
+
 def as_mission(mission: Mission | str | Path) -> Mission:
     """Return the `Mission` that was given, or load it by its shipped name or path.
 

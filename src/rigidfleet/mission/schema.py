@@ -686,6 +686,11 @@ class Network(Part):
         None,
     )
     silence: Time = key("time without a message after which a vehicle lets go of an edge [s]", 0.5)
+    event: Length | None = key(
+        "distance [m] by which neighbours guess a vehicle wrongly before it sends, or before `silence` would run out; "
+        "default: it sends each time",
+        None,
+    )
     seed: Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
     outages: tuple[Outage, ...] = key(
         "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()

@@ -27,6 +27,7 @@ GROUPS = {
     "Vehicles": (
         "crazyflies", "cube-passage-quadrotors", "delayed", "downwash-cube", "passage-quadrotors", "windy-passage",
     ),
+    "Networks": ("cube-by-neighbours",),
     "Shows": ("change-of-picture", "falling-light", "ferris-wheel", "show-1000"),
 }  # fmt: skip
 #: Shipped missions to look at first.

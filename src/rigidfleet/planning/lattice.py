@@ -226,7 +226,7 @@ class Way(NamedTuple):
 Stop = tuple[Floats, int]
 
 
-class Network:
+class Roadmap:
     """Lattices of several layers and frames, joined where the layer can change."""
 
     def __init__(

@@ -14,7 +14,7 @@ import numpy as np
 
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.clocks import FASTEST, OFF, RATE, Clocks, same_clock
-from rigidfleet.kernel.network import Network, no_network
+from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
 from rigidfleet.math.margins import Lag, LoopGains, overshoot
@@ -49,6 +49,8 @@ _LEFT = 0.2
 _TURN_TIME = 3.0
 #: Time constant with which vehicles in a network estimate the acceleration by what they do not know [s].
 _ESTIMATE = 0.15
+#: Probability with which all messages that a vehicle owes its neighbours within the time of silence are lost.
+_ALL_LOST = 1e-3
 
 
 def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.SampledFlight:
@@ -188,7 +190,7 @@ def _sensing(mission: Mission) -> fleet.Sensing:
     return fleet.Sensing(max(1, round(rate / noise.rate)), np.full(n, round(noise.delay * rate)))
 
 
-def network_of(mission: Mission) -> Network:
+def network_of(mission: Mission) -> Links:
     """The network of a mission in whole ticks of the attitude control; one that nobody uses if it has none."""
     net, n, rate = mission.network, mission.n_agents, mission.autopilot.rate
     if net is None:
@@ -197,29 +199,43 @@ def network_of(mission: Mission) -> Network:
     both = np.concatenate([e for pairs in edges for e in (pairs, pairs[:, ::-1])])
     links = np.unique(both, axis=0).astype(np.int64)
     place = {pair: l for l, pair in enumerate(map(tuple, links.tolist()))}
-    # In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
-    recovers = 1.0 - net.loss if net.burst is None else 1.0 / net.burst
-    worsens = net.loss * recovers / (1.0 - net.loss)
+    worsens, recovers = fading(net.loss, net.burst)
+    every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
+    delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
+    # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
+    tries = math.ceil(math.log(_ALL_LOST) / math.log(1.0 - recovers)) if recovers < 1.0 else 1
+    longest = (silence - delay - jitter) // max(tries, 2)
     seed = net.seed & 0xFFFFFFFF, net.seed >> 32 & 0xFFFFFFFF
     out = [
         [*(sorted(x - 1 for x in one.between) or (-1, -1)), one.start * rate, one.end * rate]
         for one in net.outages
     ] + [[*(x - 1 for x in one.between), one.time * rate, np.inf] for one in net.lost]
-    return Network(
-        every=max(1, round(rate / net.sent_rate(n))),
-        delay=max(1, round(net.delay * rate)),
-        jitter=round(net.jitter * rate),
+    return Links(
+        every=every,
+        delay=delay,
+        jitter=jitter,
         worsens=worsens,
         recovers=recovers,
         range=net.range if net.range is not None else np.inf,
-        silence=max(1, round(net.silence * rate)),
+        silence=silence,
         seed=np.array(seed, dtype=np.int64),
         links=links,
         first=np.searchsorted(links[:, 0], np.arange(n + 1)).astype(np.int64),
         reverse=np.array([place[j, i] for i, j in links.tolist()], dtype=np.int64),
         outages=np.array(out, dtype=np.float64).reshape(-1, 4),
+        event=net.event or 0.0,
+        longest=max(longest // every * every, 1),
         lag=_ESTIMATE,
     )
+
+
+def fading(loss: float, burst: float | None) -> tuple[float, float]:
+    """Probabilities with which a link begins and ends to lose messages, by the share lost and the mean burst.
+
+    In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
+    """
+    recovers = 1.0 - loss if burst is None else 1.0 / burst
+    return loss * recovers / (1.0 - loss), recovers
 
 
 def clocks_of(mission: Mission) -> Clocks:

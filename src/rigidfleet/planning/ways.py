@@ -23,7 +23,7 @@ from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
 from rigidfleet.planning.clearance import closest, pace
-from rigidfleet.planning.lattice import FreeSpace, Lattice, Layer, Network, Way, staying
+from rigidfleet.planning.lattice import FreeSpace, Lattice, Layer, Roadmap, Way, staying
 from rigidfleet.planning.legs import Leg, at_start, latest_end
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
@@ -139,9 +139,9 @@ class _Search:
             need += lacking + _KEPT
         raise self._unproved_error(lacking)
 
-    def _cheapest_way(self, need: float) -> tuple[Network, Way]:
+    def _cheapest_way(self, need: float) -> tuple[Roadmap, Way]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
-        best: tuple[Network, Way] | None = None
+        best: tuple[Roadmap, Way] | None = None
         straight = float(np.linalg.norm(self.end - self.begin))
         stages = sorted({s.stage for s in self.shapes})
         for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
@@ -151,17 +151,17 @@ class _Search:
             report(
                 f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
-            network = self._network(shapes, need, more=more)
-            way = network.shortest((self.begin, 0), (self.end, self._last))
+            roadmap = self._roadmap(shapes, need, more=more)
+            way = roadmap.shortest((self.begin, 0), (self.end, self._last))
             if way is not None and (best is None or way.cost < best[1].cost):
-                best = network, way
+                best = roadmap, way
             if best is not None and best[1].cost <= _SHORT * straight + self.reach:
                 break
         if best is None:
-            raise self._none(network)
+            raise self._none(roadmap)
         return best[0], best[0].shorten(best[1])
 
-    def _network(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Network:
+    def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
         frames = layers.frames(self._near())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -200,20 +200,20 @@ class _Search:
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = staying(nodes[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
-        return Network(space, nodes, changes, self.radius, need, frames, common, self._known)
+        return Roadmap(space, nodes, changes, self.radius, need, frames, common, self._known)
 
     # -- from nodes to phases --------------------------------------------------------------------------
 
-    def _parts(self, network: Network, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
+    def _parts(self, roadmap: Roadmap, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
         """Name, keys and greatest way [m] of an agent, of each phase of a way."""
-        changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in network.changes}
+        changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in roadmap.changes}
         written = self._written()
         for (a, i), (b, j) in pairwise(zip(way.places, way.layers, strict=True)):
-            layer = network.layers[j]
+            layer = roadmap.layers[j]
             if i == j:
                 place = f"to ({', '.join(f'{x:.4g}' for x in b)})"
                 yield place, {"kind": "fly", "position": b.tolist()}, float(np.linalg.norm(b - a))
-            elif layer.formation != network.layers[i].formation:
+            elif layer.formation != roadmap.layers[i].formation:
                 name = written.get(layer.formation, layer.formation)
                 way_of = changes[frozenset((i, j))]
                 yield f"take {name}", {"kind": "reshape", "formation": name}, way_of
@@ -230,10 +230,10 @@ class _Search:
             if p.shaping is not None
         }
 
-    def _tables(self, network: Network, way: Way) -> list[dict[str, Any]]:
+    def _tables(self, roadmap: Roadmap, way: Way) -> list[dict[str, Any]]:
         """The phases of a way as tables; times are shared like the roots of the longest ways, or automatic."""
         phase = self.phase
-        parts = list(self._parts(network, way))
+        parts = list(self._parts(roadmap, way))
         if not parts:
             parts = [("stay", {"kind": "fly", "position": self.end.tolist()}, 1.0)]
         end = latest_end(phase, self.now.t)
@@ -261,10 +261,10 @@ class _Search:
                 del last["duration"]
         return tables
 
-    def _try_way(self, network: Network, way: Way) -> tuple[Mission, float]:
+    def _try_way(self, roadmap: Roadmap, way: Way) -> tuple[Mission, float]:
         """The mission with a way, and the clearance [m] that its proof lacks: that of every vehicle, in time."""
         mission, k = self.mission, self.number
-        data, tables = mission.to_dict(), self._tables(network, way)
+        data, tables = mission.to_dict(), self._tables(roadmap, way)
         forms = {
             name: mission.formations[name].model_dump(
                 mode="json", exclude_none=True, exclude_defaults=True
@@ -320,30 +320,30 @@ class _Search:
         return error_of_key(self.mission, self.number, "clearance", self.phase.clearance, problem,
                        "give more time, or ask for less clearance")  # fmt: skip
 
-    def _none(self, network: Network) -> MissionError:
+    def _none(self, roadmap: Roadmap) -> MissionError:
         """What stands in the way, and how much is missing."""
         for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
-            x = network.layers[layer]
-            room = network.space.room(place + x.offsets, network.radius)
-            if room.min() < network.need:
-                agent, thing = self._nearest(network, place, layer, room)
+            x = roadmap.layers[layer]
+            room = roadmap.space.room(place + x.offsets, roadmap.radius)
+            if room.min() < roadmap.need:
+                agent, thing = self._nearest(roadmap, place, layer, room)
                 problem = (
                     f"its {what} leaves agent {agent + 1} {room.min():.2f} m of clearance from {thing}, which is less"
                     f" than {self.phase.clearance:g} m"
                 )
                 return error_of_key(self.mission, self.number, "position", self.phase.position, problem,
                                "move it, or ask for less clearance")  # fmt: skip
-        least, place, layer = network.widest((self.begin, 0), (self.end, self._last))
-        x = network.layers[layer]
-        room = network.space.room(place + x.offsets, network.radius)
-        _, thing = self._nearest(network, place, layer, room)
+        least, place, layer = roadmap.widest((self.begin, 0), (self.end, self._last))
+        x = roadmap.layers[layer]
+        room = roadmap.space.room(place + x.offsets, roadmap.radius)
+        _, thing = self._nearest(roadmap, place, layer, room)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
             f" {x.angles[2]:.4g}° "
         ) + (
-            self._gap(network, place, layer)
-            or f"has {least:.2f} m of clearance from {thing}, {network.need - least:.2f} m less than asked for"
+            self._gap(roadmap, place, layer)
+            or f"has {least:.2f} m of clearance from {thing}, {roadmap.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
         return error_of_key(
@@ -351,21 +351,21 @@ class _Search:
         )
 
     def _nearest(
-        self, network: Network, place: Floats, layer: int, room: Floats
+        self, roadmap: Roadmap, place: Floats, layer: int, room: Floats
     ) -> tuple[int, str]:
         """The agent with the least room at a place, and what is nearest to it."""
-        x, agent = network.layers[layer], int(room.argmin())
+        x, agent = roadmap.layers[layer], int(room.argmin())
         _, near = proximity.obstacle_clearances(
-            place + x.offsets, network.radius, network.space.obstacles
+            place + x.offsets, roadmap.radius, roadmap.space.obstacles
         )
         k = int(near[agent])
-        return agent, f"'{network.space.obstacles[k].name}'" if k >= 0 else "the geofence"
+        return agent, f"'{roadmap.space.obstacles[k].name}'" if k >= 0 else "the geofence"
 
-    def _gap(self, network: Network, place: Floats, layer: int) -> str:
+    def _gap(self, roadmap: Roadmap, place: Floats, layer: int) -> str:
         """What a shape needs in the gap between the two nearest obstacles; "" if they do not lie on two sides of it."""
-        x, boxes = network.layers[layer], []
-        for other in network.space.obstacles:
-            room = proximity.obstacle_clearances(place + x.offsets, network.radius, [other])[0]
+        x, boxes = roadmap.layers[layer], []
+        for other in roadmap.space.obstacles:
+            room = proximity.obstacle_clearances(place + x.offsets, roadmap.radius, [other])[0]
             boxes.append((float(room.min()), other))
         boxes.sort(key=lambda b: b[0])
         if len(boxes) < 2:
@@ -377,7 +377,7 @@ class _Search:
         if wide[k] <= 0.0:
             return ""
         along = x.offsets[:, k]
-        takes = float((along + network.radius).max() - (along - network.radius).min())
+        takes = float((along + roadmap.radius).max() - (along - roadmap.radius).min())
         needs = takes + 2.0 * self.phase.clearance
         if needs <= wide[k]:
             return ""

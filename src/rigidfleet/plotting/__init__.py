@@ -30,6 +30,7 @@ from rigidfleet.plotting.curves import (
     limited_motions,
     motion,
 )
+from rigidfleet.plotting.messages import messages
 from rigidfleet.plotting.operation import leaves_ground, operation
 from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
@@ -56,6 +57,7 @@ __all__ = [
     "figure_names",
     "formations",
     "inputs",
+    "messages",
     "motion",
     "operation",
     "plot",
@@ -70,6 +72,7 @@ _FIGURES: dict[str, Callable[[Result], Figure]] = {
     for draw in (
         summary, trajectory, distances, cm, attitude, inputs, constraint_force, constraint_error,
         clearance, formations, disturbance, rotors, vehicles, operation, motion,
+        messages,
     )
 }  # fmt: skip
 #: File formats of figures.
@@ -103,6 +106,7 @@ def figure_names(result: Result | None = None) -> list[str]:
         "rotors": not has_rotors(result),
         "vehicles": not has_rotors(result),
         "operation": not leaves_ground(result),
+        "messages": result.message_age is None or not result.message_age.size,
         "motion": not limited_motions(result),
     }
     # Of trajectories that others made, most panels of the summary would be empty.

@@ -23,6 +23,7 @@ from rigidfleet.preflight.formations import SEARCHED, check_formations, formatio
 from rigidfleet.preflight.gains import check_gains, gain_remarks
 from rigidfleet.preflight.losses import loss_remarks
 from rigidfleet.preflight.margins import check_margins, margin_remarks
+from rigidfleet.preflight.network import check_network, network_remarks
 from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.offsets import offset_remarks
 from rigidfleet.preflight.trajectory import (
@@ -72,6 +73,7 @@ def check(
     if lags := vehicle_lags(mission):
         progress("margins")
         preflight.margins = check_margins(mission, planned, lags)
+        preflight.network = check_network(mission, planned, lags)
         preflight.vehicles = check_vehicles(mission, planned)
         preflight.reserve = float(reserves(mission).max()) if mission.smooth else 0.0
     progress("collisions, obstacles and limits")
@@ -80,6 +82,7 @@ def check(
         *formation_remarks(mission, formations),
         *gain_remarks(mission, preflight),
         *margin_remarks(preflight),
+        *network_remarks(preflight),
         *separation_remarks(mission, preflight),
         *downwash_remarks(mission, preflight),
         *assignment_remarks(mission, preflight),

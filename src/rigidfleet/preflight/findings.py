@@ -55,7 +55,7 @@ class Remark:
     Attributes
     ----------
     level : "fails" or "note"
-    topic : files, formation, gains, margins, collision, avoidance, downwash, assignment, thrust, disturbances,
+    topic : files, formation, gains, margins, network, collision, avoidance, downwash, assignment, thrust, disturbances,
         obstacle, geofence, speed, acceleration, waypoint, attitude, tracking error, settle or paths (not checked, or
         estimated)
     text : the problem or note in words
@@ -168,6 +168,74 @@ class MarginsCheck:
 
 
 @dataclass(frozen=True)
+class FormationNetwork:
+    """What delay and loss of messages a formation by neighbours bears, beside its own network.
+
+    Attributes
+    ----------
+    broadcasts : of all vehicles a second [Hz]
+    tick : time between two evaluations of the law [s]
+    delay, own_delay : last stable delay, and the greatest one of the mission, in ticks; 0 if not even 1 is stable
+    loss, own_loss : share of independent losses up to which it is stable in mean square at its own delay, and the
+        mission's; None if it is not even without losses
+    growing : share of sampled linear flights, with the mission's own bursts, jitter and time-outs, in which errors
+        grow; None if there was no need for them
+    unheard : number of edges that are longer than the range
+    """
+
+    broadcasts: float
+    tick: float
+    delay: int
+    own_delay: int
+    loss: float | None
+    own_loss: float
+    growing: float | None = None
+    unheard: int = 0
+
+    @property
+    def borne(self) -> bool:
+        """Whether the mission's own network is within what the formation bears."""
+        within = (
+            self.loss is not None and self.own_loss <= self.loss and self.own_delay <= self.delay
+        )
+        return within and (self.growing or 0.0) <= 0.5
+
+    def lesser(self, other: FormationNetwork) -> FormationNetwork:
+        """The one of both that bears less."""
+        return min(self, other, key=lambda f: (f.borne, f.delay, f.loss or 0.0))
+
+    @property
+    def words(self) -> str:
+        """In words."""
+        ms = 1e3 * self.tick
+        parts = [
+            f"{self.broadcasts:.0f} broadcasts a second",
+            f"bears messages {self.delay} ticks late ({self.delay * ms:.0f} ms), its own are {self.own_delay}"
+            f" ({self.own_delay * ms:.0f} ms)",
+        ]
+        if self.loss is not None:
+            most = (
+                f"up to {100 * self.loss:.0f} % of losses"
+                if self.loss < 0.95
+                else "with 95 % of losses"
+            )
+            parts.append(f"stable in mean square {most}, its own are {100 * self.own_loss:.0f} %")
+        if self.growing is not None:
+            parts.append(
+                f"errors grow in {100 * self.growing:.0f} % of sampled flights over its own network"
+            )
+        return "; ".join(parts)
+
+    def data(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return {
+            "broadcasts_hz": self.broadcasts, "tick_s": self.tick, "delay_ticks": self.delay,
+            "own_delay_ticks": self.own_delay, "loss": self.loss, "own_loss": self.own_loss, "growing": self.growing,
+            "unheard_edges": self.unheard,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
 class Assignment:
     """An assignment of agents to slots.
 
@@ -255,6 +323,7 @@ class Preflight(Shown):
     assignments : assignments to slots that were compared, by name
     disturbed : effects of the disturbances; None without disturbances
     margins : what lag and delay the laws bear; None if vehicles have none
+    network : what delay and loss of messages each formation bears, by its name; empty without a network
     vehicles : what the planned paths ask of rotors; None if vehicles have none
     reserve : of the limits, what automatic times leave for lag and drag of vehicles (`planning.vehicles.reserves`) [s]
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
@@ -281,6 +350,7 @@ class Preflight(Shown):
     assignments: dict[str, Assignment] = field(default_factory=dict)
     disturbed: Disturbed | None = None
     margins: MarginsCheck | None = None
+    network: dict[str, FormationNetwork] = field(default_factory=dict)
     vehicles: VehicleCheck | None = None
     reserve: float = 0.0
     judged_to: float = math.inf
@@ -355,6 +425,7 @@ class Preflight(Shown):
                 yield "gains", _gain_words(self.gains)
         if self.margins is not None:
             yield from self.margins.rows
+        yield from (("network", f"'{name}': {f.words}") for name, f in self.network.items())
         yield from self._proof()
         if self.reserve:
             text = f"automatic times leave {self.reserve:.2g} s times the greatest jerk of limits of acceleration, tilt"
@@ -427,6 +498,7 @@ class Preflight(Shown):
                 "force_per_error_n_m": g.force,
             },
             "margins": None if self.margins is None else self.margins.data(),
+            "network": {name: f.data() for name, f in self.network.items()},
             "vehicles": None if self.vehicles is None else self.vehicles.data(),
             "reserve_s": self.reserve,
             "disturbances": None

@@ -39,6 +39,8 @@ LABELS: dict[str, tuple[str, ...]] = {
     "quaternion": ("w", "x", "y", "z"),
     "wrench": ("Fx", "Fy", "Fz", "tau_x", "tau_y", "tau_z"),
     "end": ("first", "second"),
+    "link": ("second to first", "first to second"),
+    "message": ("sent", "heard", "lost"),
     "rotor": ("front left", "front right", "rear right", "rear left"),
 }
 

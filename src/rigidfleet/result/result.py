@@ -186,6 +186,19 @@ class Result(Shown):
         Floats | None,
         "time agent | s | time along the plan by each vehicle's own clock; missing with one clock for all",
     ] = None
+    message_age: Annotated[
+        Floats | None,
+        "time edge link | s | age of the newest message that the agents of an edge have of each other; NaN before the "
+        "first; missing without [network]",
+    ] = None
+    messages: Annotated[
+        Ints | None,
+        "edge link message | 1 | messages of the whole flight; missing without [network]",
+    ] = None
+    oldest_message: Annotated[
+        Floats | None,
+        "edge link | s | greatest age of a message when it was used; missing without [network]",
+    ] = None
     clock_rate: Annotated[
         Floats | None, "time | 1 | rate of the virtual clock; missing without [avoidance]"
     ] = None
@@ -373,10 +386,10 @@ class Result(Shown):
         ResultError
             This version of rigidfleet does not accept the mission, or the mission does not match the arrays.
         """
-        from rigidfleet.mission import Mission
+        from rigidfleet.mission.loading import recorded_mission
 
         try:
-            mission = Mission.from_toml(self.mission_text, "mission of the result")
+            mission = recorded_mission(self.mission_text, "mission of the result")
         except MissionError as error:
             made = self.versions.get("rigidfleet", "an unknown version")
             message = (

@@ -36,6 +36,7 @@ from rigidfleet.simulation.callbacks import (
     RotorCommand,
 )
 from rigidfleet.simulation.extremes import Extremes
+from rigidfleet.simulation.own_laws import Law
 from rigidfleet.simulation.point_phase import PointPhase
 from rigidfleet.simulation.preparation import preparation_of
 from rigidfleet.simulation.recording import Piece, assemble
@@ -46,6 +47,7 @@ from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import Counts
+    from rigidfleet.kernel.mail import Links, Mail
 
 __all__ = [
     "AttitudeCommand", "Controller", "Flight", "FlightInterrupted", "Observation", "Progress", "RotorCommand",
@@ -94,6 +96,7 @@ def simulate(
     *,
     controller: Controller | None = None,
     rate: float = 50.0,
+    agent: Law | type | None = None,
     force: Force | None = None,
     max_step: float = MAX_STEP,
     times: ArrayLike | None = None,
@@ -109,6 +112,9 @@ def simulate(
         second; its force is held between calls, as on a vehicle. For vehicles it may return an `AttitudeCommand` or
         a `RotorCommand` instead, which no constraint force joins. The verdict names phases in which it was not called.
     rate : control rate [Hz]
+    agent : a law of each vehicle's own, in place of all built-in ones, for missions with [network]: a function of a
+        `View` that returns the force (3,) [N] of its vehicle, weight included, and a message to its neighbours; or a
+        class, of which each vehicle has an object. It is called at each tick of ``autopilot.formation_rate``
     force : an external force f(t, r, v) -> (N, 3) [N] in addition to gravity, world axes, continuous in
         time. A Numba ``cfunc`` of void(double t, double* r, double* v, double* f, ssize_t n) is called
         without Python.
@@ -129,19 +135,20 @@ def simulate(
         On Ctrl-C, with the incomplete result. Before anything has flown, it is a plain
         KeyboardInterrupt.
     FlightError
-        The controller or the force raised an exception, which is the error's cause, or did not return
+        The controller, the force or a vehicle's law raised an exception, which is the error's cause, or did not return
         forces. The error's ``result`` is the incomplete flight, or None. Or no phase tracks slots, so that the
-        controller would never be called.
+        controller would never be called; or the mission has no network for laws of vehicles.
     MissionError
         The mission does not exist, or has errors.
     TypeError
         ``mission`` is no mission.
     ValueError
         A time to record lies outside the mission, the control rate is not positive, or ``max_step`` is not from 0.001 s
-        to the duration of the mission.
+        to the duration of the mission; or there are both a controller and an agent.
     """
     flight = Flight(
-        mission, controller=controller, rate=rate, force=force, max_step=max_step, times=times, progress=progress
+        mission, controller=controller, rate=rate, agent=agent, force=force, max_step=max_step, times=times,
+        progress=progress,
     )  # fmt: skip
     controls = {phase.name: phase.control for phase in flight.mission.phases}
     if controller is not None and "tracking" not in controls.values():
@@ -196,6 +203,7 @@ class Flight:
         *,
         controller: Controller | None = None,
         rate: float = 50.0,
+        agent: Law | type | None = None,
         force: Force | None = None,
         max_step: float = MAX_STEP,
         times: ArrayLike | None = None,
@@ -212,9 +220,21 @@ class Flight:
         self.mission = mission = self._preparation.mission
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
-        for name, function in (("controller", controller), ("progress", progress)):
+        for name, function in (
+            ("controller", controller),
+            ("agent", agent),
+            ("progress", progress),
+        ):
             if not (function is None or callable(function)):
                 raise wrong_type(f"a function for {name}", function)
+        if agent is not None and controller is not None:
+            raise ValueError(
+                "vehicles follow a controller, or laws of their own: give one of controller and agent"
+            )
+        if agent is not None and mission.network is None:
+            raise FlightError(
+                "laws of vehicles need a network: add [network] to the mission, or leave the agent out"
+            )
         if not (force is None or callable(force) or hasattr(force, "address")):
             raise wrong_type("a function for force", force)
         most = max(MAX_STEP, mission.latest_end)
@@ -223,6 +243,7 @@ class Flight:
                 f"max_step must be from 0.001 to {most:g} s, not {max_step!r}: give half the time that a force lasts"
             )
         self.controller, self.rate, self.progress = controller, rate, progress
+        self._built_in = controller is None and agent is None  # whether the mission's own laws fly
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self._push = External(self.external.address, float(max_step)) if self.external else External()  # fmt: skip
         asked_for = None if times is None else times_asked(times, mission.latest_end)
@@ -230,7 +251,7 @@ class Flight:
         self.flips = flips
         self._begins = self._reached = at_start(mission)
         self._vehicles = (
-            FleetState(mission, self._push.max_step) if mission.vehicle_models else None
+            FleetState(mission, self._push.max_step, agent) if mission.vehicle_models else None
         )
         # Vehicles meet their disturbances in their own equations of motion.
         self._disturbance = self._preparation.disturbance if self._vehicles is None else None
@@ -361,7 +382,7 @@ class Flight:
         record = PhaseRecord(
             phase.name, phase.kind, phase.control, plan.formation, plan.start, plan.start,
             settled=None if phase.settle is None else False, target=plan.target,
-            planned=plan.certificate._asdict() if self.controller is None and plan.certificate else None,
+            planned=plan.certificate._asdict() if self._built_in and plan.certificate else None,
         )  # fmt: skip
         self.phases.append(record)
         return True
@@ -496,6 +517,16 @@ class Flight:
             self._ended = None
         return self.record(self.pieces, None if own else self._asked)
 
+    @property
+    def network(self) -> tuple[Links, Mail] | None:
+        """The network of the vehicles, and what was sent on it; None without one."""
+        return None if self._vehicles is None else self._vehicles.network
+
+    def lose(self, loss: float) -> None:
+        """Let links lose a share of the messages from now on, if there are any."""
+        if self._vehicles is not None:
+            self._vehicles.lose(loss)
+
     def record(
         self,
         pieces: list[Piece],
@@ -522,10 +553,14 @@ class Flight:
             "rtol": mission.integrator.rtol, "atol": mission.integrator.atol,
             "solvers": {method: vars(counts) for method, counts in self._solves.items()},
         }  # fmt: skip
+        if self._vehicles is not None and self._vehicles.laws is not None:
+            statistics["message_numbers"] = self._vehicles.laws.numbers
         if mission.avoidance is not None and self.external is not None:
             statistics["pushed"] = True  # by a force that avoidance does not know
         ending = self.ending if ending is None else ending
-        result = assemble(mission, phases, pieces, ending=ending, statistics=statistics)
+        result = assemble(
+            mission, phases, pieces, ending=ending, statistics=statistics, network=self.network
+        )
         result.mission = mission  # keeps the slots assigned and edges that it has computed
         return result
 
@@ -626,7 +661,7 @@ class Flight:
         record = self.phases[-1]
         record.extremes = self._extremes.phase()
         record.abandoned = abandoned
-        record.controller = None if self.controller is None else active.asked > 0
+        record.controller = None if self._built_in else self.controller is None or active.asked > 0
         if active.stepper.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.has_settled

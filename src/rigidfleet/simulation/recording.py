@@ -33,6 +33,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import Setup
+    from rigidfleet.kernel.mail import Links, Mail
     from rigidfleet.kernel.problem import Motion, Problem, Reference, Workspace
     from rigidfleet.mission import Mission
     from rigidfleet.planning.vehicles import YawTurn
@@ -72,6 +73,7 @@ class VehicleSamples(NamedTuple):
     rotor_force: Floats  # (K, N, 4) [N]
     thrust: Floats  # (K, N) [N]
     saturated: Bools  # (K, N)
+    age: Floats  # (K, L) of the newest message of each link [s]; NaN before the first
     # (K, N, 4) own clocks: three columns as in `slots_by_own_clocks`, time along the plan [s]; (K, N, 0) without
     tau: Floats
 
@@ -200,8 +202,9 @@ def assemble(
     *,
     ending: str,
     statistics: dict[str, Any],
+    network: tuple[Links, Mail] | None = None,
 ) -> Result:
-    """Join the pieces of a flight.
+    """Join the pieces of a flight, of vehicles with a ``network`` and what was sent on it.
 
     All that follows from positions and velocities is computed when it is first asked for, unless the law has already
     been evaluated at the samples.
@@ -275,8 +278,17 @@ def assemble(
         ending=ending,
         statistics=statistics,
         later=later,
+        **({} if flown is None or network is None else _messages(mission, flown.age, *network)),
         **(_UNMADE | now),
     )
+
+
+def _messages(mission: Mission, age: Floats, net: Links, mail: Mail) -> dict[str, Any]:
+    """Ages of messages at samples, and of what was sent, heard, lost and used, of each edge both ways."""
+    n, pairs = mission.n_agents, np.stack([mission.edges, mission.edges[:, ::-1]], axis=1)
+    of = np.searchsorted(net.links @ [n, 1], pairs @ [n, 1])  # (E, 2)
+    oldest = mail.oldest[of] / mission.autopilot.rate
+    return {"message_age": age[:, of], "messages": mail.count.T[of], "oldest_message": oldest}
 
 
 def _forces_and_references(

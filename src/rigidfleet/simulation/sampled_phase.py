@@ -13,14 +13,21 @@ from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.clocks import OFF, PACE, RATE, WORST
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.network import assign_edges
+from rigidfleet.kernel.mail import CLOCK, Links, Mail, assign_edges
 from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.derivatives import slots_by_own_clocks
-from rigidfleet.planning.vehicles import TickTables, YawTurn, first_yaw, sampled_flight, turn_from
+from rigidfleet.planning.vehicles import (
+    TickTables,
+    YawTurn,
+    fading,
+    first_yaw,
+    sampled_flight,
+    turn_from,
+)
 from rigidfleet.planning.virtual_clock import later
 from rigidfleet.result import Extremum
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
@@ -33,6 +40,7 @@ from rigidfleet.simulation.callbacks import (
 )
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.leading import Leader, layers
+from rigidfleet.simulation.own_laws import Law, OwnLaws, View
 from rigidfleet.simulation.recording import LayerSamples, VehicleSamples
 from rigidfleet.typing import Floats
 
@@ -51,8 +59,17 @@ _FAR = 1e9
 class FleetState:
     """The vehicles of a flight, from phase to phase: what they are, where they are, and their yaw."""
 
-    def __init__(self, mission: Mission, max_step: float) -> None:
+    def __init__(self, mission: Mission, max_step: float, agent: Law | type | None = None) -> None:
         self.flight = sampled_flight(mission, max_step)
+        self.laws = None if agent is None else OwnLaws(agent, self.flight)
+        if self.laws is not None and self.flight.clocks.own:
+            raise FlightError(
+                "a law of one's own is asked at the ticks of one clock: remove [network.clocks] and disturbances.stuck,"
+                " or leave agent out"
+            )
+        if self.laws is not None:
+            commands = self.flight.commands._replace(kind=fleet.OWN)
+            self.flight = self.flight._replace(commands=commands)
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
@@ -62,8 +79,21 @@ class FleetState:
         self.state: fleet.SampledState | None = None  # of the phase before
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
         self.output_step = mission.output_step
+        self.burst = None if mission.network is None else mission.network.burst
         self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
         self.waited = 0.0  # time by which phases came to their ends later than planned [s]
+
+    @property
+    def network(self) -> tuple[Links, Mail] | None:
+        """The network, and what was sent on it; None without one, or before the flight."""
+        links = self.flight.network
+        return (links, self.state.mail) if links.every and self.state is not None else None
+
+    def lose(self, loss: float) -> None:
+        """Let links lose a share of the messages from now on."""
+        worsens, recovers = fading(loss, self.burst)
+        network = self.flight.network._replace(worsens=worsens, recovers=recovers)
+        self.flight = self.flight._replace(network=network)
 
 
 class SampledPhase(Stepper):
@@ -120,7 +150,10 @@ class SampledPhase(Stepper):
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
-        assign_edges(self.flight.network, begun.mail, plan.edges, integral)
+        lose = (
+            self.first_tick is not None
+        )  # edges that end within a phase are those of what is lost
+        assign_edges(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
@@ -214,12 +247,10 @@ class SampledPhase(Stepper):
 
     def seen_by_controller(self, observation: Observation) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
-        phase, S = self.phase, self.sampled.S
+        S = self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
-            self._supply()
-            now = fleet.segment(len(S), len(phase.plan.edges), phase.t, max_steps=0)  # to measure
-            fly_ticks(phase.plan.problem, phase.workspace, self.flight, self.sampled, now)
+            self._look()
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
             # About the path of that tick, if there are any
             seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
@@ -227,6 +258,23 @@ class SampledPhase(Stepper):
             observation, position=seen[:, :3].copy(), velocity=seen[:, 3:].copy(), attitude=S[:, 6:10].copy(),
             rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
+
+    def _look(self) -> None:
+        """Measure what the law will know if a tick is due."""
+        self._supply()
+        now = fleet.segment(
+            len(self.sampled.S), len(self.phase.plan.edges), self.phase.t, max_steps=0
+        )
+        fly_ticks(self.phase.plan.problem, self.phase.workspace, self.flight, self.sampled, now)
+
+    def views(self) -> list[View | None]:
+        """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
+        self._look()
+        phase, laws = self.phase, self.vehicles.laws
+        assert laws is not None
+        return laws.views(
+            phase.plan.phase.name, phase.plan.problem, phase.workspace, self.flight, self.sampled
+        )
 
     def drop_command(self) -> None:
         """Drop the last command of vehicles."""
@@ -287,14 +335,22 @@ class SampledPhase(Stepper):
         self.flown = problem
         times = phase.times(t_end)
         phase.begun, arrays = True, self.vehicles.avoidance
-        call = fleet.segment(n, m, t_end, times, _STEPS)
+        network = self.vehicles.flight.network
+        self.flight = self.flight._replace(network=network)
+        links = len(network.links)
+        call = fleet.segment(n, m, t_end, times, _STEPS, links=links)
         sampled.count[fleet.SAMPLES] = 0
-        status = records.PAUSED
+        status, laws = records.PAUSED, self.vehicles.laws
         try:
-            while status == records.PAUSED:
-                self._supply()
+            while status in (records.PAUSED, records.ASKS):
+                if status == records.PAUSED:
+                    self._supply()
+                elif laws is not None:
+                    laws.ask(plan.phase.name, problem, phase.workspace, self.flight, sampled)
                 status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, arrays)
                 self._follow()
+                if status == records.ASKS:
+                    continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     phase.state.clock[records.TIME] = t_end
                 if phase.external is not None:
@@ -367,7 +423,9 @@ class SampledPhase(Stepper):
         if self.flight.clocks.own:
             # The next phase is planned from now on: its times are later by as much, for all clocks alike.
             late = round(self.behind / self._tick) * self._tick
-            self.sampled.tau[:, OFF] += late
+            mail = self.sampled.mail
+            for off in (self.sampled.tau[:, OFF], mail.heard[:, CLOCK], mail.post[..., CLOCK]):
+                np.add(off, late, out=off)  # also in messages
             self.vehicles.waited += late
             self.vehicles.tables.put_off(late)
             plan.problem = later(plan.problem, late)
@@ -395,7 +453,7 @@ class SampledPhase(Stepper):
         else:
             planned = native.record(plan.problem, self.phase.workspace, times, y)
             tau = tau[..., :0]
-        out, kept = _as_flown(planned, call, done, self.flight.vehicles, problem, tau)
+        out, kept = _as_flown(planned, call, done, self.flight, problem, tau)
         self.phase.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
     def _by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
@@ -425,12 +483,12 @@ def _as_flown(
     planned: Record,
     call: fleet.SampledSegment,
     done: int,
-    vehicles: fleet.Quadrotors,
+    flight: fleet.SampledFlight,
     problem: Problem,
     tau: Floats,
 ) -> tuple[Record, VehicleSamples]:
     """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
-    S, a = call.S[:done], call.dS[:done, :, 3:6]
+    S, a, vehicles = call.S[:done], call.dS[:done, :, 3:6], flight.vehicles
     curves = vehicles.thrust.T[..., None]
     rotor = np.where(vehicles.point[:, None], 0.0, fleet.thrust_of(S[..., 13:], *curves))
     T = att.dcm_from_quaternion(np.where(vehicles.point[:, None], [1.0, 0, 0, 0], S[..., 6:10]))
@@ -445,12 +503,10 @@ def _as_flown(
         a=a, f_E=rest, f_D=air, f_u=call.f_u[:done], f_C=call.f_C[:done],
         r_seen=seen[..., :3], v_seen=seen[..., 3:],
     )  # fmt: skip
+    stamp = call.stamp[:done]
+    sent = np.where(stamp < 0, np.nan, flight.start + stamp * flight.steps * flight.h)
     kept = VehicleSamples(
-        S[..., 6:10],
-        S[..., 10:13],
-        rotor,
-        np.linalg.norm(thrust, axis=2),
-        call.saturated[:done],
-        tau,
-    )
+        S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done],
+        call.times[:done, None] - sent, tau,
+    )  # fmt: skip
     return out, kept

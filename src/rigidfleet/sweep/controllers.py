@@ -1,4 +1,4 @@
-"""Controllers of users in sweeps: imported by name, so that every worker can."""
+"""Controllers and laws of users in sweeps: imported by name, so that every worker can."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ _RUNS = 10**8
 #: Tables with seeds of random numbers.
 _SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("network",), ("avoidance",)
 #: Keys that stores have since there are any: they are kept where they are not their defaults.
-_LATER = {"random_numbers", "controller", "rate"}
+_LATER = {"random_numbers", "controller", "rate", "agent"}
 
 
 class SweepHeader(Part):
@@ -83,6 +83,16 @@ class SweepHeader(Part):
     rate: Annotated[float, Strict(), Field(gt=0, le=1e6)] = Field(
         50.0, description="rate at which the controller is called [Hz]"
     )
+    agent: str = Field(
+        "",
+        description="law of each vehicle's own, MODULE:NAME: a function of what it knows, or a class, of which each "
+        "vehicle has a new object; for missions with [network]; default: the laws of the mission",
+    )
+
+    @property
+    def own(self) -> tuple[str, str]:
+        """Key of the user's law and its name; the name is "" if the laws of the mission fly."""
+        return ("agent", self.agent) if self.agent else ("controller", self.controller)
 
 
 @dataclass(frozen=True)
@@ -148,6 +158,8 @@ class Sweep:
         controller : a controller of your own, "MODULE:NAME" of a function, or of a class, of which each run has a new
             object; the module is installed or in the current folder
         rate : rate at which the controller is called [Hz]; default: 50
+        agent : a law of each vehicle's own, "MODULE:NAME" of a function, or of a class, of which each vehicle has a
+            new object; see `simulate`
 
         Raises
         ------
@@ -169,7 +181,8 @@ class Sweep:
         Parameters
         ----------
         more : lines of additional variations
-        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate
+        keys : replace those at the top of the file: runs, seed, evaluate, random_numbers, controller, rate,
+            agent
 
         Raises
         ------
@@ -216,24 +229,26 @@ class Sweep:
 
     @cached_property
     def law(self) -> tuple[Any, str]:
-        """The user's controller, or its class, with a digest of its file; None if the mission's laws fly.
+        """The user's controller or law, or its class, with a digest of its file; None if the mission's laws fly.
 
         Raises
         ------
         RigidfleetError
             It cannot be imported.
         """
-        if not (name := self.header.controller):
+        key, name = self.header.own
+        if not name:
             return None, ""
         try:
             return controllers.import_law(name)
         except ImportError as error:
-            raise RigidfleetError(f"controller: {error}\n    {controllers.REMEDY}") from error
+            raise RigidfleetError(f"{key}: {error}\n    {controllers.REMEDY}") from error
 
     @property
     def version(self) -> str:
         """What flies it: the version of rigidfleet, and the user's controller."""
-        law = f" with {self.header.controller} {self.law[1][:8]}" if self.header.controller else ""
+        name = self.header.own[1]
+        law = f" with {name} {self.law[1][:8]}" if name else ""
         return f"rigidfleet {__version__}{law}"
 
     @property
@@ -420,14 +435,21 @@ def _check(
             collector.add(("evaluate",), why, _WHOLE, "final")
     if mission is not None and whole is not None:
         _taken(collector, lacked, mission, whole)
-    if header is not None and (name := header.controller):
+    if header is not None and header.own[1]:
+        key, name = header.own
         try:
             controllers.import_law(name)
         except ImportError as error:
-            collector.add(("controller",), str(error), controllers.REMEDY)
+            collector.add((key,), str(error), controllers.REMEDY)
         if by_final_states:
-            collector.add(("controller",), "does not act on final states alone", _WHOLE)
-    elif "rate" in data:
+            collector.add((key,), "does not act on final states alone", _WHOLE)
+        if key == "agent" and mission is not None and mission.network is None:
+            collector.add(
+                (key,), "needs a network", "add [network] to the mission, or remove agent"
+            )
+        if key == "agent" and header.controller:
+            collector.add((key,), "does not go with a controller", "give one of them")
+    if "rate" in data and not data.get("controller"):
         collector.add(("rate",), "is that of a controller", "give a controller, or remove rate")
     _same_length(collector, variations)
     if "vary" not in data or data["vary"] == []:

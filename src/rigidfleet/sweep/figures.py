@@ -35,6 +35,8 @@ _COLUMNS = 4
 _BINS = 30
 #: Maximum number of intervals of an envelope.
 _ENVELOPE = 12
+#: Greatest number of values along a side of a map that are all written.
+_LABELS = 12
 #: Number of cells along a side of a map of random numbers.
 _CELLS = 10
 #: Maximum number of distinct values with a cell each.
@@ -267,7 +269,8 @@ def map_over_two(table: Table, over: Sequence[str] = (), metric: str = "") -> Fi
     ):
         distinct = np.unique(numbers[name])
         if len(distinct) <= _VALUES:
-            axis.set_ticks(range(len(distinct)), [f"{v:.3g}" for v in distinct])
+            every = 1 + (len(distinct) > _LABELS)
+            axis.set_ticks(range(0, len(distinct), every), [f"{v:.3g}" for v in distinct[::every]])
         elif _spacing(table, name) == "log":
             scale("log")
             _log_ticks(axis, distinct)

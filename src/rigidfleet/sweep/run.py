@@ -40,8 +40,14 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     from rigidfleet.simulation.flight import simulate
     from rigidfleet.simulation.together import simulate_together
 
-    law, rate = sweep.law[0], sweep.header.rate
-    new = law if isinstance(law, type) else lambda: law
+    law, header = sweep.law[0], sweep.header
+
+    def flight_of(run: int) -> Result:
+        if header.agent:
+            return simulate(flown[run], agent=law)
+        own = law() if isinstance(law, type) else law
+        return simulate(flown[run], controller=own, rate=header.rate)
+
     begun = perf_counter()
     values = {run: sweep.values(run) for run in runs}
     flown: dict[int, Any] = {
@@ -50,10 +56,7 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
     together = law or _value_or_error(lambda: simulate_together([flown[run] for run in valid]))
     if law is not None or isinstance(together, Exception):
-        together = [
-            _value_or_error(lambda run=run: simulate(flown[run], controller=new(), rate=rate))
-            for run in valid
-        ]
+        together = [_value_or_error(lambda run=run: flight_of(run)) for run in valid]
     flown |= zip(valid, together, strict=True)
     del together
     shared = (perf_counter() - begun) / len(runs)
@@ -82,7 +85,7 @@ def _record(
     match outcome:
         case MissionError():
             reason, detail = refusal(outcome)
-        case FlightError() if sweep.header.controller:
+        case FlightError() if sweep.header.own[1]:
             reason, detail = RAISED, str(outcome)
         case Exception():
             reason, detail = BROKEN, f"{type(outcome).__name__}: {outcome}"

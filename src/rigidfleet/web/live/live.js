@@ -64,6 +64,7 @@ class LivePlayer extends Player {
     }
     const label = element("label", card, { class: "lever" }, "force");
     this.strength = element("input", label, { type: "range", min: "0.5", max: "8", step: "0.5", value: "3", id: "strength" });
+    if (info.loss !== null) this.network(card, info.loss);
     const ball = element("section", card, { id: "ball" });
     element("h2", ball, {}, "Ball");
     const row = element("div", ball, { class: "row" });
@@ -122,6 +123,19 @@ class LivePlayer extends Player {
     pad.addEventListener("pointermove", (event) => event.buttons && drag(event));
     for (const end of ["pointerup", "pointercancel"]) pad.addEventListener(end, () => put(0, 0));
     return pad;
+  }
+
+  /** A slider of the share of messages that links lose. */
+  network(card, loss) {
+    element("h2", card, {}, "Messages lost");
+    const lever = element("label", card, { class: "lever value" }, "share"), value = String(Math.round(100 * loss));
+    const input = element("input", lever, { type: "range", min: "0", max: "95", step: "5", value, id: "loss" });
+    const share = element("output", lever), write = () => (share.textContent = `${input.value} %`);
+    input.addEventListener("input", () => {
+      write();
+      order({ loss: Number(input.value) / 100 });
+    });
+    write();
   }
 
   /** A slider that springs back when released. */

@@ -289,7 +289,9 @@ class Pilot:
             # A record of one moment has no extremes
             phases = [replace(p, extremes={}) for p in self.phases]
             mission = flight.mission  # with the balls
-            result = assemble(mission, phases, end, ending="", statistics={})
+            result = assemble(
+                mission, phases, end, ending="", statistics={}, network=flight.network
+            )
             result.mission = mission  # so that it is not parsed again
             self.last = result
             self.archive.add(flight.pieces, result)

@@ -105,6 +105,7 @@ class Session:
                 "unguarded": self.unguarded,
                 "ball": {"radius": [SMALLEST, LARGEST], "speed": FASTEST},
                 "speeds": SPEEDS,
+                "loss": None if self.mission.network is None else self.mission.network.loss,
                 **self.story(),
             }
         return page(info, start="live/live.js", style=read("live/live.css"), connect="'self'")
@@ -205,6 +206,8 @@ class Session:
                     self.pilot.pull(slot, _vector(place, _FARTHEST))
                 case {"remove": int(slot)}:
                     self.pilot.take_out(slot)
+                case {"loss": share}:
+                    self.pilot.flight.lose(min(abs(_number(share, 0.95)), 0.95))
                 case {"pause": bool(paused)}:
                     self.paused = paused
                 case {"speed": float(speed) | int(speed)} if speed in SPEEDS:

@@ -532,7 +532,7 @@ export class Player {
     for (const plot of this.plots) plot.point(share, state);
     const much = scene.enlarged > 1e6 ? "Vehicles have no size; they are drawn as if." : `Vehicles are drawn ${digits(scene.enlarged)} times their size.`;
     const larger = scene.enlarged > 1.15 && !scene.night ? much : "";
-    write("notes", [info.note, larger, overworked(state), avoiding(state)].filter(Boolean).join("\n"));
+    write("notes", [info.note, larger, overworked(state), avoiding(state), unheard(state)].filter(Boolean).join("\n"));
   }
 }
 
@@ -557,6 +557,12 @@ function avoiding({ aside, acts }) {
     way > 0.02 && `The formation flies ${way.toFixed(1)} m beside its path.`,
     yields && `${yields} led by barriers (amber).`, held && `${held} held by the guard (red).`,
   ].filter(Boolean).join("\n");
+}
+
+/** How many edges are let go for want of messages, in words. */
+function unheard({ silent }) {
+  const count = Array.from(silent ?? []).filter((share) => share > 0.99).length;
+  return count ? `${count} edge${count > 1 ? "s" : ""} let go: no messages (broken lines).` : "";
 }
 
 export function say(words) {

@@ -12,6 +12,7 @@ const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
 const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], LIMIT = [0.86, 0.05, 0.10], YIELDS = [0.90, 0.60, 0.0];
 const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
+const HEARD = 0.5; // share of the silence that lets go of an edge from which it is drawn broken
 const TRAIL = 8; // length of trails [s]
 const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
 const ORDER = [0, 3, 2, 1]; // rotors of `ROTORS` in the columns: front left, front right, rear right, rear left
@@ -411,9 +412,18 @@ export class Scene {
       const pull = state.tension[k];
       if (Number.isNaN(pull)) return;
       const share = pull / tension, load = Math.sqrt(Math.min(Math.abs(share), 1));
-      lines.world.add(at(i), at(j), slim * (2.2 + 2.8 * load), tensionColour(share), veil);
+      const width = slim * (2.2 + 2.8 * load), silent = state.silent?.[k] ?? 0;
+      if (silent < HEARD) lines.world.add(at(i), at(j), width, tensionColour(share), veil);
+      else this.breakEdge(at(i), at(j), width, silent, veil);
       if (edges.length <= 200) lines.ground.add(below(at(i)), below(at(j)), 1.5, INK, 0.09);
     });
+  }
+
+  /** An edge whose ends have not heard of each other for long: the longer, the wider the gap in it. */
+  breakEdge(a, b, width, silent, veil) {
+    const part = 0.5 * (1 - 0.6 * silent), along = (f) => a.map((x, q) => x + f * (b[q] - x));
+    this.lines.world.add(a, along(part), width, LIMIT, veil);
+    this.lines.world.add(along(1 - part), b, width, LIMIT, veil);
   }
 
   /** The last seconds of every vehicle's path. */

@@ -86,6 +86,7 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
         **_attitude_columns(result),
         **_avoidance_columns(result),
         **_light_columns(result),
+        **_silence_columns(result, shown),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -132,6 +133,15 @@ def _avoidance_columns(result: Result) -> dict[str, PackedColumn]:
         "aside": PackedColumn(np.linalg.norm(way, axis=1), 0.01),
         "acts": PackedColumn(acts, 1.0),
     }
+
+
+def _silence_columns(result: Result, shown: Ints) -> dict[str, PackedColumn]:
+    """Samples of links: how near an edge is to being let go for want of messages, from 0 to 1."""
+    age, net = result.message_age, result.mission.network
+    if age is None or net is None:
+        return {}
+    oldest = np.where(np.isnan(age), np.inf, age)[:, shown].max(axis=2)
+    return {"silent": PackedColumn(np.minimum(oldest / net.silence, 1.0), 0.01)}
 
 
 def _light_columns(result: Result) -> dict[str, PackedColumn]:

@@ -1,0 +1,48 @@
+"""Figure of a flight whose vehicles know each other by messages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from rigidfleet.plotting import peaks
+from rigidfleet.plotting import style as st
+from rigidfleet.plotting.style import in_style
+from rigidfleet.result import Result
+from rigidfleet.typing import Floats
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@in_style
+def messages(result: Result) -> Figure:
+    """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""
+    fig, axes = st.time_figure(result, "Messages of neighbours", 2)
+    above, below = axes[:, 0]
+    above.set_ylabel("oldest message [s]")
+    below.set_ylabel("sum of all\nconstraint forces [N]")
+    net = result.mission.network
+    if result.message_age is None or net is None:
+        for ax in (above, below):
+            st.write_note(ax, "no network: one law knows all states")
+        return fig
+    age = oldest_messages(result)
+    peaks.draw_from_zero(above, result, age, "s")
+    st.draw_agents_legend(above, result.n_agents)
+    if net.silence < 2.0 * np.nanmax(age, initial=0.0):
+        st.draw_limit(above, net.silence, f"an edge is let go: {net.silence:g} s")
+    push = np.linalg.norm(np.nansum(result.constraint_force, axis=1), axis=1)
+    st.draw_line(below, result.time, push, color=st.FLOWN)
+    below.set_ylim(bottom=0.0)
+    return fig
+
+
+def oldest_messages(result: Result) -> Floats:
+    """Age (K, N) of the oldest of the newest messages that each agent has of its neighbours [s]; NaN without any."""
+    assert result.message_age is not None
+    age = np.full((result.n_agents, len(result.time)), np.nan)
+    for way in range(2):
+        np.fmax.at(age, result.edges[:, way], result.message_age[:, :, way].T)
+    return age.T

@@ -1,0 +1,287 @@
+"""Check what delay and loss of messages a formation by neighbours bears.
+
+Delay: the linear flight (`linear_flight`) with messages that all arrive has a spectral radius, found by Arnoldi's
+method. Loss: where messages are lost independently, the second moment P of the state moves by
+
+    P -> A P A^T + q (1 - q) sum_l B_l P B_l^T,
+
+A the tick in which each link l has the share q of its change B_l. P is carried by a few states x, each with its own
+share of noise: what link l would have changed in *another* of them, with a random sign. This keeps to the map without
+any bound or closure; what is left is the sampling error of its growth, some hundredths a second. Flights of which each
+loses its own messages would need thousands, since few that grow make the moment. Bursts, jitter and edges that are let
+go of are flown so, a few flights of the mission's own network.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from rigidfleet.kernel.mail import Links
+from rigidfleet.math.margins import GROWTH, Lag
+from rigidfleet.mission import Mission
+from rigidfleet.planning.preview import PlannedPhase
+from rigidfleet.planning.vehicles import network_of
+from rigidfleet.preflight.findings import FormationNetwork, Preflight, Remark
+from rigidfleet.preflight.linear_flight import Arrivals, LinearFlight, Radio
+from rigidfleet.preflight.margins import feedback
+from rigidfleet.typing import Floats
+
+#: Delays beyond this are not looked at [s].
+_LATEST = 2.0
+#: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius.
+_PERIOD, _VECTORS, _ACCURACY = 1.5, 20, 1e-4
+#: Losses that are tried first; the limit is then found to the hundredth.
+_LOSSES = (0.2, 0.4, 0.6, 0.8, 0.9, 0.95)
+#: Time for which second moments move [s].
+_TIME = 16.0
+#: Growth [1/s] from which they count as unstable: more than the error of sampling.
+_GROWS = 0.02
+#: States that carry a moment: least and greatest number, and that of their links together; flights with the own
+#: network.
+_STATES, _FLIGHTS = (2, 64, 384), 16
+
+
+def check_network(
+    mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
+) -> dict[str, FormationNetwork]:
+    """What each formation bears, by its name; empty without a network.
+
+    Parameters
+    ----------
+    way : the planned phases
+    lags : of each vehicle
+    """
+    checks: dict[str, FormationNetwork] = {}
+    for name, flight, unheard in linear_flights(mission, way, lags):
+        check = _borne(mission, flight, unheard)
+        checks[name] = check if name not in checks else checks[name].lesser(check)
+    return checks
+
+
+def linear_flights(
+    mission: Mission, way: Sequence[PlannedPhase], lags: Sequence[Lag]
+) -> Iterator[tuple[str, LinearFlight, int]]:
+    """Each formation under each law with which it is flown, and how many of its edges nobody hears along."""
+    if mission.network is None or mission.vehicle_models is None:
+        return
+    net, every, tick = network_of(mission), *_law_ticks(mission)
+    radio = Radio(max(1, round(net.every / every)), math.ceil(net.delay / every), net.lag, tick)
+    drag = np.array([model.linear_drag for model in mission.vehicle_models])
+    drag /= mission.fleet.mass[:, None]
+    pairs = zip(mission.phases, way, strict=False)
+    laws = {(planned.shapes[1], feedback(mission, p, planned.shapes[1])) for p, planned in pairs}
+    for name, law in sorted(laws, key=str):
+        slots = None if name is None else mission.formation_slots(name)
+        if name is None or slots is None:
+            continue
+        edges = mission.formation_edges(name)
+        near = np.linalg.norm(slots[edges[:, 0]] - slots[edges[:, 1]], axis=1) <= net.range
+        if near.any():
+            flight = LinearFlight(slots, edges[near], mission.fleet.mass, law, radio, lags, drag)
+            yield name, flight, int((~near).sum())
+
+
+def _law_ticks(mission: Mission) -> tuple[int, float]:
+    """Attitude ticks from one evaluation of the law to the next, and the time between them [s]."""
+    every = max(1, round(mission.autopilot.rate / mission.autopilot.formation_rate))
+    return every, every / mission.autopilot.rate
+
+
+def _borne(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
+    own, net, radio, (every, tick) = (
+        mission.network,
+        network_of(mission),
+        flight.radio,
+        _law_ticks(mission),
+    )
+    assert own is not None
+    latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
+    loss = loss_borne(flight) if radio.delay <= delay else None
+    growing = None
+    if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
+        growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
+    broadcasts = flight.n / (radio.every * tick)
+    return FormationNetwork(broadcasts, tick, delay, latest, loss, own.loss, growing, unheard)
+
+
+def growth_at(flight: LinearFlight, delay: int) -> float:
+    """Greatest growth [1/s] of a motion if all messages arrive after ``delay`` ticks; about 0 at least.
+
+    Free motions of the whole formation, and integrals of stresses that no vehicle feels, neither grow nor decay.
+    """
+    from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
+
+    every = flight.radio.every
+    ticks = max(1, round(_PERIOD / flight.radio.tick / every)) * every
+    messages = (delay, *flight.shape, 1)
+    size = flight.size + math.prod(messages)
+
+    drift = np.linalg.qr(flight.drift(delay))[0] if flight.is_free else np.zeros((size, 0))
+
+    def moved(z: Floats) -> Floats:
+        sent = z[flight.size :].reshape(messages).copy()
+        _, x = flight.fly(z[: flight.size].reshape(-1, 1), sent, ticks, delay, _all(flight, delay))
+        sent = np.roll(sent, -(ticks % delay), axis=0)
+        z = np.concatenate([x.ravel(), sent.ravel()])
+        return z - drift @ (drift.T @ z)  # motions of the whole formation are projected out
+
+    # No class of its own: what scipy declares of this one is not how it is made.
+    operator: Any = LinearOperator((size, size), matvec=moved, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
+    start = np.random.default_rng(0).normal(size=size)
+    options: dict[str, Any] = {
+        "k": 1,
+        "v0": start,
+        "ncv": _VECTORS,
+        "tol": _ACCURACY,
+        "maxiter": 20,
+    }
+    try:
+        values = eigs(operator, return_eigenvectors=False, **options)
+    except ArpackNoConvergence as stopped:
+        values = stopped.eigenvalues
+    return math.log(np.abs(values).max(initial=1e-300)) / (ticks * flight.radio.tick)
+
+
+def _all(flight: LinearFlight, delay: int) -> Arrivals:
+    """All messages arrive after ``delay`` ticks."""
+    return lambda k, change: change(0) if (k - delay) % flight.radio.every == 0 else 0.0
+
+
+def last_stable_delay(flight: LinearFlight) -> int:
+    """Last delay in ticks at which no motion grows; 0 if there is none, or the last one that is looked at."""
+    most = max(1, math.ceil(_LATEST / flight.radio.tick))
+    low, high = 0, 1
+    while growth_at(flight, high) < GROWTH:
+        if high == most:
+            return most
+        low, high = high, min(2 * high, most)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if growth_at(flight, middle) < GROWTH else (low, middle)
+    return low
+
+
+def mean_square_growth(
+    flight: LinearFlight, losses: Floats, *, states: int, time: float = _TIME
+) -> Floats:
+    """Growth [1/s] of the root mean square of errors of edges, for each share of messages lost."""
+    rng = np.random.default_rng(0)
+    delay, every = flight.radio.delay, flight.radio.every
+    L = len(flight.links)
+    kept = np.repeat(1.0 - losses, states)
+    spread = np.sqrt(kept * (1.0 - kept))
+    block = np.arange(len(losses))[:, None] * states
+
+    def arrivals(k: int, change: Callable[[int], Floats]) -> Floats | float:
+        if (k - delay) % every:
+            return 0.0
+        news = change(0)
+        # Of which other state each link has its noise: a rotation of those with the same loss.
+        turn = (np.arange(states) + rng.integers(0, states, (L, 1, 1))) % states
+        other = np.take_along_axis(news, (block + turn).reshape(1, L, -1), axis=2)
+        sign = rng.integers(0, 2, (L, len(kept))) * 2.0 - 1.0
+        return kept * news + spread * sign * other
+
+    errors = _flown(flight, delay, len(kept), time, arrivals)
+    return _growth(errors.reshape(len(errors), len(losses), states).mean(axis=2), time)
+
+
+def _flown(
+    flight: LinearFlight,
+    depth: int,
+    columns: int,
+    time: float,
+    arrivals: Arrivals,
+    grip: Floats | float = 1.0,
+) -> Floats:
+    """Squares of errors of edges (ticks, B) in flights from random places; ``depth`` ticks of messages are kept."""
+    x = np.zeros((flight.size, columns))
+    place = flight.slices["order 0"]
+    x[place] = np.random.default_rng(1).normal(size=(place.stop - place.start, columns))
+    sent = np.zeros((depth, *flight.shape, columns))
+    return flight.fly(x, sent, round(time / flight.radio.tick), flight.radio.delay, arrivals, grip)[
+        0
+    ]
+
+
+def _growth(squares: Floats, time: float) -> Floats:
+    """Growth [1/s] of the root of squares (ticks, ...) from the second to the last quarter of a time [s]."""
+    quarter = len(squares) // 4
+    before, after = squares[quarter : 2 * quarter], squares[-quarter:]
+    return 0.5 * np.log(after.mean(axis=0) / before.mean(axis=0)) / (0.5 * time)
+
+
+def loss_borne(flight: LinearFlight) -> float | None:
+    """Share of messages lost up to which the formation is stable in mean square at its own delay; None if at none."""
+    few, many, links = _STATES
+    states = min(max(links // len(flight.links), few), many)
+    tried = np.array(_LOSSES)
+    low, high = 0.0, math.inf
+    while len(tried):
+        unstable = mean_square_growth(flight, tried, states=states) > _GROWS
+        first = int(unstable.argmax()) if unstable.any() else len(tried)
+        low = float(tried[first - 1]) if first else low
+        high = float(tried[first]) if unstable.any() else high
+        if high == math.inf:
+            return low
+        tried = np.unique(np.round(np.linspace(low, high, 8), 2))
+        tried = tried[(tried > low) & (tried < high)]
+    return low
+
+
+def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
+    """Growth [1/s] of the errors of edges in some flights (B,) with the losses, jitter and time-outs of a network."""
+    rng, (_, L) = np.random.default_rng(0), flight.shape
+    delay, late = (
+        flight.radio.delay,
+        math.ceil((net.delay + net.jitter) / every) - flight.radio.delay,
+    )
+    shape = late + 1, L, _FLIGHTS
+    fading, grip = np.zeros(shape[1:], dtype=np.bool_), np.ones(shape[1:])
+    due, newest = np.full(shape, -1), np.zeros(shape[1:], dtype=np.int64)
+    step = every / net.silence
+
+    def arrivals(k: int, change: Callable[[int], Floats]) -> Floats | float:
+        # The message sent at tick k - delay is due in some ticks from now, or never.
+        nonlocal fading
+        total: Floats | float = 0.0
+        due[(k - delay) % len(due)] = -1
+        if (k - delay) % flight.radio.every == 0:
+            fading = np.where(
+                fading, rng.random(shape[1:]) >= net.recovers, rng.random(shape[1:]) < net.worsens
+            )
+            wait = (rng.random(shape[1:]) * (late + 1)).astype(np.int64)
+            due[(k - delay) % len(due)] = np.where(fading, -1, k + wait)
+        for waited in range(late + 1):  # the newest of those that arrive together
+            sent = k - delay - waited
+            now = (due[sent % len(due)] == k) & (sent > newest)
+            if now.any():
+                newest[now] = sent
+                total = total + now * change(waited)
+        silent = k - newest > net.silence / every
+        grip[:] = np.clip(np.where(silent, grip - step, grip + step), 0.0, 1.0)
+        return total
+
+    return _growth(_flown(flight, delay + late, _FLIGHTS, _TIME, arrivals, grip), _TIME)
+
+
+def network_remarks(preflight: Preflight) -> Iterator[Remark]:
+    """Remarks on formations whose network is beyond what they bear."""
+    for name, f in preflight.network.items():
+        if f.unheard:
+            text = f"'{name}': {f.unheard} edges are longer than the range of the network: nobody hears along them"
+            yield Remark("note", "network", text)
+        if f.borne:
+            continue
+        share, what = f.growing or 0.0, f"{100 * f.own_loss:.0f} % of its messages are lost"
+        why, remedy = what, "lower network.loss, raise network.rate, or slow the constraint law"
+        if f.own_delay > f.delay:
+            why = f"its messages are up to {f.own_delay} ticks late, and it bears {f.delay}"
+            remedy = "shorten network.delay, or slow the constraint law"
+        grows = f"errors grow in {100 * share:.0f} % of linear flights"
+        text = f"'{name}': unstable over its network: {why}; {grows}; {remedy}"
+        yield Remark("fails" if share > 0.5 else "note", "network", text)

@@ -1,0 +1,250 @@
+"""A user's law for each vehicle, called at each tick with what that vehicle knows: itself, its slot, its messages."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rigidfleet.errors import FlightError
+from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
+from rigidfleet.kernel.mail import NONE
+from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
+from rigidfleet.typing import Floats
+
+
+class Message(NamedTuple):
+    """The newest message that a vehicle has heard of a neighbour: what it says, and how old it is [s]."""
+
+    content: Any
+    age: float
+
+
+@dataclass(slots=True)
+class View:
+    """What one vehicle knows at a tick of its law; arrays are copies of its own.
+
+    Agents count from 0, as in arrays.
+
+    Attributes
+    ----------
+    agent : which vehicle it is
+    t, dt : mission time, and time between two calls [s]
+    phase : name of the phase
+    mass, gravity : as laws assume them [kg], [m/s^2]
+    position, velocity : (3,) its own as measured, world axes [m, m/s]
+    reference_position, reference_velocity, reference_acceleration : (3,) of its slot, world axes [m, m/s, m/s^2]; NaN
+        where no slots are tracked
+    distance, distance_rate : what its edges are to have now, by neighbour [m], [m/s]
+    inbox : newest `Message` of each neighbour of which it has heard, by neighbour; contents cannot be changed
+    memory : a dictionary of its own, kept from call to call
+    attitude, rates, rotor_speed : of a vehicle with rotors: (4,) quaternion, world to body, scalar first; (3,) body
+        axes [rad/s]; (4,) [rad/s]; None for a point
+    """
+
+    agent: int
+    t: float
+    dt: float
+    phase: str
+    mass: float
+    gravity: float
+    position: Floats
+    velocity: Floats
+    reference_position: Floats
+    reference_velocity: Floats
+    reference_acceleration: Floats
+    distance: dict[int, float]
+    distance_rate: dict[int, float]
+    inbox: dict[int, Message]
+    memory: dict[Any, Any]
+    attitude: Floats | None = None
+    rates: Floats | None = None
+    rotor_speed: Floats | None = None
+
+
+#: A law returns the force (3,) [N] of its vehicle, weight included, and what it says to its neighbours; None: nothing.
+Law = Callable[[View], tuple[ArrayLike, Any]]
+
+
+class OwnLaws:
+    """The laws of a flight's vehicles, what they remember and what they have said.
+
+    Which message arrives, and when, is the kernel's; what it says is kept here.
+    """
+
+    def __init__(self, agent: Law | type, flight: SampledFlight) -> None:
+        net, n = flight.network, len(flight.vehicles.m)
+        self.laws: list[Law] = [agent() if isinstance(agent, type) else agent for _ in range(n)]
+        self.every, self.tick = flight.every, flight.steps * flight.h
+        self.points = flight.vehicles.point.tolist()
+        self.memories: list[dict[Any, Any]] = [{} for _ in range(n)]
+        pairs, first = net.links.tolist(), net.first.tolist()
+        #: Links of each vehicle, with the neighbour that it hears by each.
+        self.links = [[(l, pairs[l][1]) for l in range(*first[i : i + 2])] for i in range(n)]
+        #: What all said at the last ticks of their laws, the newest last: those that may still be under way.
+        self.said: deque[list[Any]] = deque(maxlen=(net.delay + net.jitter) // flight.every + 2)
+        #: Of each link, the tick at which the newest message was written, and what it says.
+        self.newest: list[tuple[int, Any]] = [(-1, None)] * len(pairs)
+        #: Of each link with an edge, its length [m] and the rate of that [m/s].
+        self.lengths: dict[int, tuple[float, float]] = {}
+        #: The views last made, with their tick and problem: who looks before the flight asks has the same ones.
+        self.last: tuple[int, Problem, list[View | None]] | None = None
+        self.numbers = 0  # in the longest message
+
+    def ask(
+        self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
+    ) -> None:
+        """Call the law of each vehicle at the tick at which the flight asks, and take what they answer.
+
+        Raises
+        ------
+        FlightError
+            A law raised an exception, or did not return a force and a message. It names the vehicle and the tick.
+        """
+        answers: list[Any] = []
+        for view in self.views(phase, problem, w, flight, state):
+            try:
+                answers.append(view and self.laws[view.agent](view))
+            except Exception as error:
+                assert view is not None
+                words = f"raised {type(error).__name__}", f": {error}"
+                raise self._failure(view.agent, *words, state) from error
+        self.take(answers, flight, state)
+
+    def views(
+        self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
+    ) -> list[View | None]:
+        """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
+        k, S, tracks = int(state.count[TICKS]), state.S, problem.control.kind == TRACKING
+        if self.last is not None and self.last[0] == k and self.last[1] is problem:
+            return self.last[2]
+        t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
+        self._open(k, state.mail.stamp.tolist())
+        np.maximum(
+            state.mail.oldest,
+            k - state.mail.stamp,
+            out=state.mail.oldest,
+            where=state.mail.stamp >= 0,
+        )
+        slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
+        known = np.stack([w.r, w.v, *slots])
+        masses, lost = problem.vehicles.m.tolist(), flight.vehicles.lost.tolist()
+        self._take_lengths(state.mail.edge.tolist(), w.d.tolist(), w.d_dot.tolist())
+        views: list[View | None] = []
+        for i, links in enumerate(self.links):
+            if lost[i]:
+                views.append(None)
+                continue
+            r, v, r_ref, v_ref, a_ref = known[:, i].copy()
+            rotors = () if self.points[i] else np.split(S[i, 6:].copy(), (4, 7))
+            held = [(j, *self.lengths[l]) for l, j in links if l in self.lengths]
+            heard = [(j, *self.newest[l]) for l, j in links if self.newest[l][0] >= 0]
+            views.append(
+                View(
+                    i, t, dt, phase, masses[i], g, r, v, r_ref, v_ref, a_ref,
+                    {j: d for j, d, _ in held}, {j: rate for j, _, rate in held},
+                    {j: Message(content, (k - written) * self.tick) for j, written, content in heard},
+                    self.memories[i], *rotors,
+                )
+            )  # fmt: skip
+        self.last = k, problem, views
+        return views
+
+    def take(self, answers: Sequence[Any], flight: SampledFlight, state: SampledState) -> None:
+        """Take forces and messages of all vehicles for the tick that comes; nothing of those that are lost."""
+        said: list[Any] = []
+        for i, answer in enumerate(answers):
+            if flight.vehicles.lost[i]:
+                said.append(None)
+                continue
+            try:
+                force, message = answer
+            except (TypeError, ValueError):
+                words = f"returned {answer!r}", ": return a force (3,) [N] and a message"
+                raise self._failure(i, *words, state) from None
+            state.f_u[i] = self._force(i, force, state)
+            try:
+                content, numbers = (None, 0) if message is None else plain_copy(message)
+            except TypeError as error:
+                remedy = f": it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
+                raise self._failure(
+                    i, "returned a message that cannot be sent", remedy, state
+                ) from None
+            self.numbers = max(self.numbers, numbers)
+            state.mail.mute[i] = message is None
+            said.append(content)
+        self.said.append(said)
+        state.count[ANSWERED] = state.count[TICKS] + 1
+
+    def _open(self, k: int, stamps: Sequence[int]) -> None:
+        """Take over what was heard until tick k; a message is sent at the tick that is its stamp, or again then."""
+        now = k // self.every
+        for links in self.links:
+            for l, j in links:
+                written = stamps[l] // self.every
+                if stamps[l] >= 0 and written * self.every > self.newest[l][0]:
+                    self.newest[l] = written * self.every, self.said[written - now][j]
+
+    def _take_lengths(
+        self, edges: Sequence[int], d: Sequence[float], d_dot: Sequence[float]
+    ) -> None:
+        """Lengths of the phase's edges; what has lost its other end keeps its last one, as nobody has told."""
+        for l, c in enumerate(edges):
+            if c >= 0:
+                self.lengths[l] = d[c], d_dot[c]
+            elif c == NONE:
+                self.lengths.pop(l, None)
+
+    def _force(self, i: int, force: ArrayLike, state: SampledState) -> Floats:
+        remedy = ": return a force (3,) [N], weight included, and a message"
+        try:
+            f = np.array(force)
+            f = f if f.dtype.kind in "biuf" else None
+        except (TypeError, ValueError):
+            f = None
+        if f is None:
+            raise self._failure(i, f"returned the force {force!r}", remedy, state)
+        if f.shape != (3,):
+            raise self._failure(i, f"returned a force of shape {f.shape}", remedy, state)
+        if not np.isfinite(f).all():
+            raise self._failure(i, "returned a force that is not finite", f": {f.tolist()}", state)
+        return f
+
+    def _failure(self, i: int, what: str, more: str, state: SampledState) -> FlightError:
+        k = int(state.count[TICKS])
+        return FlightError(
+            f"the law of agent {i + 1} {what} at tick {k}, t = {k * self.tick:.3f} s{more}"
+        )
+
+
+def plain_copy(x: Any) -> tuple[Any, int]:
+    """A copy of numbers, arrays, and tuples, lists and dictionaries of these that nobody can change, and its numbers.
+
+    Raises
+    ------
+    TypeError
+        It contains something else, which the message names.
+    """
+    if isinstance(x, np.ndarray) and x.dtype.kind in "biuf":
+        y = x.copy()
+        y.flags.writeable = False
+        return y, y.size
+    if isinstance(x, int | float):
+        return x, 1
+    if isinstance(x, np.floating | np.integer | np.bool_):
+        return x.item(), 1
+    if isinstance(x, tuple | list):
+        parts = [plain_copy(part) for part in x]
+        return tuple(part for part, _ in parts), sum(size for _, size in parts)
+    if isinstance(x, Mapping):
+        named = {name: plain_copy(part) for name, part in x.items()}
+        whole = {name: part for name, (part, _) in named.items()}
+        return MappingProxyType(whole), sum(size for _, size in named.values())
+    raise TypeError(
+        f"an array of {x.dtype}" if isinstance(x, np.ndarray) else f"a {type(x).__name__}"
+    )
