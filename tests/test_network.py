@@ -77,6 +77,7 @@ def fly(problem: Any, work: Any, flight: Any, state: Any, ticks: int) -> None:
 NETWORKS = [
     {"delay": 0.04, "loss": 0.3, "jitter": 0.04},
     {"delay": 0.02, "loss": 0.6, "burst": 5.0, "range": 5.7},
+    {"delay": 0.02, "clocks": {"late": 0.3, "drift": 5e3, "consensus": 2.0, "wait": 1.0}},
 ]
 
 
@@ -92,7 +93,7 @@ def test_no_vehicle_reads_another_ones_state(network):
     for i in range(8):
         alone = deepcopy(state)
         others, foreign = np.arange(8) != i, net.links[:, 0] != i
-        for name in ("S", "seen", "error", "f_u", "f_C", "force"):
+        for name in ("S", "seen", "error", "f_u", "f_C", "force", "tau"):
             getattr(alone, name)[others] = np.nan
         alone.history[:, others] = np.nan
         mail = alone.mail

@@ -54,7 +54,7 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
             if doubt
             else "the guarantee of [avoidance] is proved: at every tick, all vehicles could brake in time"
         )
-    yield from _clock_and_body_notes(result)
+    yield from _body_notes(result)
     for name, words in (("barrier", "barriers changed"), ("guard", "the guard replaced")):
         every = [p.extremes[name] for p in result.phases if name in p.extremes]
         if every:
@@ -66,8 +66,8 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
             )
 
 
-def _clock_and_body_notes(result: Result) -> Iterator[str]:
-    """What the virtual clock and the body layer did, and the share of time by layer."""
+def clock_notes(result: Result) -> Iterator[str]:
+    """Whether the formation waited, and how far the vehicles' own clocks were apart."""
     waited = [p for p in result.phases if "clock" in p.extremes]
     if waited:
         longest = max(waited, key=lambda p: p.extremes["clock"].value)
@@ -76,6 +76,16 @@ def _clock_and_body_notes(result: Result) -> Iterator[str]:
             f"the formation waited on its path from {x.time:.2f} s on: phase '{longest.name}' ends"
             f" {value(x.value, 's')} later than planned"
         )
+    if (clock := result.vehicle_clock) is not None:
+        apart = np.ptp(clock, axis=1)
+        yield (
+            f"each vehicle has flown by its own clock: they differed by up to {value(float(apart.max()), 's')}, and by"
+            f" {value(float(apart[-1]), 's')} at the end"
+        )
+
+
+def _body_notes(result: Result) -> Iterator[str]:
+    """The share of time by layer, and how far the body was beside its path."""
     rate, way, acts = result.clock_rate, result.body_displacement, result.avoidance_layers
     if rate is None or way is None or acts is None or len(result.time) < 2:
         return

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigidfleet._common.text import agent_names
-from rigidfleet.assessment.avoidance import avoidance_notes
+from rigidfleet.assessment.avoidance import avoidance_notes, clock_notes
 from rigidfleet.assessment.checks import abandonment_check
 from rigidfleet.assessment.fits import angle_between
 from rigidfleet.assessment.measure import Measurements
@@ -39,6 +39,7 @@ def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
             yield f"the thrust of {who} saturates at its limit, first at {since:.2f} s"
     if words := measured.mission.landings_in_words(measured.result.position[-1]):
         yield words
+    yield from clock_notes(measured.result)
     yield from avoidance_notes(measured)
     if "doubt" in measured.result.statistics:
         yield "a log is judged here as if it were exact; `assess MISSION LOG...` judges it with doubt"

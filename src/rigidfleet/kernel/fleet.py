@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet.kernel.clocks import Clocks, clocks_at_start, same_clock
 from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
@@ -199,6 +200,10 @@ class TickInputs(NamedTuple):
     noise_r: Floats  # (K', N, 3) of measurements [m]
     noise_v: Floats  # (K', N, 3) [m/s]
     dropped: Bools  # (K', N) measurements that fail
+    #: with clocks of their own, path, yaw, jerk and snap (K'', N, 15) by the clocks' ticks from ``origin`` on, of which
+    #: those of each tick are taken in flight
+    by_clock: Floats = np.zeros((0, 0, 15))
+    origin: int = 0
 
 
 class Commands(NamedTuple):
@@ -218,6 +223,7 @@ class SampledFlight(NamedTuple):
     air: Air
     sensing: Sensing
     network: Links  # how vehicles know each other
+    clocks: Clocks  # and by which time they fly
     guidance: Guidance
     tables: TickInputs
     commands: Commands
@@ -251,6 +257,7 @@ class SampledState(NamedTuple):
     seen: Floats  # (N, 6) measured r, v
     history: Floats  # (D, N, 6) true r, v of the last ticks
     mail: Mail
+    tau: Floats  # (N, 9) each vehicle's own clock, see `clocks.OFF`
     peak: Floats  # (N, 4) greatest thrust of each rotor [N]
     peak_time: Floats  # (N, 4) [s]
     worst: Floats  # (N, 7) see `UPRIGHT`
@@ -293,6 +300,7 @@ class SampledSegment(NamedTuple):
     air: Floats  # (K, N, 3) velocity of the air [m/s]
     saturated: Bools  # (K, N)
     layers: Ints  # (K, N)
+    tau: Floats  # (K, N, 3) clocks: tau - t [s], dtau/dt, ds/dt [1/s]
     integral: Floats  # (K, m) of the constraints
     frame: Floats  # (K, 4)
     stamp: Ints  # (K, L) tick at which the newest message of each link was sent
@@ -396,8 +404,8 @@ def flight(
     """A flight in still air with exact sensing; see `SampledFlight`. Replace parts of it by ``_replace``."""
     n = len(vehicles.m)
     return SampledFlight(
-        vehicles, still_air(n), exact_sensing(n), no_network(n), Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n),
-        no_commands(n), start, h, steps, every,
+        vehicles, still_air(n), exact_sensing(n), no_network(n), same_clock(n),
+        Guidance(np.zeros(n), np.zeros((n, 3))), no_tables(n), no_commands(n), start, h, steps, every,
     )  # fmt: skip
 
 
@@ -450,7 +458,7 @@ def begin(
         f_u=np.zeros((n, 3)), f_C=np.zeros((n, 3)), force=np.zeros((n, 3)), push=np.zeros((n, 3)),
         command=np.zeros((n, 4)), saturated=np.zeros(n, dtype=np.bool_),
         layers=np.zeros(n, dtype=np.int64), seen=known, history=past,
-        mail=mail, peak=peak, peak_time=times[:, :4].copy(),
+        mail=mail, tau=clocks_at_start(n), peak=peak, peak_time=times[:, :4].copy(),
         worst=worst, worst_time=times, saturations=np.zeros(n, dtype=np.int64), trail=trail,
         work=_work(n, m),
     )  # fmt: skip
@@ -496,6 +504,6 @@ def segment(
     return SampledSegment(
         t_end, max_steps, 0, 0, 0, 0, 0, at, np.empty((k, n, STATES)), np.empty((k, n, STATES)), np.empty((k, n, 4)),
         np.empty((k, n, 3)), np.empty((k, n, 3)), np.empty((k, n, 6)), np.empty((k, n, 3)),
-        np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, m)), np.empty((k, 4)),
-        np.empty((k, links), dtype=np.int64),
+        np.empty((k, n), dtype=np.bool_), np.empty((k, n), dtype=np.int64), np.empty((k, n, 3)), np.empty((k, m)),
+        np.empty((k, 4)), np.empty((k, links), dtype=np.int64),
     )  # fmt: skip

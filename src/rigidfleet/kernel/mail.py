@@ -12,8 +12,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 #: Columns of a message: position [m], velocity [m/s], acceleration and the input's share of it [m/s^2], whether the
 #: vehicle is saturated, whether it tracks a slot, position, velocity and acceleration of that slot (which whoever knows
-#: the plan need not be sent), and the acceleration by each iterate of the constraint force [m/s^2], three columns each.
-R, V, A, U, SATURATED, TRACKED, SLOT, PULL = 0, 3, 6, 9, 12, 13, 14, 23
+#: the plan need not be sent), its clock (4, see `clocks.post_clock`), and the acceleration by each iterate of the
+#: constraint force [m/s^2], three columns each.
+R, V, A, U, SATURATED, TRACKED, SLOT, CLOCK, PULL = 0, 3, 6, 9, 12, 13, 14, 23, 27
 #: Share that a vehicle believes of what its neighbour does not know yet of it.
 FRESH = 0.5
 #: Share of the difference of two integrals that one message takes away, and how much longer it takes with each further

@@ -10,6 +10,16 @@ import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
+from rigidfleet.kernel.clocks import (
+    OFF,
+    RATE,
+    SLOPE,
+    advance_clocks,
+    follow_own_clock,
+    let_go,
+    post_clock,
+    take_own_slots,
+)
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.control import local_law
@@ -188,19 +198,10 @@ def worse(i, kind, value, t, state):
 
 @jit
 def know(k, t, p, w, flight, state):
-    """What each vehicle knows at tick k, time t [s], beside messages: its measured state and the plan, into w."""
+    """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
     known_states(k, w, flight, state)
-    if p.reference.kind == SHAPE or p.control.kind == TRACKING:
-        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
-    if p.control.kind == TRACKING:
-        local_law(t, p, w)
-    else:
-        for i in range(state.S.shape[0]):
-            for q in range(3):
-                w.f_u[i, q] = p.control.force[i, q]
-    distance_references(
-        t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
-    )
+    if not flight.clocks.own:
+        evaluate_plan(t, p, w)
 
 
 @jit
@@ -210,7 +211,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
     ``dt`` [s] is the time between two evaluations. Of w, only the plan and the rows of vehicle i are read for i.
     Vehicles that follow laws of their own have answered in ``state.f_u`` with their whole force.
     """
-    net, mail, tick = flight.network, state.mail, flight.steps * flight.h
+    net, mail, tick, stuck = flight.network, state.mail, flight.steps * flight.h, False
     state.work.law_time[0] = t
     know(k, t, p, w, flight, state)
     state.integral[:] = 0.0
@@ -218,6 +219,9 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
     for i in range(state.S.shape[0]):
         if flight.vehicles.lost[i]:
             continue
+        if flight.clocks.own:
+            evaluate_plan(max(t + state.tau[i, OFF], p.motion.knots[0]), p, w)
+            stuck = follow_own_clock(i, k, t, p, w, flight, state)
         estimate_acceleration(i, dt, w.v[i], net, mail)
         hold_edges(i, k, flight.every, net, mail)
         if flight.commands.kind == OWN:
@@ -225,6 +229,8 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
                 w.f_u[i, q], w.f_C[i, q] = state.f_u[i, q], 0.0
         else:
             solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
+        if stuck:
+            let_go(i, w, net, state)
         take_force(k, i, dt, p, w, flight, state)
         for q in range(3):
             mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
@@ -232,6 +238,24 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
         for l in range(net.first[i], net.first[i + 1]):
             if mail.edge[l] >= 0:
                 state.integral[mail.edge[l]] += 0.5 * mail.multiplier[l, last]
+    if flight.clocks.own:
+        take_own_slots(p, w, state)
+
+
+@jit
+def evaluate_plan(t, p, w):
+    """Slots, input forces and desired distances of the plan at t [s], into w, for the states in w."""
+    if p.reference.kind == SHAPE or p.control.kind == TRACKING:
+        blend_slots(t, p.reference, w.p, w.p_dot, w.p_ddot)
+    if p.control.kind == TRACKING:
+        local_law(t, p, w)
+    else:
+        for i in range(w.f_u.shape[0]):
+            for q in range(3):
+                w.f_u[i, q] = p.control.force[i, q]
+    distance_references(
+        t, p.reference, p.graph.edges, w.p, w.p_dot, w.p_ddot, w.d, w.d_dot, w.d_ddot
+    )
 
 
 @jit
@@ -258,6 +282,7 @@ def post(k, p, w, flight, state):
             message[SLOT + 6 + q] = w.a_ref[i, q]
         message[TRACKED] = 1.0 if p.control.kind == TRACKING else 0.0
         message[SATURATED] = 1.0 if state.saturated[i] else 0.0
+        post_clock(k, i, flight.clocks, state.tau[i], message)
         for q in range(mail.pull.shape[1]):
             message[PULL + q] = mail.pull[i, q]
     for l in range(mail.multiplier.shape[0]):
@@ -337,6 +362,8 @@ def advance_frame(t, p, state):
 @jit
 def tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
+    if flight.clocks.own:
+        advance_clocks(k, flight.steps * flight.h, flight, state)
     measure(k, flight, state)
     if flight.network.every > 0:
         receive(k, flight.network, state.mail)
@@ -424,6 +451,9 @@ def write_samples(t, h, p, flight, state, call):
                 )
             call.saturated[c, i] = state.saturated[i]
             call.layers[c, i] = state.layers[i]
+            since = t + x - flight.start - (count[TICKS] - 1) * flight.steps * flight.h
+            call.tau[c, i, 0] = state.tau[i, OFF] + since * (state.tau[i, RATE] - 1.0)
+            call.tau[c, i, 1], call.tau[c, i, 2] = state.tau[i, RATE], state.tau[i, SLOPE]
         write_derivatives(c, t + x, p, flight, state, call)
         for k in range(state.integral.shape[0]):
             call.integral[c, k] = state.integral[k]

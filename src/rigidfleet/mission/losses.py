@@ -41,6 +41,13 @@ def rules(m: Draft) -> Breaches:
     if d is None:
         return
     yield from _vehicles(m, d)
+    for k, one in enumerate(d.stuck):
+        path = (_TABLE, "stuck", k)
+        yield from agents_exist(m, (*path, "agent"), (one.agent,))
+        yield from in_time(m, one.time, path)
+    if d.stuck and m.network is None and m.right((), "network"):
+        problem = "needs vehicles that fly by themselves: without [network], one law commands all"
+        yield Breach((_TABLE, "stuck"), problem, "add [network], or remove it", None)
     for key, needed in ON_LOSS.items():
         if getattr(d, key) is not None and d.on_loss != needed:
             problem = f"has no effect with on_loss '{d.on_loss}'"

@@ -20,6 +20,12 @@ def rules(m: Draft) -> Breaches:
     if net.budget is not None and m.n is not None and net.sent_rate(m.n) < 1.0:
         problem = f"leaves each of {m.n:,} vehicles less than one broadcast a second"
         yield Breach("budget", problem, f"give at least {m.n} Hz, or remove it")
+    for key in ("late", "drift") if net.clocks else ():
+        entries = getattr(net.clocks, key)
+        if m.n is not None and isinstance(entries, tuple) and len(entries) != m.n:
+            problem = f"has {len(entries)} entries for {m.n} agents"
+            remedy = f"give one entry per agent, {m.n} in all, or a single number"
+            yield Breach(("clocks", key), problem, remedy)
     for k, one in enumerate(net.outages):
         yield from agents_exist(m, ("outages", k, "between"), one.between)
         if one.end <= one.start:

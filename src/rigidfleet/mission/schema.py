@@ -51,6 +51,8 @@ from rigidfleet.mission.values import (
     MotorTimes,
     Part,
     PerAgent,
+    PerAgentDelay,
+    PerAgentDrift,
     PerAgentError,
     PerAxis,
     Rate,
@@ -643,6 +645,29 @@ class Outage(Part):
     end: Time = key("mission time from which messages are sent again [s]")
 
 
+class Clocks(Part):
+    """Clocks of the vehicles, by which each flies the plan by itself, and how they keep together."""
+
+    late: PerAgentDelay = key(
+        "time by which clocks start late [s], at most 10: a list, or the greatest, of which each vehicle has a share "
+        "drawn by the seed",
+        0.0,
+    )
+    drift: PerAgentDrift = key(
+        "drift of the clocks [ppm]: a list, or the greatest, of which each vehicle has a share from -1 to 1 drawn by "
+        "the seed",
+        0.0,
+    )
+    consensus: Annotated[float, Strict(), Field(ge=0, le=100)] = key(
+        "gain with which a clock follows those of its neighbours [1/s]; 0: they never meet", 0.0
+    )
+    wait: Length | None = key(
+        "distance of a vehicle from its slot at which all clocks stand still, that hear of it [m]; from half of it on "
+        "they slow down; default: nobody waits",
+        None,
+    )
+
+
 class Network(Part):
     """How vehicles know each other: each computes its force from its own state and its neighbours' messages."""
 
@@ -675,6 +700,9 @@ class Network(Part):
     outages: tuple[Outage, ...] = key(
         "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()
     )
+    clocks: Clocks | None = key(
+        "clocks of the vehicles: [network.clocks]; default: one for all", None
+    )
     lost: tuple[LostLink, ...] = key(
         "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
@@ -689,6 +717,14 @@ class Lost(Part):
 
     agent: Whole = key("agent that is lost, counted from 1")
     time: Time = key("mission time of the loss [s], > 0")
+
+
+class Stuck(Part):
+    """A vehicle that does not follow its slot for some time: it holds its place."""
+
+    agent: Whole = key("agent that is stuck, counted from 1")
+    time: Seconds = key("mission time from which on it is [s]")
+    duration: Time = key("for how long [s]")
 
 
 class Disturbances(Part):
@@ -717,6 +753,11 @@ class Disturbances(Part):
     )
     lost: tuple[Lost, ...] = key(
         "vehicles lost during the flight: `lost = [{ agent = 2, time = 30.0 }]`", ()
+    )
+    stuck: tuple[Stuck, ...] = key(
+        "vehicles that hold their place for some time, only with [network]: `stuck = [{ agent = 2, time = 30.0, "
+        "duration = 5.0 }]`",
+        (),
     )
     on_loss: Literal["continue", "hold", "land", "abort"] = key(
         "what the others do when the first vehicle or link is lost: continue: fly the mission on; hold: "

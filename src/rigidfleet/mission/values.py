@@ -129,6 +129,7 @@ Duration = Annotated[
 ]
 
 
+Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
 _Error = Annotated[float, Strict(), Field(gt=-1, le=bounds.MASS_RATIO)]
 Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31)]
 PerAgent = Annotated[
@@ -139,6 +140,15 @@ PerAgentError = Annotated[
     Annotated[_Error, Tag("one")] | Annotated[tuple[_Error, ...], Tag("list")],
     Discriminator(_form),
 ]
+_Drift = Annotated[float, Strict(), Field(ge=-1e5, le=1e5)]
+PerAgentDelay = Annotated[
+    Annotated[Delay, Tag("one")] | Annotated[tuple[Delay, ...], Tag("list")],
+    Discriminator(_form),
+]
+PerAgentDrift = Annotated[
+    Annotated[_Drift, Tag("one")] | Annotated[tuple[_Drift, ...], Tag("list")],
+    Discriminator(_form),
+]
 PerAxis = Annotated[
     Annotated[Spread, Tag("one")] | Annotated[tuple[Spread, ...], _Three, Tag("list")],
     Discriminator(_form),
@@ -147,7 +157,6 @@ PerAxis = Annotated[
 
 Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
 Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
-Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
 Scale = Annotated[float, Strict(), Field(ge=0.1, lt=1.0)]
 Share = Annotated[float, Strict(), Field(ge=0, le=0.95)]
 Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]

@@ -55,6 +55,29 @@ def slot_derivatives(
     return derivatives.transpose(3, 0, 2, 1)
 
 
+def slots_by_own_clocks(reference: Reference, motion: Motion, time: Floats, tau: Floats) -> Floats:
+    """Position, velocity, acceleration and jerk (K, 4, N, 3) of slots, each by the clock of its vehicle.
+
+    At times (K,) [s], clocks differ by ``tau[..., 0]`` (K, N) [s], have the rates ``tau[..., 1]``, and these the rates
+    ``tau[..., 2]`` [1/s]. Before the first knot, slots move as they do there.
+    """
+    out = np.empty((len(time), 4, tau.shape[1], 3))
+    for i in range(tau.shape[1]):
+        alone = reference._replace(
+            p0=reference.p0[i : i + 1],
+            dp=reference.dp[i : i + 1],
+            ways=reference.ways[:, i : i + 1],
+        )
+        own, (s, slope) = time + tau[:, i, 0], tau[:, i, 1:3].T[..., None]
+        inside = np.maximum(own, motion.knots[0])
+        r, v, a, j = slot_derivatives(alone, motion, inside, 4)[:, :, 0].swapaxes(0, 1)
+        early = own < inside
+        a[early] = j[early] = 0.0
+        out[:, 0, i], out[:, 1, i] = r + (own - inside)[:, None] * v, s * v
+        out[:, 2, i], out[:, 3, i] = s * s * a + slope * v, s**3 * j + 3.0 * s * slope * a
+    return out
+
+
 def slot_series(reference: Reference, body: tuple[Floats, Floats], time: Floats) -> Floats:
     """Taylor series (5, 3, N, K) of each slot, from the `body_series` at times (K,) [s]; see `slot_derivatives`."""
     cm, axes = body

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
+from rigidfleet.kernel.clocks import FASTEST, OFF, RATE, Clocks, same_clock
 from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
@@ -31,12 +32,13 @@ from rigidfleet.planning.derivatives import (
     yaw_of,
 )
 from rigidfleet.planning.disturbances import disturbance
+from rigidfleet.planning.virtual_clock import later
 from rigidfleet.typing import Floats, Ints
 
 #: Rows of random numbers in a block.
 _BLOCK = 1024
 #: Kinds of random numbers.
-_NOISE, _DROPPED = 2, 3
+_NOISE, _DROPPED, _LATE, _DRIFT = range(2, 6)
 #: Density of the air at sea level, ICAO standard atmosphere [kg/m^3].
 DENSITY = 1.225
 #: Speed below which the direction of quadratic drag is rounded off [m/s].
@@ -84,8 +86,9 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         roofs=around.roofs,
     )
     return flight._replace(
-        air=air, guidance=guidance, sensing=_sensing(mission), network=network_of(mission)
-    )
+        air=air, guidance=guidance, sensing=_sensing(mission), network=network_of(mission),
+        clocks=clocks_of(mission),
+    )  # fmt: skip
 
 
 def vehicle_lags(mission: Mission) -> list[Lag]:
@@ -235,6 +238,31 @@ def fading(loss: float, burst: float | None) -> tuple[float, float]:
     return loss * recovers / (1.0 - loss), recovers
 
 
+def clocks_of(mission: Mission) -> Clocks:
+    """The clocks by which vehicles fly; one for all if the mission has neither [network.clocks] nor stuck vehicles."""
+    net, d, n = mission.network, mission.disturbances, mission.n_agents
+    clocks, stuck = None if net is None else net.clocks, () if d is None else d.stuck
+    if net is None or not (clocks or stuck):
+        return same_clock(n)
+    rate = mission.autopilot.rate
+    rows = [[x.agent - 1, round(x.time * rate), round((x.time + x.duration) * rate)] for x in stuck]
+    made = same_clock(n)._replace(own=True, stuck=np.array(rows, dtype=np.int64).reshape(-1, 3))
+    if clocks is None:
+        return made
+
+    def of_each(value: float | tuple[float, ...], kind: int, least: float) -> Floats:
+        if isinstance(value, tuple):
+            return np.array(value, dtype=np.float64)
+        return value * np.random.default_rng((kind, net.seed)).uniform(least, 1.0, n)
+
+    return made._replace(
+        late=(of_each(clocks.late, _LATE, 0.0) * rate).round().astype(np.int64),
+        drift=1e-6 * of_each(clocks.drift, _DRIFT, -1.0),
+        gain=clocks.consensus,
+        wait=math.inf if clocks.wait is None else clocks.wait,
+    )
+
+
 class TickTables:
     """Tables of a flight for ranges of ticks: references of the attitude control, noise, dropped measurements."""
 
@@ -252,20 +280,36 @@ class TickTables:
         #: Where the yaw "along" of a turn is known from, to continue from table to table: time [s], yaw (N,).
         self._known: tuple[YawTurn, float, Floats] | None = None
 
-    def start_path(self, problem: Problem, tick: int, tables: fleet.TickInputs) -> Floats:
+    def start_path(
+        self, problem: Problem, tick: int, tables: fleet.TickInputs, tau: Floats | None = None
+    ) -> Floats:
         """Begin to measure states about another path; return where the one before is (N, 6), by its ``tables``.
 
-        While slots are tracked, the path is that of the reference. Otherwise it stays where it is.
+        While slots are tracked, the path is that of the reference. Otherwise it stays where it is. Of own clocks,
+        ``tau`` says how they stand (`kernel.clocks`).
         """
         k = tick - tables.first
-        before = tables.path[k] if 0 <= k < len(tables.path) else self._path(np.array([tick]))[0]
+        before = tables.path[k] if 0 <= k < len(tables.path) else self._path_at(tick, tau)
         if problem.control.kind == TRACKING:
             self._source = problem
         else:
             self._source, self._anchor = None, before
         return before
 
-    def _path(self, ticks: Ints) -> Floats:
+    def put_off(self, late: float) -> None:
+        """Take the path that states were last measured about as later by some time [s]."""
+        if self._source is not None:
+            self._source = later(self._source, late)
+
+    def _path_at(self, tick: int, tau: Floats | None) -> Floats:
+        """The path (N, 6) at a tick, of each vehicle by its own clock, if it has one."""
+        if tau is None:
+            return self._path(np.array([tick]))[0]
+        path = self._path(tick + tau[:, OFF] * self.rate).diagonal(axis1=0, axis2=1).T.copy()
+        path[:, 3:] *= tau[:, RATE, None]
+        return path
+
+    def _path(self, ticks: Floats | Ints) -> Floats:
         if self._source is None:
             return np.tile(self._anchor, (len(ticks), 1, 1))
         reference, motion = self._source.reference, self._source.motion
@@ -273,10 +317,19 @@ class TickTables:
         return np.ascontiguousarray(np.concatenate([states[:, 0], states[:, 1]], axis=2))
 
     def tables_for(
-        self, first: int, last: int, problem: Problem, turn: YawTurn
+        self, first: int, last: int, problem: Problem, turn: YawTurn, tau: Floats | None = None
     ) -> fleet.TickInputs:
-        """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase."""
-        sensing, ticks = self.flight.sensing, np.arange(first, last)
+        """Tables for ticks from ``first`` to before ``last``; ``turn`` is that of the phase.
+
+        With clocks of their own, which stand at ``tau``, references are those of all ticks that a clock may come to.
+        """
+        sensing, ticks, origin = self.flight.sensing, np.arange(first, last), first
+        if tau is not None:
+            begun = math.ceil(turn.begun * self.rate - 1e-6)
+            slow, fast = math.floor(tau[:, OFF].min() * self.rate), tau[:, OFF].max() * self.rate
+            origin = max(begun, first + slow)
+            end = last + math.ceil(fast + (FASTEST - 1.0) * (last - first)) + 2
+            ticks = np.arange(origin, max(end, origin + 2))
         yaw = jerk = snap = np.zeros((0, self.n, 3))
         slots, path = np.zeros(0), np.zeros((0, self.n, 6))
         if not self.flight.vehicles.point.all() or self.yaw.kind == "along":
@@ -296,7 +349,17 @@ class TickTables:
                 noise_v = np.ascontiguousarray(self.noise.velocity * white[:, 1])
             if self.noise.dropped:
                 dropped = _random_rows(_DROPPED, seed, rows, (self.n,)) < self.noise.dropped
-        return fleet.TickInputs(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped)
+        made = fleet.TickInputs(first, last, path, yaw, jerk, snap, noise_r, noise_v, dropped)
+        if tau is None:
+            return made
+        # Rows of single ticks are taken in flight from those of all
+        rows, size = len(ticks), (last - first, self.n)
+        parts = [x if len(x) else np.zeros((rows, *x.shape[1:])) for x in made[2:6]]
+        path, yaw, jerk, snap = (np.zeros((*size, x.shape[2])) for x in parts)
+        path[0] = self._path_at(first, tau) if self.compensated else 0.0
+        return made._replace(
+            path=path, yaw=yaw, jerk=jerk, snap=snap, by_clock=np.concatenate(parts, axis=2), origin=origin,
+        )  # fmt: skip
 
     def yaw_at(self, problem: Problem, t: float, turn: YawTurn) -> Floats:
         """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""

@@ -18,6 +18,7 @@ import math
 
 import numpy as np
 
+from rigidfleet.kernel.problem import Problem
 from rigidfleet.typing import Floats
 
 #: Greatest |ds/dt| after a step of the target, over omega.
@@ -95,6 +96,18 @@ class VirtualClock:
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self.ahead(middle)[0] < progress else (low, middle)
         return high
+
+
+def later(problem: Problem, delay: float) -> Problem:
+    """A problem whose references come later by a delay [s]."""
+    reference, motion = problem.reference, problem.motion
+    if delay == 0.0:
+        return problem
+    knots = reference.knots + delay if len(reference.knots) else reference.knots
+    return problem._replace(
+        motion=motion._replace(knots=motion.knots + delay),
+        reference=reference._replace(t0=reference.t0 + delay, knots=knots),
+    )
 
 
 def time_derivatives(x: Floats, rate: Floats) -> Floats:

@@ -182,6 +182,10 @@ class Result(Shown):
         Ints | None,
         "time agent | 1 | 1 if a vehicle cannot give what is asked of it, else 0; missing without vehicles",
     ] = None
+    vehicle_clock: Annotated[
+        Floats | None,
+        "time agent | s | time along the plan by each vehicle's own clock; missing with one clock for all",
+    ] = None
     message_age: Annotated[
         Floats | None,
         "time edge link | s | age of the newest message that the agents of an edge have of each other; NaN before the "

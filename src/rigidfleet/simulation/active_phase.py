@@ -54,6 +54,8 @@ class Stepper:
     by_ticks = False
     #: Time by which the events of the phase come later than planned [s].
     delay = 0.0
+    #: Time by which the plan's references are behind now, in the mean of the vehicles' own clocks [s].
+    behind = 0.0
 
     def __init__(self, phase: ActivePhase) -> None:
         self.phase = phase
@@ -232,7 +234,7 @@ class ActivePhase:
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
                 return  # between two checks
-            quiet = self.t >= least and self._error() <= settle.tolerance
+            quiet = self.t - self.stepper.behind >= least and self._error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
     def steer(self, problem: Problem) -> None:
@@ -249,8 +251,8 @@ class ActivePhase:
 
     def evaluate(self) -> None:
         """Evaluate the law at the current state; forces and references are then in the workspace."""
-        y = self.state.y
-        native.closed_loop(self.t, y, np.empty_like(y), self.plan.problem, self.workspace)
+        y, t = self.state.y, self.t - self.stepper.behind
+        native.closed_loop(t, y, np.empty_like(y), self.plan.problem, self.workspace)
 
     def observe(self) -> Observation:
         """What a controller sees at the current state."""

@@ -27,7 +27,7 @@ from rigidfleet.planning.body_layer import (
 )
 from rigidfleet.planning.derivatives import body_series, slot_derivatives, slot_series
 from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, time_derivatives
+from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, later, time_derivatives
 from rigidfleet.result import Extremum
 from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
 from rigidfleet.typing import Floats, Ints
@@ -126,7 +126,7 @@ class Leader:
             if not self.leads:
                 return None
             self.leads = False
-            return self._late(self.problem)
+            return later(self.problem, self.clock.delay)
         self.leads = True
         self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
         problem = self._piece(t, h, accelerations)
@@ -237,17 +237,6 @@ class Leader:
         if begun < (blend := plan.reference).t0 + blend.T_b:
             plan.reference = blend._replace(t0=blend.t0 + lost)
 
-    def _late(self, problem: Problem) -> Problem:
-        """The plan's problem, later by the delay of the clock."""
-        reference, motion, delay = problem.reference, problem.motion, self.clock.delay
-        if delay == 0.0:
-            return problem
-        knots = reference.knots + delay if len(reference.knots) else reference.knots
-        return problem._replace(
-            motion=motion._replace(knots=motion.knots + delay),
-            reference=reference._replace(t0=reference.t0 + delay, knots=knots),
-        )
-
     def _piece(self, t: float, h: float, accelerations: Floats) -> Problem:
         """The problem from t for h [s]: the path at the clock's time, moved by the deviation, as polynomials.
 
@@ -285,7 +274,7 @@ class Leader:
         phi = series.derivatives(series.rotation_vector(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
         polynomials = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
-        late, scaled = self._late(problem).reference, self._any_scale(ends)
+        late, scaled = later(problem, self.clock.delay).reference, self._any_scale(ends)
         if not (p[1:].any() or scaled):
             return problem._replace(motion=polynomials, reference=late)
         ways = _polynomials(times, p.transpose(0, 3, 2, 1))

@@ -16,7 +16,12 @@ from rigidfleet.kernel.records import Record, recorder
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.constraint_jacobian import smallest_singular_value
-from rigidfleet.planning.derivatives import Yaw, slot_derivatives, yaw_derivatives
+from rigidfleet.planning.derivatives import (
+    Yaw,
+    slot_derivatives,
+    slots_by_own_clocks,
+    yaw_derivatives,
+)
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
 from rigidfleet.simulation.solver_setup import (
     give_back,
@@ -69,6 +74,8 @@ class VehicleSamples(NamedTuple):
     thrust: Floats  # (K, N) [N]
     saturated: Bools  # (K, N)
     age: Floats  # (K, L) of the newest message of each link [s]; NaN before the first
+    # (K, N, 4) own clocks: three columns as in `slots_by_own_clocks`, time along the plan [s]; (K, N, 0) without
+    tau: Floats
 
 
 class LayerSamples(NamedTuple):
@@ -205,6 +212,7 @@ def assemble(
     pieces = [p for p in pieces if len(p.time)]
     time = _join([p.time for p in pieces])
     flown = _of_vehicles(pieces)
+    tau = flown.tau if flown is not None and flown.tau.size else None
     avoided = [piece.layers for piece in pieces if piece.layers is not None]
     layers = _together(avoided) if avoided else None
     d = mission.disturbances
@@ -238,7 +246,7 @@ def assemble(
             partial(_forces_and_references, mission, pieces, time, flown),
         ),
         (CLOSE, partial(distances, mission, worst, places, time)),
-        (LATER, partial(_references, mission, [(p.time, p.followed) for p in pieces])),
+        (LATER, partial(_references, mission, [(p.time, p.followed) for p in pieces], tau)),
         (("singular_value",), partial(_singular_values, places, [p.edges for p in pieces])),
         (("mission_text",), partial(text_of, mission)),
     ]
@@ -261,6 +269,7 @@ def assemble(
         vehicle_rates=None if flown is None else flown.rates,
         rotor_force=None if flown is None else flown.rotor_force,
         saturated=None if flown is None else flown.saturated.astype(np.int64),
+        vehicle_clock=None if tau is None else tau[..., 3],
         clock_rate=None if layers is None else layers.rate,
         body_displacement=None if layers is None else layers.displacement,
         avoidance_layers=None if layers is None else layers.layers,
@@ -369,18 +378,30 @@ def distances(
 
 
 def _references(
-    mission: Mission, pieces: Sequence[tuple[Floats, FollowedReferences]]
+    mission: Mission, pieces: Sequence[tuple[Floats, FollowedReferences]], tau: Floats | None
 ) -> dict[str, Floats]:
     """Derivatives of the slots and the yaw of each vehicle, of pieces of a flight; NaN where no slots are tracked.
 
-    Yaw "along" continues from piece to piece.
+    Yaw "along" continues from piece to piece. Where vehicles have clocks of their own, ``tau`` says how these stand;
+    the yaw is that by their mean, from which they differ by far less than a vehicle needs to turn.
     """
     yaw, n = mission.yaw, mission.n_agents
     x, y, z = yaw.point or (0.0, 0.0, 0.0)
     turned = Yaw(yaw.kind, float(np.deg2rad(yaw.yaw_deg)), (x, y, z))
     states, angles = [], []
-    last, until = None, 0.0
+    last, until, end = None, 0.0, 0
     for times, followed in pieces:
+        begin, end = end, end + len(times)
+        if followed and tau is not None:
+            ((_, reference, motion, turn),), own = followed, tau[begin:end]
+            states.append(slots_by_own_clocks(reference, motion, times, own)[:, 1:])
+            off, rate = own[..., :2].mean(axis=1).T
+            assert turn is not None  # vehicles fly
+            angles.append(
+                _yaw_of_turn(reference, motion, np.maximum(times + off, turn.begun), turned, turn)
+            )
+            angles[-1][:, 1] *= rate[:, None]
+            continue
         if not followed:
             last = None
             states.append(np.full((len(times), 3, n, 3), np.nan))

@@ -10,14 +10,16 @@ import numpy as np
 from rigidfleet._common.text import agent_names
 from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
+from rigidfleet.kernel.clocks import OFF, PACE, RATE, WORST
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.mail import Links, Mail, assign_edges
+from rigidfleet.kernel.mail import CLOCK, Links, Mail, assign_edges
 from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
+from rigidfleet.planning.derivatives import slots_by_own_clocks
 from rigidfleet.planning.vehicles import (
     TickTables,
     YawTurn,
@@ -26,6 +28,8 @@ from rigidfleet.planning.vehicles import (
     sampled_flight,
     turn_from,
 )
+from rigidfleet.planning.virtual_clock import later
+from rigidfleet.result import Extremum
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
@@ -44,6 +48,10 @@ from rigidfleet.typing import Floats
 _TICKS, _STEPS = 1024, 4000
 
 
+#: Time for which vehicles with clocks of their own fly before the plan's events are put off [s].
+_STRETCH = 0.1
+#: Pace of a clock below which it waits.
+_SLOWED = 0.99
 #: Distance [m] and speed [m/s] that no vehicle reaches in flight.
 _FAR = 1e9
 
@@ -54,6 +62,11 @@ class FleetState:
     def __init__(self, mission: Mission, max_step: float, agent: Law | type | None = None) -> None:
         self.flight = sampled_flight(mission, max_step)
         self.laws = None if agent is None else OwnLaws(agent, self.flight)
+        if self.laws is not None and self.flight.clocks.own:
+            raise FlightError(
+                "a law of one's own is asked at the ticks of one clock: remove [network.clocks] and disturbances.stuck,"
+                " or leave agent out"
+            )
         if self.laws is not None:
             commands = self.flight.commands._replace(kind=fleet.OWN)
             self.flight = self.flight._replace(commands=commands)
@@ -68,6 +81,7 @@ class FleetState:
         self.output_step = mission.output_step
         self.burst = None if mission.network is None else mission.network.burst
         self.scale = np.array([1.0, 0.0, 0.0])  # of the slots at the last switch, two derivatives
+        self.waited = 0.0  # time by which phases came to their ends later than planned [s]
 
     @property
     def network(self) -> tuple[Links, Mail] | None:
@@ -109,6 +123,9 @@ class SampledPhase(Stepper):
             self.leader = Leader(vehicles.layers, plan, period)
             self.leader.deviation.scale = vehicles.scale
         self.turn = turn_from(plan.problem, plan.start, vehicles.tables.yaw, vehicles.yaw)
+        #: When own clocks were last looked at, and by how much they were late then [s].
+        self.late = plan.start, 0.0
+        self.slowed: tuple[float, int] | None = None  # when they first waited [s], and for whom
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
@@ -154,6 +171,8 @@ class SampledPhase(Stepper):
     def decide(self, *, by_law: bool) -> float:
         """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
         leader, arrays = self.leader, self.vehicles.avoidance
+        if self.flight.clocks.own:
+            return (math.floor(self.phase.t / _STRETCH + 1e-6) + 1.0) * _STRETCH
         if leader is None or arrays is None or not by_law or self.steered:
             return math.inf
         t = self.phase.t
@@ -168,7 +187,38 @@ class SampledPhase(Stepper):
     @property
     def delay(self) -> float:
         """Time by which the events of the phase come later than planned [s]."""
-        return 0.0 if self.leader is None else self.leader.clock.delay
+        return self.late[1] if self.leader is None else self.leader.clock.delay
+
+    @property
+    def behind(self) -> float:
+        """Time by which the plan's references are behind now, in the mean of the clocks of vehicles that fly [s]."""
+        if not self.flight.clocks.own:
+            return 0.0
+        tau, ticks = self.sampled.tau[~self.flight.vehicles.lost], self.sampled.count[fleet.TICKS]
+        since = self.phase.t - max(ticks - 1, 0) * self._tick  # clocks run on between ticks
+        return float(-(tau[:, OFF] + since * (tau[:, RATE] - 1.0)).mean())
+
+    @property
+    def _tick(self) -> float:
+        return self.flight.steps * self.flight.h
+
+    def _put_off(self) -> None:
+        """Move the events of the plan that have not come yet by what own clocks are late."""
+        plan, t, (t_before, before) = self.phase.plan, self.phase.t, self.late
+        late = max(0, round(self.behind / self._tick)) * self._tick
+        self.late = t, late
+
+        def postponed_time(time: float) -> float:
+            """When clocks come to what they were to come to at a time, if they had stayed as late as before."""
+            due, passed, now = time - before, t_before - before, t - late
+            if due <= passed:
+                return time
+            return due + float(np.interp(due, [passed, max(now, passed + 1e-9)], [before, late]))
+
+        plan.t_end, plan.arrival = postponed_time(plan.t_end), postponed_time(plan.arrival)
+        plan.through = tuple(at | {"time": postponed_time(at["time"])} for at in plan.through)
+        if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
+            self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
 
     @property
     def turn_about_vertical(self) -> YawTurn:
@@ -257,6 +307,9 @@ class SampledPhase(Stepper):
         phase.extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
             phase.extremes.led = self.leader.extremes(phase.t)
+        if self.slowed is not None:
+            time, who = self.slowed
+            phase.extremes.led = {"clock": Extremum(self.delay, time, who, -1)}
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
@@ -313,6 +366,8 @@ class SampledPhase(Stepper):
             done = done if finite.all() else int(finite.argmin())
             if done:
                 self._keep(problem, call, done)
+        if self.flight.clocks.own:
+            self._put_off()
         if not np.isfinite(sampled.S).all():
             who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
@@ -334,15 +389,15 @@ class SampledPhase(Stepper):
         planned, source = self.phase.plan.problem, self.vehicles.tables
         if planned is self.tabled and tables.first <= tick < tables.last:
             return
-        before = None
+        before, tau = None, self.sampled.tau if self.flight.clocks.own else None
         if planned is not self.tabled and source.compensated:
-            before = source.start_path(planned, tick, tables)
+            before = source.start_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
         until = self.phase.plan.t_end
         if self.led:
             until = min(until, self.led_until if not self.steered else self.phase.stop)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
-        made = source.tables_for(tick, max(last, tick + 1), planned, self.turn)
+        made = source.tables_for(tick, max(last, tick + 1), planned, self.turn, tau)
         if before is not None:  # states that were measured about another path
             s, moved = self.sampled, before - made.path[0]
             for known in (s.seen, s.history):
@@ -363,9 +418,18 @@ class SampledPhase(Stepper):
 
     def end(self) -> None:
         """End the phase; the vehicles keep their states, and so the workspace, to which these may refer."""
-        self.vehicles.yaw = self.vehicles.tables.yaw_at(
-            self.phase.plan.problem, self.phase.t, self.turn
-        )
+        plan, t = self.phase.plan, self.phase.t
+        self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.behind, self.turn)
+        if self.flight.clocks.own:
+            # The next phase is planned from now on: its times are later by as much, for all clocks alike.
+            late = round(self.behind / self._tick) * self._tick
+            mail = self.sampled.mail
+            for off in (self.sampled.tau[:, OFF], mail.heard[:, CLOCK], mail.post[..., CLOCK]):
+                np.add(off, late, out=off)  # also in messages
+            self.vehicles.waited += late
+            self.vehicles.tables.put_off(late)
+            plan.problem = later(plan.problem, late)
+            plan.reference = plan.reference._replace(t0=plan.reference.t0 + late)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:
             self.vehicles.scale = self.leader.deviation.scale
@@ -381,11 +445,29 @@ class SampledPhase(Stepper):
         if plan.frame is not None:
             frame = call.frame[:done]
             parts.append(frame)
-        planned = native.record(
-            plan.problem, self.phase.workspace, times, np.concatenate(parts, axis=1)
-        )
-        out, kept = _as_flown(planned, call, done, self.flight, problem)
+        tau, y = call.tau[:done], np.concatenate(parts, axis=1)
+        if self.flight.clocks.own:
+            planned = self._by_own_clocks(times, y, tau)
+            plan_time = (times - self.vehicles.waited)[:, None, None] + tau[..., :1]
+            tau = np.concatenate([tau, plan_time], axis=2)
+        else:
+            planned = native.record(plan.problem, self.phase.workspace, times, y)
+            tau = tau[..., :0]
+        out, kept = _as_flown(planned, call, done, self.flight, problem, tau)
         self.phase.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
+
+    def _by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
+        """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
+        problem, work = self.phase.plan.problem, self.phase.workspace
+        off, rate = tau[:, ~self.flight.vehicles.lost, :2].mean(axis=1).T
+        f_E = native.record(problem, work, times, y).f_E
+        planned = native.record(problem, work, times + off, y)._replace(f_E=f_E)
+        if problem.control.kind == TRACKING:
+            r_ref = slots_by_own_clocks(problem.reference, problem.motion, times, tau)[:, 0]
+            planned = planned._replace(r_ref=r_ref)
+        for x in (planned.motion[:, 3:], planned.rates, planned.d_dot):
+            np.multiply(x, rate[:, None], out=x)
+        return planned
 
     def _layers(self, call: fleet.SampledSegment, done: int) -> LayerSamples | None:
         """Samples of what avoidance did."""
@@ -403,6 +485,7 @@ def _as_flown(
     done: int,
     flight: fleet.SampledFlight,
     problem: Problem,
+    tau: Floats,
 ) -> tuple[Record, VehicleSamples]:
     """A record of references with the forces of vehicles, and the samples of the vehicles themselves."""
     S, a, vehicles = call.S[:done], call.dS[:done, :, 3:6], flight.vehicles
@@ -424,6 +507,6 @@ def _as_flown(
     sent = np.where(stamp < 0, np.nan, flight.start + stamp * flight.steps * flight.h)
     kept = VehicleSamples(
         S[..., 6:10], S[..., 10:13], rotor, np.linalg.norm(thrust, axis=2), call.saturated[:done],
-        call.times[:done, None] - sent,
+        call.times[:done, None] - sent, tau,
     )  # fmt: skip
     return out, kept
