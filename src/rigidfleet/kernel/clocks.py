@@ -27,8 +27,6 @@ OFF, RATE, PACE, SLOPE, WORST, SINCE, PLACE, SLOT = 0, 1, 2, 3, 4, 5, 6, 9
 _BANDWIDTH = 5.0
 #: Greatest rate: what a plan has to spare is not known, and forces grow with its square.
 FASTEST = 1.2
-#: Derivatives in the columns of `TickInputs.by_clock`.
-_ORDERS = (0, 0, 0, 1, 1, 1, 0, 1, 2, 3, 3, 3, 4, 4, 4)
 
 
 class Clocks(NamedTuple):
@@ -63,18 +61,19 @@ def take_row(k, i, tick, flight, state):
     x = k + state.tau[i, OFF] / tick - tables.origin
     x = min(x, rows - 1.0) if x >= 0.0 else 0.0  # not a number in a flight that has come apart
     row, after = int(x), min(int(x) + 1, rows - 1)
-    for q in range(15 if rows > 0 else 0):
-        value = tables.by_clock[row, i, q]
-        value += (x - row) * (tables.by_clock[after, i, q] - value)
-        value *= rate ** _ORDERS[q]
-        if q < 6:
-            tables.path[here, i, q] = value
-        elif q < 9:
-            tables.yaw[here, i, q - 6] = value
-        elif q < 12:
-            tables.jerk[here, i, q - 9] = value
-        else:
-            tables.snap[here, i, q - 12] = value
+    if rows == 0:
+        return
+    x -= row
+    before, then, scale = tables.by_clock[row, i], tables.by_clock[after, i], 1.0
+    for q in range(
+        3
+    ):  # r, v, jerk and snap in threes, and between them yaw and its two derivatives
+        tables.path[here, i, q] = before[q] + x * (then[q] - before[q])
+        tables.path[here, i, 3 + q] = rate * (before[3 + q] + x * (then[3 + q] - before[3 + q]))
+        tables.yaw[here, i, q] = scale * (before[6 + q] + x * (then[6 + q] - before[6 + q]))
+        tables.jerk[here, i, q] = rate**3 * (before[9 + q] + x * (then[9 + q] - before[9 + q]))
+        tables.snap[here, i, q] = rate**4 * (before[12 + q] + x * (then[12 + q] - before[12 + q]))
+        scale *= rate
 
 
 @jit

@@ -360,13 +360,19 @@ def advance_frame(t, p, state):
 
 
 @jit
-def tick(k, t, p, w, flight, state, call):
-    """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
+def hear(k, flight, state):
+    """Take the messages that arrive at tick k, and advance the clocks to it."""
     if flight.clocks.own:
         advance_clocks(k, flight.steps * flight.h, flight, state)
-    measure(k, flight, state)
+    receive(k, flight.network, state.mail)
+
+
+@jit
+def tick(k, t, p, w, flight, state, call):
+    """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     if flight.network.every > 0:
-        receive(k, flight.network, state.mail)
+        hear(k, flight, state)
+    measure(k, flight, state)
     due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
     if due and not desire(k, t, p, w, flight, state, call):
         return False
