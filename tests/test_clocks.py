@@ -8,7 +8,7 @@ from test_network import CUBE, EDGES, fly, laid_out, mission
 
 import rigidfleet as rf
 from rigidfleet.errors import MissionError
-from rigidfleet.kernel.clocks import OFF, PACE, RATE
+from rigidfleet.kernel.clock_records import OFF, PACE, RATE
 from rigidfleet.sweep import Sweep
 from rigidfleet.typing import Floats
 

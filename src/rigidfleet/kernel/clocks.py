@@ -10,47 +10,24 @@ all wait for one that is stuck. By the chain rule, a path r(tau) is flown with t
 """
 
 import math
-from typing import NamedTuple
 
-import numpy as np
-
+from rigidfleet.kernel.clock_records import (
+    FASTEST,
+    OFF,
+    PACE,
+    PLACE,
+    RATE,
+    SINCE,
+    SLOPE,
+    SLOT,
+    WORST,
+)
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.mail import CLOCK
 from rigidfleet.kernel.problem import TRACKING
-from rigidfleet.typing import Floats, Ints
 
-#: Columns of `SampledState.tau`: tau - t [s]; dtau/dt; the pace s and ds/dt [1/s]; the greatest error known of any
-#: vehicle [m], and the tick at which it was measured; the place that a stuck vehicle holds (3) [m], NaN for none;
-#: position, velocity and acceleration of the slot (9).
-OFF, RATE, PACE, SLOPE, WORST, SINCE, PLACE, SLOT = 0, 1, 2, 3, 4, 5, 6, 9
 #: Bandwidth of the pace [1/s]: two equal lags, so that the acceleration of a reference does not jump.
 _BANDWIDTH = 5.0
-#: Greatest rate: what a plan has to spare is not known, and forces grow with its square.
-FASTEST = 1.2
-
-
-class Clocks(NamedTuple):
-    """How the clocks of N vehicles run."""
-
-    own: bool  # whether each vehicle has one of its own
-    late: Ints  # (N,) ticks by which it starts late
-    drift: Floats  # (N,) of its rate
-    gain: float  # of consensus g [1/s]
-    wait: float  # distance from a slot at which the pace is zero [m]; it falls from half of it on
-    stuck: Ints  # (M, 3) vehicles, and from and until which tick they are stuck
-
-
-def same_clock(n: int) -> Clocks:
-    """One clock for n vehicles."""
-    none = np.zeros((0, 3), dtype=np.int64)
-    return Clocks(False, np.zeros(n, dtype=np.int64), np.zeros(n), 0.0, math.inf, none)
-
-
-def clocks_at_start(n: int) -> Floats:
-    """Clocks (N, 18) that are right, of vehicles that are not stuck."""
-    tau = np.zeros((n, SLOT + 9))
-    tau[:, [RATE, PACE]], tau[:, PLACE:SLOT] = 1.0, np.nan
-    return tau
 
 
 @jit
@@ -58,16 +35,15 @@ def take_row(k, i, tick, flight, state):
     """Fill the rows of vehicle i for tick k in the tables of its path, yaw, jerk and snap, by its own clock."""
     tables, rate, here = flight.tables, state.tau[i, RATE], k - flight.tables.first
     rows = tables.by_clock.shape[0]
-    x = k + state.tau[i, OFF] / tick - tables.origin
-    x = min(x, rows - 1.0) if x >= 0.0 else 0.0  # not a number in a flight that has come apart
-    row, after = int(x), min(int(x) + 1, rows - 1)
     if rows == 0:
         return
-    x -= row
+    x = k + state.tau[i, OFF] / tick - tables.origin
+    x = min(x, rows - 1.0) if x >= 0.0 else 0.0  # not a number in a flight that has come apart
+    row = int(x)
+    after, x = min(row + 1, rows - 1), x - row
     before, then, scale = tables.by_clock[row, i], tables.by_clock[after, i], 1.0
-    for q in range(
-        3
-    ):  # r, v, jerk and snap in threes, and between them yaw and its two derivatives
+    # Position, velocity, jerk and snap have three columns each; yaw comes with two derivatives.
+    for q in range(3):
         tables.path[here, i, q] = before[q] + x * (then[q] - before[q])
         tables.path[here, i, 3 + q] = rate * (before[3 + q] + x * (then[3 + q] - before[3 + q]))
         tables.yaw[here, i, q] = scale * (before[6 + q] + x * (then[6 + q] - before[6 + q]))

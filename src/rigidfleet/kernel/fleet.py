@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet.kernel.clocks import Clocks, clocks_at_start, same_clock
+from rigidfleet.kernel.clock_records import VehicleClocks, clocks_at_start, same_clock
 from rigidfleet.kernel.mail import Links, Mail, empty_mail, no_network
 from rigidfleet.kernel.problem import Workspace, padded, zeros
 from rigidfleet.kernel.records import NO_TRAIL, Trail
@@ -223,7 +223,7 @@ class SampledFlight(NamedTuple):
     air: Air
     sensing: Sensing
     network: Links  # how vehicles know each other
-    clocks: Clocks  # and by which time they fly
+    clocks: VehicleClocks  # and by which time they fly
     guidance: Guidance
     tables: TickInputs
     commands: Commands
@@ -257,7 +257,7 @@ class SampledState(NamedTuple):
     seen: Floats  # (N, 6) measured r, v
     history: Floats  # (D, N, 6) true r, v of the last ticks
     mail: Mail
-    tau: Floats  # (N, 9) each vehicle's own clock, see `clocks.OFF`
+    tau: Floats  # (N, 9) each vehicle's own clock, see `clock_records.OFF`
     peak: Floats  # (N, 4) greatest thrust of each rotor [N]
     peak_time: Floats  # (N, 4) [s]
     worst: Floats  # (N, 7) see `UPRIGHT`

@@ -10,10 +10,8 @@ import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
 from rigidfleet.kernel.attitude_control import steer
+from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
-    OFF,
-    RATE,
-    SLOPE,
     advance_clocks,
     follow_own_clock,
     let_go,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.clocks import FASTEST, OFF, RATE, Clocks, same_clock
+from rigidfleet.kernel.clock_records import FASTEST, OFF, RATE, VehicleClocks, same_clock
 from rigidfleet.kernel.mail import Links, no_network
 from rigidfleet.kernel.problem import TRACKING, Motion, Problem, Reference
 from rigidfleet.math import series
@@ -238,7 +238,7 @@ def fading(loss: float, burst: float | None) -> tuple[float, float]:
     return loss * recovers / (1.0 - loss), recovers
 
 
-def clocks_of(mission: Mission) -> Clocks:
+def clocks_of(mission: Mission) -> VehicleClocks:
     """The clocks by which vehicles fly; one for all if the mission has neither [network.clocks] nor stuck vehicles."""
     net, d, n = mission.network, mission.disturbances, mission.n_agents
     clocks, stuck = None if net is None else net.clocks, () if d is None else d.stuck
@@ -286,7 +286,7 @@ class TickTables:
         """Begin to measure states about another path; return where the one before is (N, 6), by its ``tables``.
 
         While slots are tracked, the path is that of the reference. Otherwise it stays where it is. Of own clocks,
-        ``tau`` says how they stand (`kernel.clocks`).
+        ``tau`` says how they stand (`kernel.clock_records`).
         """
         k = tick - tables.first
         before = tables.path[k] if 0 <= k < len(tables.path) else self._path_at(tick, tau)

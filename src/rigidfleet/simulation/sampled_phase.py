@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._common.text import agent_names
 from rigidfleet.errors import FlightError, StoppedError
 from rigidfleet.kernel import avoidance, fleet, records
-from rigidfleet.kernel.clocks import OFF, PACE, RATE, WORST
+from rigidfleet.kernel.clock_records import OFF, PACE, RATE, WORST
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
 from rigidfleet.kernel.mail import CLOCK, Links, Mail, assign_edges
