@@ -56,6 +56,7 @@ def flown(mission: Mission, position: Any, **changes: Any) -> Result:
         name: np.zeros([sizes[d] for d in v.dims])
         for name, v in VARIABLES.items()
         if name not in ("vehicle_attitude", "vehicle_rates", "rotor_force", "saturated")
+        and name not in ("message_age", "messages", "oldest_message", "vehicle_clock")
     }
     nothing: dict[str, Any] = {
         name: zero[name] * np.nan

@@ -32,7 +32,7 @@ CUBE = {"shape": "cube", "size": 4.0}
 BOX = {"kind": "box", "name": "wall", "min": [10.0, 8.0, 0.0], "max": [14.0, 12.0, 6.0]}
 OF_VEHICLES = (
     "vehicle_attitude", "vehicle_rates", "rotor_force", "saturated", "clock_rate", "body_displacement",
-    "avoidance_layers",
+    "avoidance_layers", "message_age", "messages", "oldest_message", "vehicle_clock",
 )  # fmt: skip
 OVER_TIME = [
     "distances", "cm", "attitude", "inputs", "constraint_force", "constraint_error", "clearance",

@@ -582,13 +582,13 @@ def test_forces_of_edges_that_let_go_are_taken_back(saturated):
     crowd.work.u[:] = u / np.linalg.norm(u, axis=1)[:, None]
     crowd.work.multiplier[:], crowd.work.c[:] = [2.0, -3.0], [0.1, -0.2]
     crowd.a.hold[:] = [0.9, 1.0, 0.4]
-    crowd.state.integral[0] = 1.0
+    crowd.state.integral[:] = 1.0
     crowd.state.saturated[0] = saturated
     took = crowd([[0.0, 0, 0], [50.0, 0, 0], [0, 90.0, 0]], np.zeros((3, 3)), np.ones((3, 3)))
     force = 0.6 * crowd.work.multiplier[:, None] * crowd.work.u
     assert took - 1.0 == pytest.approx(np.array([-force[0], force[0] - force[1], force[1]]))
     lost = 0.6 * T * crowd.work.c * [not saturated, True]
-    assert crowd.state.integral[0] == pytest.approx(1.0 - lost)
+    assert crowd.state.integral == pytest.approx(1.0 - lost)
     crowd.a.hold[:] = 1.0
     before = crowd.state.integral.copy()
     assert crowd(

@@ -46,6 +46,7 @@ SHIPPED = [
     "hill-search",
     "line-singular",
     "lossy-passage",
+    "market-square",
     "moving-obstacles",
     "narrow-passage",
     "narrow-passage-found",
@@ -150,6 +151,7 @@ def test_shipped_mission_is_in_order(name):
         "delayed",
         "downwash-cube",
         "lossy-passage",
+        "market-square",
         "moving-obstacles",
         *SCENES,
     )

@@ -138,6 +138,8 @@ def test_it_opens_in_xarray_in_one_line(tmp_path):
             "wrench": 6,
             "end": 2,
             "rotor": 4,
+            "link": 2,
+            "message": 3,
         }
         assert list(ds.agent.values) == [1, 2, 3, 4]
         assert list(ds.edge.values) == ["1-2", "1-3", "1-4", "2-3", "2-4"]

@@ -685,7 +685,7 @@ class Network(Part):
         "mean number of messages lost one after the other; default: losses are independent", None
     )
     range: Length | None = key("distance beyond which no message is heard [m]; default: none", None)
-    budget: Annotated[float, Strict(), Field(gt=0)] | None = key(
+    budget: Annotated[float, Strict(), Field(gt=0, le=1e9)] | None = key(
         "broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
         "no limit",
         None,
@@ -778,9 +778,7 @@ class Disturbances(Part):
 class Aborting(Part):
     """How the flight is aborted, at any time: `check --abort` plans it, `run --abort-at` flies it."""
 
-    at: Annotated[float, Strict(), Field(ge=0)] | None = key(
-        "mission time at which an abort is ordered [s]; default: never", None
-    )
+    at: Seconds | None = key("mission time at which an abort is ordered [s]; default: never", None)
     step: Time = key("time between the aborts that `check --abort` plans [s]", 1.0)
     reaction: Annotated[float, Strict(), Field(ge=0, le=60)] = key(
         "time after which all vehicles have the order, or notice a loss, and act at once [s]", 0.5

@@ -63,10 +63,15 @@ def draw_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
 
 
 def falls(result: Result) -> Floats:
-    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m] on the ground, or at z = 0 without one."""
+    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m] on the ground, or at z = 0 without one.
+
+    NaN where nothing falls, for want of gravity.
+    """
     from rigidfleet.mission.boundaries import Boundaries
 
     mission = result.mission
+    if mission.gravity < 1.0:
+        return np.full((*result.position.shape[:2], 2), np.nan)
     level = mission.ground if np.isfinite(mission.ground) else 0.0
     return Boundaries(mission).landings(result.position, result.velocity, level)
 

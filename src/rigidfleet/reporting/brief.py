@@ -79,6 +79,8 @@ def _proofs(result: Result, verdict: Verdict) -> list[str]:
 def _falls(result: Result) -> list[str]:
     """How far vehicles that fail are carried, at samples."""
     mission, falls = result.mission, areas.falls(result)
+    if not np.isfinite(falls).any():
+        return ["Without gravity, nothing falls."]
     off = np.linalg.norm(falls - result.position[..., :2], axis=2)
     off = np.where(np.isfinite(off) & result.left, off, -1.0)
     k, i = np.unravel_index(int(off.argmax()), off.shape)
