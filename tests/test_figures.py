@@ -789,6 +789,7 @@ def test_a_flight_has_no_empty_figures(tmp_path):
         "vehicles",
         "operation",
         "motion",
+        "messages",
         "plan_and_flight",
     }
     assert "still air" in texts(plotting.disturbance(calm))
@@ -797,7 +798,7 @@ def test_a_flight_has_no_empty_figures(tmp_path):
     missing = set(plotting.figure_names()) - set(plotting.figure_names(free))
     assert missing == {
         "distances", "attitude", "constraint_force", "constraint_error", "formations",
-        "rotors", "vehicles", "operation", "motion", "plan_and_flight",
+        "rotors", "vehicles", "operation", "motion", "messages", "plan_and_flight",
     }  # fmt: skip
     assert "no body frame attached" in texts(plotting.attitude(free))
     alone = a_flight(n=1, formation=None, mission={"obstacles": [], "limits": {}})
