@@ -1,6 +1,11 @@
 """Formulas written plainly, by which tests check the faster code of the package."""
 
+import os
+
 import numpy as np
+
+#: Whether oracles of hundreds of flights have their full size, which takes hours: `RIGIDFLEET_FULL=1`.
+FULL = os.environ.get("RIGIDFLEET_FULL") == "1"
 
 
 def jacobian(r: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles import FULL
 
 import rigidfleet as rf
 from rigidfleet.cli.app import main
@@ -112,9 +113,9 @@ def test_aborts_keep_their_promise_in_flight(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("first", range(0, 200, 20))
+@pytest.mark.parametrize("first", range(0, 200 if FULL else 40, 20))
 def test_two_hundred_aborts_keep_their_promise_in_flight(first: int) -> None:
-    """Of 200 random missions in wind, with one vehicle lost, no abort is below its promise as flown."""
+    """Of 200 random missions (40 in CI) in wind, with one vehicle lost, no abort is below its promise as flown."""
     assert min(flown_apart(seed) for seed in range(first, first + 20)) > -1e-9
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles import FULL
 from scipy.signal import butter, lfilter
 
 import rigidfleet as rf
@@ -77,7 +78,9 @@ def logged(times: list[np.ndarray], positions: list[np.ndarray]) -> Trajectories
     return Trajectories(names, tuple(curves), ASSUMED["cubic"], away=True)
 
 
-many = pytest.mark.parametrize("count", [3, pytest.param(500, marks=pytest.mark.long)])
+many = pytest.mark.parametrize(
+    "count", [3, pytest.param(500 if FULL else 12, marks=pytest.mark.long)]
+)
 
 
 @many

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles import FULL
 from test_network import CUBE, EDGES, fly, laid_out, mission
 
 import rigidfleet as rf
@@ -182,8 +183,9 @@ def test_the_last_stable_delay_flies():
 
 @pytest.mark.long
 def test_the_last_stable_delays_of_many_formations():
-    """So do 99 % of 200 whose growth beyond is as low as 1 % a second, in 500 s."""
-    assert len(wrong_delays(200, 0.01, 500.0)) <= 2
+    """So do 99 % of 200 (a tenth of them in CI) whose growth beyond is as low as 1 % a second, in 500 s."""
+    count = 200 if FULL else 20
+    assert len(wrong_delays(count, 0.01, 500.0)) <= count // 100
 
 
 def exact_growth(linear: LinearFlight, delay: int, loss: float, ticks: int) -> float:
@@ -301,8 +303,8 @@ def test_what_is_stable_in_mean_square_flies_stable():
 
 @pytest.mark.long
 def test_what_is_stable_in_mean_square_flies_stable_in_many_flights():
-    """So do 99 % of 100 flights each of twenty random formations."""
-    assert grown(20, 100, 200.0).mean() <= 0.01
+    """So do 99 % of 100 flights each of twenty random formations (of a quarter of them in CI)."""
+    assert grown(20 if FULL else 5, 100 if FULL else 50, 200.0).mean() <= 0.01
 
 
 def checked(network: dict[str, Any], **tables: Any) -> rf.Preflight:
