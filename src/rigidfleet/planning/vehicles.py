@@ -195,10 +195,7 @@ def network_of(mission: Mission) -> Links:
     net, n, rate = mission.network, mission.n_agents, mission.autopilot.rate
     if net is None:
         return no_network(n)
-    edges = [mission.formation_edges(name) for name in mission.formations]
-    both = np.concatenate([e for pairs in edges for e in (pairs, pairs[:, ::-1])])
-    links = np.unique(both, axis=0).astype(np.int64)
-    place = {pair: l for l, pair in enumerate(map(tuple, links.tolist()))}
+    links, reverse = links_of(mission.edges)
     worsens, recovers = fading(net.loss, net.burst)
     every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
@@ -221,12 +218,18 @@ def network_of(mission: Mission) -> Links:
         seed=np.array(seed, dtype=np.int64),
         links=links,
         first=np.searchsorted(links[:, 0], np.arange(n + 1)).astype(np.int64),
-        reverse=np.array([place[j, i] for i, j in links.tolist()], dtype=np.int64),
+        reverse=reverse,
         outages=np.array(out, dtype=np.float64).reshape(-1, 4),
         event=net.event or 0.0,
         longest=max(longest // every * every, 1),
         lag=_ESTIMATE,
     )
+
+
+def links_of(edges: Ints) -> tuple[Ints, Ints]:
+    """Links (L, 2) both ways along edges (m, 2), sorted, and of each (L,) the one that leads back."""
+    links = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
+    return links, np.lexsort(links.T)
 
 
 def fading(loss: float, burst: float | None) -> tuple[float, float]:

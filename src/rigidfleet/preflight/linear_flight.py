@@ -17,6 +17,7 @@ import numpy as np
 from rigidfleet.kernel.mail import FRESH, TOGETHER, UNDER_WAY
 from rigidfleet.math.margins import Lag, LoopGains
 from rigidfleet.math.rigid_body import rigid_motions
+from rigidfleet.planning.vehicles import links_of
 from rigidfleet.typing import Floats, Ints
 
 #: Of each coordinate: place, velocity, acceleration and two derivatives of it; those of a point end with the velocity.
@@ -71,7 +72,7 @@ class LinearFlight:
         from scipy import sparse
 
         self.n, self.r, self.radio = len(r), r, radio
-        self.links = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+        self.links, back = links_of(edges)
         self.tracks = law.control == "tracking"
         self.iterations = law.iterations if law.solver == "iterated" else 1
         self._gains = (law.k1, law.k2) if self.tracks else (0.0, 0.0)
@@ -84,8 +85,6 @@ class LinearFlight:
             sparse.csr_array((unit.ravel(), (rows, (3 * x[:, None] + range(3)).ravel())), (L, n3))
             for x in (i, j)
         )
-        place = {pair: l for l, pair in enumerate(map(tuple, self.links.tolist()))}
-        back = np.array([place[b, a] for a, b in self.links.tolist()], dtype=np.int64)
         #: Rows that are held and sent of each link, and number of links.
         self.shape = len(self._held()) + 1, L
         #: Whether nothing acts on motions of the whole formation.
