@@ -62,7 +62,7 @@ def draw_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
             ax.plot(x, y, np.full(len(x), floor), color=look["edgecolor"], **style, zorder=1)
 
 
-def falls(result: Result) -> Floats:
+def falls_of(result: Result) -> Floats:
     """Where each vehicle falls that fails at a sample: places (K, N, 2) [m] on the ground, or at z = 0 without one.
 
     NaN where nothing falls, for want of gravity.
@@ -77,14 +77,14 @@ def falls(result: Result) -> Floats:
 
 
 @st.in_style
-def sketch(result: Result) -> Figure:
-    """The ground from above: fences, people, and where vehicles fly and fall."""
+def sketch(result: Result, falls: Floats) -> Figure:
+    """The ground from above: fences, people, and where vehicles fly and fall (`falls_of`)."""
     fig = st.blank_figure(st.WIDTH, 4.6, "constrained")
     ax = fig.subplots()
     draw_from_above(ax, result.mission)
     handles = []
     for what, places, colour in (
-        ("vehicles that fail fall", falls(result), _FALLS),
+        ("vehicles that fail fall", falls, _FALLS),
         ("vehicles fly", result.position[..., :2], st.FLOWN),
     ):
         flat = places[result.left]

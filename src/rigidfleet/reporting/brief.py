@@ -13,6 +13,7 @@ from rigidfleet._common.facts import value
 from rigidfleet._common.text import agent_names, all_hold
 from rigidfleet.assessment import Verdict
 from rigidfleet.plotting import areas, encode_figure
+from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from rigidfleet.result import Result
@@ -22,12 +23,17 @@ _AREAS = "fence", "soft_fence", "people"
 
 
 def rows(
-    result: Result, verdict: Verdict, rehearsed: Sequence[str] = (), abort: Sequence[str] = ()
+    result: Result,
+    verdict: Verdict,
+    falls: Floats,
+    rehearsed: Sequence[str] = (),
+    abort: Sequence[str] = (),
 ) -> list[tuple[str, list[str]]]:
     """Headings, each with its sentences.
 
     Parameters
     ----------
+    falls : where vehicles fall (K, N, 2) [m], by `areas.falls_of`
     rehearsed : what drills have shown, in sentences
     abort : how the flight is aborted
     """
@@ -39,7 +45,7 @@ def rows(
         ("Rehearsed", [*rehearsed] or ["No drill belongs to this report."]),
         ("Aborted", [*abort] or ["No way home belongs to this report."]),
         ("Fences and people", beside or ["The mission has neither."]),
-        ("Where things fall", _falls(result)),
+        ("Where things fall", _falls(result, falls)),
         ("Versions and digests", _digests(result)),
     ]
 
@@ -76,9 +82,9 @@ def _proofs(result: Result, verdict: Verdict) -> list[str]:
     return [*lines, words]
 
 
-def _falls(result: Result) -> list[str]:
+def _falls(result: Result, falls: Floats) -> list[str]:
     """How far vehicles that fail are carried, at samples."""
-    mission, falls = result.mission, areas.falls(result)
+    mission = result.mission
     if not np.isfinite(falls).any():
         return ["Without gravity, nothing falls."]
     off = np.linalg.norm(falls - result.position[..., :2], axis=2)
@@ -109,6 +115,6 @@ def _digests(result: Result) -> list[str]:
     ]
 
 
-def sketch(result: Result) -> bytes:
+def sketch(result: Result, falls: Floats) -> bytes:
     """The ground from above with fences, people, and where vehicles fly and fall, as an SVG."""
-    return encode_figure(areas.sketch(result), ["svg"])["svg"]
+    return encode_figure(areas.sketch(result, falls), ["svg"])["svg"]

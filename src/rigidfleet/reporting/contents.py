@@ -17,6 +17,7 @@ from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
+from rigidfleet.plotting.areas import falls_of
 from rigidfleet.plotting.quadrotors import (
     has_rotors,
     rotor_forces,
@@ -66,12 +67,16 @@ def contents(
     # Trajectories that others made have no gains.
     controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
     response = overlay.response(missions, names) if controlled else None
+    first: dict[str, Any] = {"brief": [], "sketch": None}
+    if not several:
+        falls = falls_of(flights[0])
+        first["brief"] = brief.rows(flights[0], judged[0], falls, **more)
+        first["sketch"] = _data_url(brief.sketch(flights[0], falls))
     return {
         "title": " · ".join(names),
         "several": several,
         "flights": pages,
-        "brief": [] if several else brief.rows(flights[0], judged[0], **more),
-        "sketch": None if several else _data_url(brief.sketch(flights[0])),
+        **first,
         "figures": [] if several else _figures(flights[0]),
         "passed": all(verdict.passed for verdict in judged),
         "safety": _safety_table(flights, judged, names),
