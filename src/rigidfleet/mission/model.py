@@ -576,7 +576,7 @@ class Mission(Contents, Shown):
         words += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
         return " and ".join(words)
 
-    @property
+    @cached_property
     def aborting(self) -> Aborting:
         """How the flight is aborted: [abort], or its defaults."""
         return self.abort or Aborting.model_construct()

@@ -88,7 +88,7 @@ def _kind(phase: ActivePhase) -> tuple[object, ...]:
     plan, extremes = phase.plan, phase.extremes
     points = tuple(at["time"] for at in plan.through)
     times = plan.start, plan.t_end, plan.arrival, points
-    return *times, plan.integrator.rtol, len(phase.state.y), len(extremes.boxes)
+    return *times, plan.integrator.rtol, len(phase.state.y), extremes.directed
 
 
 def _vector(active: Sequence[ActivePhase]) -> Vector:
@@ -110,7 +110,6 @@ def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
         vector.begin(
             _fill_lanes([stretch.problem for stretch in stretches]),
             _fill_lanes([phase.state for phase in active]),
-            _fill_lanes([phase.extremes.monitor.monitor for phase in active]),
             t_end,
             times,
             _fill_lanes([stretch.samples for stretch in stretches]),
