@@ -1,13 +1,13 @@
 """The kinds of phases: their keys with unit and meaning, and the properties by which other modules tell them apart."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field, model_validator
 
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.mission.values import (
@@ -47,6 +47,7 @@ class Settle(Part):
     timeout: Time = key("time after which the mission fails [s]", 60.0)
 
 
+@with_earlier_names(led="follows_curves", spelled="flown_as_written", ended="keys_if_ended")
 class AnyPhase(Part):
     """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
@@ -85,12 +86,6 @@ class AnyPhase(Part):
         "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
     )
-
-    @property
-    def led(self) -> bool:
-        """The earlier name of `follows_curves`."""
-        warnings.warn("led is now follows_curves", DeprecationWarning, stacklevel=2)
-        return self.follows_curves
 
     @property
     def shaping(self) -> "Shaping | None":
@@ -152,7 +147,7 @@ class AnyPhase(Part):
         return self if isinstance(self, Vertical) else None
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether the phase is flown as written; others take its place before the flight (`planning.transitions`)."""
         return True
 
@@ -183,7 +178,7 @@ class AnyPhase(Part):
         """Target of the phase in words; "" if it stays."""
         return ""
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """Keys that change if the pilot ends the phase after another duration [s]: no motion is longer than it."""
         own = ((key, self.__dict__.get(key)) for key in ("travel", "blend"))
         return {key: min(seconds(time), length) for key, time in own if time is not None}
@@ -213,6 +208,7 @@ class Attitude(Part):
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
 
+@with_earlier_names(aligned="fits_slots")
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
 
@@ -244,7 +240,7 @@ class Shaping(AnyPhase):
         return self.position
 
     @property
-    def aligned(self) -> bool:
+    def fits_slots(self) -> bool:
         """Whether the slots are rotated during the blend, so that they move least: unless `alignment` is none."""
         return self.__dict__.get("alignment") != "none"
 
@@ -254,10 +250,10 @@ class Shaping(AnyPhase):
         place = [] if self.position is None else [_vector(self.position, "m")]
         return ", ".join([self.formation, *place, *self.angles])
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
         return {"formation": self.formation} | (
-            {} if self.reference == "step" else super().ended(length)
+            {} if self.reference == "step" else super().keys_if_ended(length)
         )
 
 
@@ -297,7 +293,7 @@ class Reshape(Shaping):
     )
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether the ways are straight, or given."""
         return self.transition == "straight"
 
@@ -453,7 +449,7 @@ class Vertical(Arriving):
     )
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether there is one group, which does not land elsewhere."""
         return self.stagger is None and self.__dict__.get("places") != "own"
 
@@ -586,7 +582,7 @@ class Follow(Cruising):
         n = len(self.trajectories or ())
         return "along a trajectory" if n == 1 else f"along {n} trajectories"
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The time of the whole trajectories, so that they are flown as fast up to the new end."""
         whole = self.travel or self.duration
         return {"travel": length if whole is None else seconds(whole)}

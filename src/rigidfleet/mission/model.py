@@ -13,6 +13,7 @@ from pydantic import PrivateAttr
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.kept import kept
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
@@ -84,6 +85,7 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 _STANDING = 0.5
 
 
+@with_earlier_names(linked="has_link")
 class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -554,7 +556,7 @@ class Mission(Contents, Shown):
         pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
         return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
 
-    def linked(self, edges: Ints, t: float) -> Bools:
+    def has_link(self, edges: Ints, t: float) -> Bools:
         """Mask (m,) of the edges (m, 2), i < j, whose link is not lost at a time [s]."""
         pairs, times = self.links_lost
         n = self.n_agents
