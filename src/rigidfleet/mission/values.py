@@ -11,7 +11,6 @@ from pydantic import (
     Tag,
     WithJsonSchema,
 )
-from pydantic_core import PydanticUndefined
 
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
@@ -153,9 +152,15 @@ def number_or_list(least: float) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
 
 
-def key(text: str, default: Any = PydanticUndefined, **more: Any) -> Any:
-    """A key of a table: its meaning with its unit, and its default; without one it is required."""
-    return Field(default, description=text, **more)
+def key(text: str, default: Any = None, **more: Any) -> Any:
+    """A key of a table that may be left out: its meaning with its unit, and its default, or what makes one."""
+    kind = "default_factory" if callable(default) else "default"
+    return Field(description=text, **{kind: default}, **more)
+
+
+def required_key(text: str, **more: Any) -> Any:
+    """A key that a table must have: its meaning with its unit."""
+    return Field(description=text, **more)
 
 
 class Part(BaseModel):
