@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -29,6 +29,7 @@ from rigidfleet.mission.values import (
     Velocity,
     VelocityOrFree,
     key,
+    models_by_kind,
     required_key,
 )
 
@@ -177,6 +178,15 @@ class AnyPhase(Part):
     def leads_to(self) -> str:
         """Target of the phase in words; "" if it stays."""
         return ""
+
+    @property
+    def ends(self) -> str:
+        """When the phase ends, in words: at a time, after a duration, or as it settles."""
+        if self.settle is not None:
+            return f"settled, within {self.settle.timeout:g} s"
+        if self.duration == AUTO:
+            return "as soon as the limits allow"
+        return f"at {self.until:g} s" if self.until is not None else f"after {self.duration:g} s"
 
     def keys_if_ended(self, length: float) -> dict[str, Any]:
         """Keys that change if the pilot ends the phase after another duration [s]: no motion is longer than it."""
@@ -629,7 +639,4 @@ Phase = Annotated[
     Field(discriminator="kind"),
 ]
 #: Models of all phases by `kind`.
-KINDS: dict[str, type[AnyPhase]] = {
-    get_args(model.model_fields["kind"].annotation)[0]: model
-    for model in get_args(get_args(Phase)[0])
-}
+KINDS: dict[str, type[AnyPhase]] = models_by_kind(Phase)

@@ -25,7 +25,6 @@ from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import with_own_names, with_scales
 from rigidfleet.mission.check import check, defaults
-from rigidfleet.mission.describe import ending, goal, size_in_words
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
@@ -199,7 +198,16 @@ class Mission(Contents, Shown):
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""
-        return size_in_words(self.n_agents, len(self.formations), self.phases)
+        counts = {
+            "agent": self.n_agents,
+            "formation": len(self.formations),
+            "phase": len(self.phases),
+        }
+        words = [f"{n} {thing}{'s' * (n != 1)}" for thing, n in counts.items()]
+        most = "at most " if any(phase.settle for phase in self.phases) else ""
+        end = self.latest_end
+        lasts = "as long as its limits ask" if math.isnan(end) else f"{most}{end:g} s"
+        return ", ".join([*words, lasts])
 
     def __repr__(self) -> str:
         return f"<Mission {self.name}: {self.size_in_words}>"
@@ -214,7 +222,7 @@ class Mission(Contents, Shown):
     def phase_table(self) -> FactTable:
         """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
-            Row((n, p.name, p.kind, goal(p), ending(p), p.control))
+            Row((n, p.name, p.kind, p.leads_to, p.ends, p.control))
             for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")

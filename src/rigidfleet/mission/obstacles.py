@@ -24,6 +24,7 @@ from rigidfleet.mission.values import (
     Vector,
     Velocity,
     key,
+    models_by_kind,
     required_key,
 )
 from rigidfleet.solids import records
@@ -241,10 +242,8 @@ class Ground(Part):
         return records.single(records.half_space(self.height))
 
 
-Obstacle = Annotated[Box | Sphere | Cylinder | Hull | Heights | Ground, Field(discriminator="kind")]
-KINDS: dict[str, type[Part]] = {
-    "box": Box, "ground": Ground, "sphere": Sphere, "cylinder": Cylinder, "hull": Hull, "heights": Heights,
-}  # fmt: skip
+Obstacle = Annotated[Box | Ground | Sphere | Cylinder | Hull | Heights, Field(discriminator="kind")]
+KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 
 def is_ground(thing: Obstacle) -> bool:

@@ -467,13 +467,7 @@ class Formation(Part):
         if isinstance(self.edges, str):
             slots = self.slot_array(n)
             assert slots is not None  # checked: there is a shape or slots
-            if self.edges == "neighbours":
-                return graphs.neighbours(slots, self.reach)
-            return (
-                graphs.henneberg(slots)
-                if self.edges == "henneberg"
-                else graphs.henneberg_multilevel(slots)
-            )
+            return graphs.GRAPHS[self.edges](slots, self.reach)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     @property

@@ -1,6 +1,6 @@
 """Values of a mission file: numbers within bounds, vectors, lists; and `Part`, the base of all its tables."""
 
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -161,6 +161,12 @@ def key(text: str, default: Any = None, **more: Any) -> Any:
 def required_key(text: str, **more: Any) -> Any:
     """A key that a table must have: its meaning with its unit."""
     return Field(description=text, **more)
+
+
+def models_by_kind(union: Any) -> dict[str, Any]:
+    """Models of a union of tables by their `kind`."""
+    models = get_args(get_args(union)[0])
+    return {get_args(model.model_fields["kind"].annotation)[0]: model for model in models}
 
 
 class Part(BaseModel):
