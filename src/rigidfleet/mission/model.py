@@ -24,11 +24,11 @@ from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import with_own_names, with_scales
-from rigidfleet.mission.check import check, defaults
+from rigidfleet.mission.check import checked_parts, defaults
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
-from rigidfleet.mission.phases import latest_end
+from rigidfleet.mission.phases import end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -133,7 +133,7 @@ class Mission(Contents, Shown):
         MissionError
             With a finding for each error.
         """
-        parts = check(data, origin)
+        parts = checked_parts(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = with_own_names(
                 parts["formations"], parts["phases"]
@@ -462,7 +462,7 @@ class Mission(Contents, Shown):
 
         It is nan while a duration before it is automatic (`rigidfleet.planning.timing.complete_times`).
         """
-        return latest_end(self.phases)
+        return end_of_phases(self.phases)
 
     @cached_property
     def fleet(self) -> Fleet:
