@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
+from rigidfleet.plotting.logged import runs
 from rigidfleet.plotting.style import in_style
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
@@ -178,9 +178,8 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
         ax.set_ylabel("saturated\n[vehicles]")
         return
     for i, colour in enumerate(st.agent_colours(n)):
-        ends = np.flatnonzero(np.diff(np.pad(saturated[:, i], 1).astype(int)))
         last = np.append(t, t[-1])
-        bars = [(t[a], last[b] - t[a]) for a, b in list(pairwise(ends.tolist()))[::2]]
+        bars = [(t[a], last[b] - t[a]) for a, b in runs(saturated[:, i])]
         ax.broken_barh(bars, (i + 0.6, 0.8), color=colour, linewidth=0.4)
     ax.set_ylim(n + 0.6, 0.4)
     ax.set_yticks(range(1, n + 1))
