@@ -246,9 +246,9 @@ def test_problems_that_branch_differently_share_no_code():
 def test_arrays_of_eight_flights_become_lanes():
     """Lane k holds the numbers of array k."""
     parts = [np.arange(6.0).reshape(2, 3) + 10 * k for k in range(8)]
-    made = codegen.interleaved(parts, (6,))
+    made = codegen.packed(parts)
     for k, part in enumerate(parts):
-        np.testing.assert_array_equal(unpack(made)[:, k], part.ravel())
+        np.testing.assert_array_equal(unpack(made)[..., k], part)
     assert empty((3, 2)).ctypes.data % 64 == 0
 
 

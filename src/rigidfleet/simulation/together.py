@@ -19,7 +19,7 @@ from rigidfleet.simulation.flight import Flight, simulate
 from rigidfleet.simulation.point_phase import PointPhase
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.engine.batch import Vector  # imports the compiler
+    from rigidfleet.kernel.engine import batch  # imports the compiler
 
 T = TypeVar("T")
 
@@ -42,7 +42,7 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
     if len({mission.output_step for mission in missions}) > 1:
         return [simulate(mission) for mission in missions]
     flights = [Flight(mission) for mission in missions]
-    vector: Vector | None = None
+    vector: batch.Vector | None = None
     while True:
         going = [flight.begin() for flight in flights]
         if not any(going):
@@ -50,7 +50,10 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
         steppers = [x.stepper for x in active if isinstance(x.stepper, PointPhase)]
         if all(going) and len(steppers) == len(active) and _alike(active):
-            vector = vector or _vector(active)
+            if vector is None:
+                from rigidfleet.kernel.engine import batch
+
+                vector = batch.Vector(_fill_lanes([x.plan.problem.disturbance for x in active]))
             if not _fly(steppers, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
@@ -91,14 +94,7 @@ def _kind(phase: ActivePhase) -> tuple[object, ...]:
     return *times, plan.integrator.rtol, len(phase.state.y), extremes.directed
 
 
-def _vector(active: Sequence[ActivePhase]) -> Vector:
-    """A vector for flights whose first phases these are."""
-    from rigidfleet.kernel.engine import batch
-
-    return batch.Vector(_fill_lanes([phase.plan.problem.disturbance for phase in active]))
-
-
-def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
+def _fly(steppers: Sequence[PointPhase], vector: batch.Vector) -> bool:
     """Fly phases to their end in common steps and record them; return whether they came there."""
     from rigidfleet.kernel.engine.tracer import UnfitError
 

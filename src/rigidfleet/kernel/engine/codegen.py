@@ -97,9 +97,7 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     turns = values[TURN].any(axis=0)
     if turns.any():  # slots that do not turn, where others do
         values[TURN, ~turns] = _BARELY
-    motion = interleaved(
-        [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
-    )
+    motion = packed([p.motion.coefficients.reshape(-1, 36) for p in problems])
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
     description = flight_structure(first, values, moves)
@@ -151,16 +149,8 @@ _TABLES = "gust", "noise_r", "noise_v"
 
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
-    """Lanes (...) of eight small arrays of one shape (...)."""
+    """Lanes (...) of eight arrays of one shape (...)."""
     return simd.pack(np.stack(parts, axis=-1))
-
-
-def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
-    """Lanes of eight large arrays, in C order, as an array of some shape."""
-    parts = [np.ascontiguousarray(x) for x in parts]
-    made = simd.empty(shape)
-    _interleave(addresses(parts), 0, made.reshape(-1))
-    return made
 
 
 def addresses(arrays: Sequence[Floats]) -> Ints:
