@@ -711,7 +711,7 @@ def test_everything_in_space_is_in_the_picture(flight):
     view = space.scene(result)
     spatial, above = figure.axes
     points = np.concatenate(
-        [result.position.reshape(-1, 3), *([low, high] for _, low, high in view.boxes)]
+        [result.position.reshape(-1, 3), *(shape.ends for shape in view.shapes)]
     )
     inside = space._on_screen(spatial, points) / figure.bbox.size
     assert (inside > [0, 0.05]).all()
@@ -746,7 +746,7 @@ def test_a_huge_obstacle_does_not_shrink_the_flight():
     """Of a wall a hundred kilometres long only what stands near the flight is shown."""
     wall = {"kind": "box", "name": "wall", "min": [-1e5, 20.0, 0.0], "max": [1e5, 21.0, 50.0]}
     near = space.scene(a_flight(mission={"obstacles": [wall]}))
-    assert near.boxes
+    assert near.shapes
     assert np.ptp([near.low, near.high], axis=0).max() < 100
 
 
