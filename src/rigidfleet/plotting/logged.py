@@ -60,7 +60,7 @@ class OffPlan(NamedTuple):
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
         for i, off in enumerate(self.off.T):
-            for a, b in _joined(runs(off), time):
+            for a, b in _spans(runs(off), time):
                 k = a + int(np.nanargmax(self.far[a:b, i]))
                 ends = float(time[a]), float(time[b - 1])
                 drifts.append(Drift(i, *ends, float(self.far[k, i]), float(time[k])))
@@ -73,7 +73,7 @@ def runs(mask: Bools) -> list[tuple[int, int]]:
     return list(pairwise(ends))[::2]
 
 
-def _joined(spans: list[tuple[int, int]], time: Floats) -> list[tuple[int, int]]:
+def _spans(spans: list[tuple[int, int]], time: Floats) -> list[tuple[int, int]]:
     """Runs of samples, those that follow soon after another joined to it."""
     joined: list[tuple[int, int]] = []
     for a, b in spans:
