@@ -593,16 +593,16 @@ class Mission(Contents, Shown):
     @property
     def abandons_at(self) -> float:
         """Time [s] at which the flight leaves its plan, for a loss that is answered or an abort; infinity if never."""
-        return min(self._answers)
+        return min(self._loss_and_order)
 
     @property
     def aborts(self) -> bool:
         """Whether it then aborts, by [abort]."""
-        loss, abort = self._answers
+        loss, abort = self._loss_and_order
         return abort < loss
 
     @property
-    def _answers(self) -> tuple[float, float]:
+    def _loss_and_order(self) -> tuple[float, float]:
         """Times [s] at which the others brake after a loss, and at which the flight aborts; infinity if never."""
         options, loss = self.aborting, math.inf if self.on_loss == "continue" else self.first_loss
         order = math.inf if options.at is None else options.at
