@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
+from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -237,6 +238,11 @@ class Mission(Contents, Shown):
         if not self._text:
             self._text = self._about + to_toml(self._data)
         return self._text
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of its text."""
+        return sha256(self.text.encode()).hexdigest()
 
     @property
     def about(self) -> str:

@@ -63,7 +63,7 @@ def planned_answer(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:
     when = mission.abandons_at
     lost = mission.lost_at <= when
     now = copy_with(at.state_at(when), lost=lost if lost.any() else None)
-    return answer_to(mission, now, legs)
+    return answer_to(mission, now, lambda: legs)
 
 
 def _links(mission: Mission) -> Iterator[Remark]:
