@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import lzma
 from pathlib import Path
 from typing import NamedTuple
 
@@ -429,6 +430,56 @@ def test_trajectories_of_others_are_drilled_by_the_command(kind, tmp_path, capsy
         "mirrored",
     }
     assert sum(case["failed"]["of"] for case in out["drill"]) == out["flown"] == 34
+
+
+def xz(name, folder):
+    """A log of the test data, unpacked into a folder."""
+    packed = Path(__file__).parent / "data" / "logs" / f"{name}.xz"
+    (folder / name).write_bytes(lzma.decompress(packed.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    "name", ["show-2.csv", "folder", "copter.tlog", "plane.bin", "odometry.mcap", "transforms.db3"]
+)
+def test_what_assess_reads_is_drilled_or_refused_with_the_reason(
+    name, tmp_path, capsys, monkeypatch
+):
+    """What `assess` passes is drilled, what it does not read or pass is refused for the same reason; .nc: mission."""
+    monkeypatch.chdir(tmp_path)
+    day(tmp_path, 2)
+    if name == "folder":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.csv").write_text("time,x,y,z\n0,0,0,1\n1,0,0,2\n2,1,0,2\n")
+        (tmp_path / name / "b.csv").write_text("time,x,y,z\n0,3,0,1\n1,3,0,2\n2,4,0,2\n")
+    elif not Path(name).exists():
+        xz(name, tmp_path)
+    passed = main(["assess", name, "--separation", "0.5"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    drill = [
+        "sweep",
+        name,
+        "--drill",
+        "--separation",
+        "0.5",
+        "--runs",
+        "3",
+        "--quiet",
+        "--no-figures",
+    ]
+    code, error = main(drill), " ".join(capsys.readouterr().err.split())
+    assert code == (0 if passed else 2), error
+    if not passed:
+        assert error.partition("any fault: ")[2].partition(". Mend")[0] in said
+
+
+def test_a_result_is_not_drilled(tmp_path, capsys, monkeypatch):
+    """The result of a flight is refused: its mission is what can be drilled; so is a folder with nothing in it."""
+    monkeypatch.chdir(tmp_path)
+    Path("flight.nc").write_bytes(b"\x89HDF")
+    Path("empty").mkdir()
+    for what, words in (("flight.nc", "Drill its mission"), ("empty", "has no .csv")):
+        assert main(["sweep", what, "--drill", "--separation", "1", "--quiet"]) == 2
+        assert words in capsys.readouterr().err
 
 
 WRONG = {

@@ -144,10 +144,12 @@ class _Chords(NamedTuple):
     ----------
     place : (3, K + 1, N) positions at knots [m]
     sag : (K, N) greatest distance of a way from its chord, at the same time [m]
+    move : (N,) greatest distance of a way, between two knots, from where it is at the nearer one [m]
     """
 
     place: Floats
     sag: Floats
+    move: Floats
 
     @classmethod
     def of(cls, way: Piecewise) -> _Chords:
@@ -157,7 +159,13 @@ class _Chords(NamedTuple):
         share = np.linspace(0.0, 1.0, points.shape[-1])
         points -= place[:-1, ..., None] + np.diff(place, axis=0)[..., None] * share
         sag = np.linalg.norm(points, axis=2).max(axis=-1)
-        return cls(np.ascontiguousarray(place.transpose(2, 0, 1)), sag)
+        return cls.through(np.ascontiguousarray(place.transpose(2, 0, 1)), sag)
+
+    @classmethod
+    def through(cls, place: Floats, sag: Floats) -> _Chords:
+        """Chords through places (3, K + 1, N) [m], with sags (K, N) [m]."""
+        step = proximity.root_of_squares(np.diff(place, axis=1)).max(axis=0)
+        return cls(place, sag, 0.5 * step + sag.max(axis=0))
 
 
 class Show:
@@ -190,6 +198,8 @@ class Show:
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
         self._data, self.radius, limits = data, mission.fleet.radius, mission.limits
         self.reach = max(limits.separation or 0.0, limits.separation_below or 0.0)
+        #: Whether other pairs than the nearest of all may matter.
+        self.by_height = bool(limits.separation_below or limits.separation_altitude is not None)
         solid = any(not isinstance(thing, Ground) for thing in mission.obstacles)
         #: Whether it matters where the show is as a whole: flat ground is the same everywhere.
         self.bounded = solid or limits.geofence or mission.fences or mission.people
@@ -301,25 +311,27 @@ class Show:
         return Piecewise(flown.time, pieces)
 
     def _near(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
-        """Which vehicles (N,) may come near one of those (S,) that fly by other chords, or are the nearest to it."""
-        place, sag = (x.copy() for x in self._chords_on(knots))
-        place[:, :, who], sag[:, who] = own
-        # Between two knots none moves further than half of a step from the nearer one.
-        step = 0.5 * np.linalg.norm(np.diff(place, axis=1), axis=0).max(axis=0) + sag.max(axis=0)
-        near = np.zeros(self.n, dtype=np.bool_)
+        """Which vehicles (N,) may be the nearest to one of those (S,) that fly by other chords, or hit it.
+
+        If distances count by height, these are all that may come nearer than a limit.
+        """
+        place, sag, move = (x.copy() for x in self._chords_on(knots))
+        place[:, :, who], sag[:, who], move[who] = own
+        near, least = np.full(self.n, np.inf), self.reach
         for i in who.tolist():
-            apart = place - place[:, :, i : i + 1]
-            allowed = self.reach + self.radius + self.radius[i]
-            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - allowed
+            apart, radii = place - place[:, :, i : i + 1], self.radius + self.radius[i]
+            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - radii
             ends[i] = np.inf
-            near[ends.argmin()] = True
-            some = np.flatnonzero(ends < step + step[i])
+            nearest = ends.argmin()
+            near[nearest] = -np.inf
+            least = least if self.by_height else min(least, max(float(ends[nearest]), 0.0))
+            some = np.flatnonzero(ends < least + move + move[i])
             a, d = apart[:, :-1, some], np.diff(apart[:, :, some], axis=1)
             share = -(a * d).sum(axis=0) / np.maximum((d * d).sum(axis=0), 1e-300)
             a += np.clip(share, 0.0, 1.0) * d
-            gap = proximity.root_of_squares(a) - sag[:, some] - sag[:, i : i + 1]
-            near[some[gap.min(axis=0) < allowed[some]]] = True
-        return near
+            gap = proximity.root_of_squares(a) - sag[:, some] - sag[:, i : i + 1] - radii[some]
+            near[some] = np.minimum(near[some], gap.min(axis=0))
+        return near < least
 
     def _chords_on(self, knots: Floats) -> _Chords:
         """Chords of all vehicles on other knots: on a part of a piece, the sag may be twice that of the piece."""
@@ -330,7 +342,8 @@ class Show:
             within = np.clip(knots, own[0], own[-1])
             place = np.ascontiguousarray(self.curve.at(within)[:, :, :3].transpose(2, 0, 1))
             middle = 0.5 * (within[:-1] + within[1:])
-            self._on_knots[key] = _Chords(place, 2.0 * self._chords.sag[piece_at(own, middle)])
+            sag = 2.0 * self._chords.sag[piece_at(own, middle)]
+            self._on_knots[key] = _Chords.through(place, sag)
         return self._on_knots[key]
 
     def _some(self, who: Ints) -> Piecewise:
