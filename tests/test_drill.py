@@ -482,11 +482,32 @@ def test_a_result_is_not_drilled(tmp_path, capsys, monkeypatch):
         assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("stale", "words"),
+    [("no.csv", "no such file"), ("two-agents", "has 2 agents, and the show 12")],
+)
+def test_an_earlier_version_that_is_none_is_refused(stale, words, tmp_path, capsys, monkeypatch):
+    """An earlier version that is not there, or is of another show, is one error before anything is judged."""
+    monkeypatch.chdir(tmp_path)
+    Path("drill.toml").write_text(f'mission = "change-of-picture"\n[drill]\nstale = ["{stale}"]\n')
+    assert main(["sweep", "drill.toml", "--quiet"]) == 2
+    err = " ".join(capsys.readouterr().err.split())
+    assert words in err
+    assert err.count("error: ") == 1
+    assert "no run has" not in err
+
+
 WRONG = {
     "nothing": ({"late": []}, "has no magnitude"),
     "unknown": ({"later": [1.0]}, "later"),
     "negative": ({"late": [-1.0]}, "late"),
     "flown": ({"files": ["x.csv"], "wind": [1.0]}, "needs a mission that is flown"),
+    "zero": ({"shifted": [0.0]}, "drill.shifted.*must be > 0"),
+    "no number": ({"rotated": ["north"]}, "drill.rotated.*must be a number"),
+    "no trial": ({"trials": 0}, "drill.trials.*must be >= 1"),
+    "all lost": ({"lost": [12]}, "drill.lost.*too much for 12 vehicles"),
+    "its own file": ({"another": [1, 12]}, "drill.another.*too much for 12 vehicles"),
+    "too many": ({"late": [1.0], "vehicles": [13]}, "drill.vehicles.*too much for 12 vehicles"),
 }
 
 
@@ -494,8 +515,9 @@ WRONG = {
 def test_what_cannot_be_drilled_is_refused(name):
     """A drill without magnitudes, of unknown faults, or with wind on others' files is refused before it is flown."""
     table, words = WRONG[name]
-    with pytest.raises(rf.SweepError, match=words):
+    with pytest.raises(rf.SweepError, match=words) as error:
         Sweep.of("change-of-picture", [], drill=table)
+    assert len(error.value.findings) == 1
     with pytest.raises(rf.SweepError, match="no effect on a drill"):
         Sweep.of("change-of-picture", ["agents.mass = grid(1.0, 2.0)"], drill={})
 

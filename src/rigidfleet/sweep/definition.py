@@ -448,9 +448,9 @@ def _check(
     own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
     header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
-    if header is not None and header.drill is not None:
-        cases = _cases(collector, header.drill, mission)
-        if collector.findings:
+    if data.get("drill") is not None:
+        cases = [] if header is None else _cases(collector, header.drill or Drill(), mission)
+        if collector.findings or header is None:
             raise SweepError(collector.findings)
         return cases, header
     whole = None if mission is None else keypaths.whole_document(mission)
@@ -509,8 +509,13 @@ def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -
     if drill.links and mission is not None and mission.network is None:
         problem = "has no effect: without [network], one law knows all states"
         collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
-    grids = drill.grids(1 if mission is None else mission.n_agents)
-    if not grids:
+    n = 1 if mission is None else mission.n_agents
+    for key, most in faults.most_of(n).items():
+        if key in drill.model_fields_set and max(getattr(drill, key), default=0) > most:
+            remedy = f"give at most {most}"
+            collector.add(("drill", key), f"is too much for {n} vehicles", remedy)
+    grids = drill.grids(n)
+    if not (grids or collector.findings):
         collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
     return grids
 

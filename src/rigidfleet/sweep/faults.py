@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, piece_at
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.obstacles import Ground
-from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, Whole, key
+from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, key
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.variation import Grid, Variation
 from rigidfleet.typing import Bools, Floats, Ints
@@ -59,13 +59,13 @@ class Drill(Part):
     links: _Counts = key("so many links are lost, each at any time", ())
     lost: _Counts = key("so many vehicles are lost, each at any time", (1,))
     vehicles: _Counts = key("of how many at once late, another, stale and bias are faults", (1, 5))
-    trials: Whole = key("trials of each magnitude: other vehicles, directions, times", 20, ge=1)
+    trials: AgentNumber = key("trials of each magnitude: other vehicles, directions, times", 20)
     files: tuple[str, ...] = key("files of others that are flown, not those of the mission", ())
 
     def grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
         possible = PARTIAL | SETUP if self.files else UNITS
-        faults = self.model_fields_set & UNITS.keys() or possible.keys()
+        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), most_of(n)
         some = sorted({min(count, n) for count in self.vehicles})
         counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
@@ -74,6 +74,7 @@ class Drill(Part):
             for fault in UNITS
             if fault in faults
             for size in (places if fault == "stale" else getattr(self, fault))
+            if fault not in most or size <= most[fault]
             for count in counts.get(fault, [int(size) if fault == "lost" else n])
         ]
         names = "drill.fault", "drill.magnitude", "drill.vehicles"
@@ -95,6 +96,11 @@ class Drill(Part):
 
         named = {key: (*map(whole, getattr(self, key)),) for key in ("stale", "files")}
         return self.model_copy(update={key: x for key, x in named.items() if x})
+
+
+def most_of(n: int) -> dict[str, int]:
+    """Of how many vehicles or links at most a key may be in a show of n vehicles."""
+    return {"vehicles": n, "another": n - 1, "lost": n - 1, "links": n * (n - 1) // 2}
 
 
 def stream_of(seed: int, *number: int) -> np.random.Generator:
@@ -207,15 +213,12 @@ class Show:
         self._rows = np.ascontiguousarray(self.curve.pieces.transpose(3, 1, 2, 0))
         self._chords = _Chords.of(self.curve)
         self._on_knots: dict[bytes, _Chords] = {}  # one for each magnitude of a delay
-
-    @cached_property
-    def versions(self) -> list[Piecewise]:
-        """The ways of earlier versions."""
-        return [
+        #: The ways of earlier versions.
+        self.versions = [
             self._ways(load_mission(name), ())[0]
             if name in mission_names() or name.endswith(".toml")
-            else self._ways(self.mission, (name,))[0]
-            for name in self.drill.stale
+            else self._ways(mission, (name,))[0]
+            for name in drill.stale
         ]
 
     def _ways(self, mission: Mission, files: Sequence[str]) -> tuple[Piecewise, str, Verdict]:
@@ -228,10 +231,15 @@ class Show:
 
         if files:
             read = read_trajectories(files, spans="stand")
+            if len(read.curves) != self.n:
+                raise RigidfleetError(
+                    f"{files[0]}: has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
+                )
             return join(read.curves), read.assumed, assess(of_curves(read, mission=mission))
         if mission.n_agents != self.n:
             raise RigidfleetError(
-                f"stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}."
+                f"drill.stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}. Give an earlier"
+                " version of the same show."
             )
         result = simulate(mission)
         motion = result.motion(flown=False)
