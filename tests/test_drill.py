@@ -307,6 +307,18 @@ def test_the_summary_has_the_share_of_each_fault(drilled):
     assert [row.cells[3] for row in shown.rows] == [
         f"{case['failed']['count']} of 3" for case in data
     ]
+    sentences = summary.rehearsals()
+    assert [x.partition(":")[0] for x in sentences] == ["Late", "Rotated"]
+    late = [case for case in data if case["fault"] == "late"]
+    for case in late:
+        size, failed = f"{case['magnitude']:g} s", case["failed"]["count"]
+        assert (f"{size} ({failed} of 3 runs)" in sentences[0]) == bool(failed)
+        assert size in sentences[0].partition("; failures")[2 * bool(failed)]
+    worst = summary.facts().parts[1]
+    assert isinstance(worst, FactTable)
+    assert [row.cells[3:] for row in worst.rows] == [
+        (case["worst"]["run"], case["worst"]["detail"]) for case in data if case["worst"]
+    ]
 
 
 def test_faults_that_are_flown_are_missions():
@@ -540,12 +552,9 @@ def market_square(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fault", sorted(faults.UNITS.keys() - {"stale", "links"}))
+@pytest.mark.parametrize("fault", sorted(faults.UNITS.keys() - {"links"}))
 def test_the_shipped_drill_has_a_danger_of_each_kind(fault, market_square):
-    """Of each fault one magnitude is harmless in all trials, and another is not.
-
-    No earlier version ships that could be stale, and lights that fly files have no links.
-    """
+    """Of each fault but lost links, which lights have not, a magnitude is harmless in all trials, another is not."""
     own = [x for x in market_square.values() if x.fault == fault]
     failed = {
         size: sum(x.failed.count for x in own if x.magnitude == size)
@@ -564,3 +573,12 @@ def test_the_shipped_show_as_a_whole_fails_by_its_fences(market_square):
     words = [x.worst.detail for x in whole if x.worst]
     assert len(words) == 3
     assert all("fence 'outer'" in each or "'crowd'" in each for each in words)
+
+
+@pytest.mark.long
+def test_lost_links_are_a_danger_to_those_who_fly_by_their_neighbours():
+    """In the shipped cube by neighbours, any one link is lost without harm, and six that are lost end the cube."""
+    sweep = Sweep.of("cube-by-neighbours", [], drill={"links": [1, 6], "trials": 4}, seed=2)
+    rows = fly_runs(sweep, range(sweep.runs))
+    assert [row.passed for row in rows] == [True, False] * 4
+    assert all(row.reason in ("shape", "shape, handedness") for row in rows[1::2])
