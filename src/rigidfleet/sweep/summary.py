@@ -221,16 +221,8 @@ class Summary(Shown):
         for reason, count in self.reasons.items():
             example = self.examples[reason]
             words = f"run {example.run}{': ' if example.detail else ''}{example.detail}"
-            rows.append(
-                Row(
-                    (
-                        reason_in_words(reason),
-                        count,
-                        f"{100 * count / self.success.of:.3g} %",
-                        words,
-                    )
-                )
-            )
+            share = f"{100 * count / self.success.of:.3g} %"
+            rows.append(Row((reason_in_words(reason), count, share, words)))
         return FactTable(("failed check", "runs", "of all", "for example"), rows, ("for example",))
 
     def _correlations(self, strong: Sequence[Driver]) -> FactTable:
