@@ -145,6 +145,23 @@ def test_missions_of_other_kinds_are_flown_as_alone():
         np.testing.assert_array_equal(one.position, other.position)
 
 
+def test_many_vehicles_are_flown_one_by_one(monkeypatch):
+    """No code is generated for more vehicles than it is worth, and each flies bit for bit as alone."""
+    n = together.MOST_VEHICLES + 1
+    data = {
+        "schema_version": 1, "name": "row", "output_step": 0.5,
+        "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 1.0] for i in range(n)]},
+        "formations": {"row": {"slots": [[2.0 * i, 0.0, 0.0] for i in range(n)], "edges": []}},
+        "phases": [{"kind": "establish", "formation": "row", "control": "tracking", "duration": 2.0}],
+    }  # fmt: skip
+    missions = [
+        Mission.from_dict(data | {"disturbances": {"wind": [by, 0.0, 0.0]}}) for by in (0.0, 1.0)
+    ]
+    monkeypatch.setattr(together, "_vector", lambda _: pytest.fail("code is generated"))
+    for one, other in zip(simulate_together(missions), alone(missions), strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+
+
 def test_a_flight_that_fails_takes_nobody_along():
     """Where the law is singular for one, all are flown alone, bit for bit."""
     missions = [load_mission("line-singular")] + [

@@ -25,6 +25,9 @@ T = TypeVar("T")
 
 #: Number of missions of a vector.
 WIDTH = 8
+#: Greatest number of vehicles in a vector: straight-line code of more takes longer to compile than it gains, and of a
+#: thousand minutes and gigabytes.
+MOST_VEHICLES = 60
 #: Greatest number of common steps between two looks at Ctrl-C.
 _STEPS = 2000
 
@@ -32,14 +35,16 @@ _STEPS = 2000
 def simulate_together(missions: Sequence[Mission]) -> list[Result]:
     """Fly at most eight missions side by side, each as by `simulate`; return their records.
 
-    A flight's last bits depend on the others. If a step of the common ones fails, each mission is flown alone.
+    A flight's last bits depend on the others. If a step of the common ones fails, each mission is flown alone; so it is
+    with more than `MOST_VEHICLES`.
 
     Raises
     ------
     MissionError
         A mission has errors.
     """
-    if len({mission.output_step for mission in missions}) > 1:
+    many = any(mission.n_agents > MOST_VEHICLES for mission in missions)
+    if many or len({mission.output_step for mission in missions}) > 1:
         return [simulate(mission) for mission in missions]
     flights = [Flight(mission) for mission in missions]
     vector: batch.Vector | None = None
