@@ -12,7 +12,7 @@ from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.rules import Breach, Breaches, Draft
-from rigidfleet.mission.values import Coordinate, Flag, Part, key
+from rigidfleet.mission.values import Coordinate, Flag, Part, key, required_key
 from rigidfleet.solids.polygons import Region, crossing
 from rigidfleet.typing import Floats
 
@@ -86,7 +86,7 @@ class Area(Part):
 class Fence(Area):
     """A fence, which holds for the centres of vehicles, at all heights unless it has a floor or a ceiling."""
 
-    kind: Literal["inclusion", "exclusion"] = key(
+    kind: Literal["inclusion", "exclusion"] = required_key(
         "inclusion: vehicles stay inside; exclusion: they stay outside. Each fence holds by itself"
     )
     soft: Flag = key(
