@@ -17,6 +17,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from pages import Page, splice
 from scipy.stats import t as student
 
 import rigidfleet as rf
@@ -56,7 +57,6 @@ _DRAG = 1e-3
 _SETTLED = 10.0
 #: Broadcasts that the law of everyone keeps.
 _DEPTH = 128
-_BEGIN, _END = "<!-- network -->", "<!-- end -->"
 
 
 def mission(
@@ -214,25 +214,6 @@ def interval(x: Floats) -> str:
     return f"{x.mean():.3f} +- {half:.3f}"
 
 
-class Page:
-    """Tables of what is measured, as Markdown, and how many goals are missed."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.missed = 0
-
-    def title(self, words: str, *head: str) -> None:
-        """Begin a table."""
-        self.lines += ["", words, "", f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
-        print("\n".join(self.lines[-4:]), flush=True)
-
-    def row(self, *cells: str, kept: bool) -> None:
-        """Add a row; a goal that is missed stands out."""
-        self.missed += not kept
-        self.lines.append(f"| {' | '.join(cells)} |" + ("" if kept else " **missed**"))
-        print(self.lines[-1], flush=True)
-
-
 def laws(page: Page, seeds: int, time: float) -> None:
     """The tables of shapes, without and with noise."""
     for noise in (0.0, 0.01):
@@ -331,12 +312,7 @@ def main() -> int:
     events(page, options.seeds, options.time)
     others(page, options.seeds)
     if options.write:
-        text = options.write.read_text(encoding="utf-8")
-        begin, end = text.index(_BEGIN), text.index(_END)
-        tables = "\n".join(page.lines)
-        options.write.write_text(
-            f"{text[:begin]}{_BEGIN}\n{tables}\n\n{text[end:]}", encoding="utf-8"
-        )
+        splice(options.write, {"network": "\n".join(page.lines)})
     return int(page.missed > 0)
 
 
