@@ -54,7 +54,7 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         The layers of a phase do not keep the separation, or there is no formation before it; or the groups of a
         staggered phase have no time, or would be under way together.
     """
-    if all(phase.spelled for phase in mission.phases):
+    if all(phase.flown_as_written for phase in mission.phases):
         return mission
     data, tables, forms = mission.to_dict(), [], {}
     before: str | None = None
@@ -62,7 +62,7 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
-        if not phase.spelled:
+        if not phase.flown_as_written:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             state = partial(_state_after, mission, so_far, timed)
             parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, state)

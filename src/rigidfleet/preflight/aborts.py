@@ -100,6 +100,7 @@ class AbortsCheck(Shown):
         """Plain data for JSON, agents counted from 1."""
         options = self.mission.aborting
         return {
+            "mission_sha256": self.mission.digest,
             "to": options.to, "reaction_s": options.reaction, "step_s": options.step,
             "aborts": [
                 {

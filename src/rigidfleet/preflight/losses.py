@@ -75,7 +75,7 @@ def _links(mission: Mission) -> Iterator[Remark]:
     used = {p.shaping.formation for p in mission.phases if p.shaping is not None}
     for name in mission.formations:
         slots, edges = mission.formation_slots(name), mission.formation_edges(name)
-        kept = edges[mission.linked(edges, np.inf)]
+        kept = edges[mission.has_link(edges, np.inf)]
         head = f"without the lost links ({links}), '{name}'"
         if name not in used or slots is None:
             continue
