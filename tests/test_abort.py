@@ -198,6 +198,31 @@ def test_files_of_vehicles_are_what_is_flown(tmp_path: Path, to: str, T: float) 
         assert t == pytest.approx(result.time[-1], abs=1e-6)
 
 
+@pytest.mark.parametrize("name", ["change-of-picture", "bridge-inspection"])
+def test_files_of_vehicles_lead_home_from_every_second(tmp_path: Path, name: str) -> None:
+    """Each abort's way in a vehicle's file takes as long as said and ends on a place; only a landing has none."""
+    mission = load_mission(name)
+    check = check_aborts(complete_times(Mission.from_dict(mission.to_dict() | {"abort": {}})))
+    check.write(tmp_path)
+    table = json.loads((tmp_path / "vehicle-0001.json").read_text())
+    ends = {x["ordered_s"]: x for x in json.loads((tmp_path / "aborts.json").read_text())["aborts"]}
+    assert len(table["aborts"]) == len(check.aborts)
+    back = 0
+    for abort, planned in zip(table["aborts"], check.aborts, strict=True):
+        if abort["ways"] is None:
+            assert planned.way == "lands as planned"
+            continue
+        steps = table["ways"][str(abort["ways"])]
+        end = abort["stops_s"] + sum(x["duration_s"] for x in steps)
+        assert end == pytest.approx(ends[abort["ordered_s"]]["ends_s"], abs=1e-9)
+        assert steps[-1]["to_m"] == pytest.approx(planned.at(np.array([end]))[0, 0], abs=1e-5)
+        for step in (x for x in steps if "back_to_s" in x):  # where the plan was then
+            back += 1
+            was = aborts_of(check.mission).plan.at(np.array([step["back_to_s"]]))[0, 0]
+            assert step["to_m"] == pytest.approx(was, abs=1e-5)
+    assert (back > 0) == (name == "bridge-inspection")
+
+
 def test_what_follows_if_one_does_not_hear() -> None:
     """The nearest of a vehicle that flies on is that of a search of all vehicles, at fine samples."""
     aborts = aborts_of(show())

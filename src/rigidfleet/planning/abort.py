@@ -107,12 +107,12 @@ class Step(NamedTuple):
 
 
 class Home(NamedTuple):
-    """Steps from rest, what their way is called, why there are none, and their number, which aborts may share."""
+    """Steps from rest, what their way is called, why there is none, and its number, which aborts may share."""
 
     steps: tuple[Step, ...] = ()
     way: str = ""
     reason: str = ""
-    number: int = 0
+    number: int | None = None
 
 
 @dataclass(frozen=True)
