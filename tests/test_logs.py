@@ -16,6 +16,7 @@ from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError, TrajectoryError
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.foreign.logs import enu_of
+from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.trajectories import of_curves
 
 LOGS = Path(__file__).parent / "data" / "logs"
@@ -45,7 +46,7 @@ def at_samples(read, i=0):
 
 def measured(read, i=0) -> SimpleNamespace:
     """Velocities and deviations of a vehicle."""
-    velocity, deviation = (np.asarray(x, dtype=float) for x in read.measured[i])
+    velocity, deviation = (np.asarray(x, dtype=float) for x in read.measured[i][:2])
     return SimpleNamespace(velocity=velocity, deviation=deviation)
 
 
@@ -280,6 +281,22 @@ def test_local_positions_of_px4_are_turned_and_timed(tmp_path):
     assert said(read, "the estimator moves its position by 0.52 m at 0.8 s")
     assert said(read, "--topic may name vehicle_local_position:1")
     assert read.read[0]["origin"] == pytest.approx([47.4, 8.55, 488.0])
+
+
+def test_a_reset_is_no_flight(tmp_path):
+    """A step that the estimator counts as its own fails no limit: it is undecided; the same step of a vehicle fails."""
+    pytest.importorskip("pyulog")
+    judged = []
+    for counts in (True, False):
+        rows = [row if counts else (*row[:14], 0, *row[15:]) for row in local_rows(valid=0)]
+        read = read_trajectories(
+            ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, rows)])
+        )
+        _, verdict = judge_log(read, None, Doubts(0.01, 0.0), limits={"speed": 3.0})
+        judged.append(verdict)
+    assert [verdict.word for verdict in judged] == ["undecided", "failed"]
+    assert judged[0].doubt["resets_s"] == [pytest.approx(6.1992)]
+    assert "as an estimator moves its position at 6.20 s" in judged[0].by_name["speed"].message
 
 
 def test_what_is_not_valid_is_not_read(tmp_path):
