@@ -27,8 +27,6 @@ _TURNS, _STEP, _FEW, _MANY = 12, 0.25, 150, 2000
 #: looks like a little of each.
 _MOVES, _UNTOLD = (0.02, 0.05, 0.05), np.array([0.1, 0.1, 0.1, np.inf, np.inf, np.inf])
 _FLOOR = np.array([1e-3, 5e-4, 2e-4, 1e-3, 1e-3, 1e-3])
-#: Parameters of one vehicle beside those of all: its offset and its shift.
-_OF_ONE = np.array([True, False, False, True, True, True])
 #: Errors from which on a vehicle's offset differs from that of others, and the least that does [s].
 _SURE, _LATE = 4.0, 0.01
 
@@ -84,7 +82,7 @@ def align(logs: Logs, plan: PlanStates, span: tuple[float, float], clock: str) -
     whole, errors, left = _fit(logs, plan, span, start, every)
     own = np.empty((2, len(logs)))
     for i, log in enumerate(logs):
-        alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, _OF_ONE)
+        alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, every)
         own[:, i] = np.where(np.isfinite(error[0]), [alone[0], error[0]], np.nan)
     own[0] += apart
     errors[0] = errors[0] if np.ptp(apart) == 0.0 else np.nan  # all have none in common

@@ -88,6 +88,7 @@ _MESSAGES = [
     *[(name, _Fields("geodetic", "Lat Lng Alt")) for name in ("POS", "GPS", "SIM")],
     *[(name, _POSE) for name in ("PoseStamped", "NamedPoseArray", "Odometry", "PoseWithCovarianceStamped",
                                  "TransformStamped", "TFMessage")],
+    ("NavSatFix", _GLOBAL._replace(spread="")),
 ]  # fmt: skip
 _RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
