@@ -199,10 +199,10 @@ def test_what_follows_if_one_does_not_hear() -> None:
         far = np.linalg.norm(r - on[:, i, None], axis=2) - 0.3
         best[i] = np.delete(far, i, axis=1).min()
     assert told.time <= 24.0
-    assert told.separation == pytest.approx(best.min(), abs=0.02)
-    assert told.agents[0] == best.argmin()
-    assert np.allclose([x.separation for x in each], best, atol=0.05)
-    assert [x.agents[0] for x in each] == list(range(n))
+    assert told.value == pytest.approx(best.min(), abs=0.02)
+    assert told.who == best.argmin()
+    assert np.allclose([x.value for x in each], best, atol=0.05)
+    assert [x.who for x in each] == list(range(n))
 
 
 def test_levels_keep_who_is_above() -> None:
@@ -318,7 +318,7 @@ def test_ways_home_stay_within_fences() -> None:
 def test_equal_stopped_places_are_planned_once() -> None:
     """Orders while all hold share the number of their ways."""
     aborts = aborts_of(show())
-    numbers = [aborts.at(t).number for t in (8.0, 8.25, 8.5, 8.75, 9.0)]
+    numbers = [aborts.at(t).home.number for t in (8.0, 8.25, 8.5, 8.75, 9.0)]
     assert len(set(numbers)) < 5
 
 

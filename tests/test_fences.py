@@ -18,6 +18,7 @@ from rigidfleet.math.bernstein import greatest_of
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
+from rigidfleet.mission.schema import GeodeticOrigin
 from rigidfleet.reporting import html_page
 from rigidfleet.simulation.together import simulate_together
 from rigidfleet.solids.polygons import Region, crossing
@@ -47,6 +48,11 @@ def curves(n, spread=6.0):
     return RNG.uniform(-2, 12, (n, 3, 1)) + RNG.normal(0, spread, (n, 3, 5))
 
 
+def signed(region, points):
+    """Signed distances of points (M, 3), which are curves of one control point."""
+    return region.most(points[:, :, None], outside=True)[0]
+
+
 def along(points, t):
     """Values (T, C) of one curve (C, P) at places (T,)."""
     p = points.shape[1] - 1
@@ -60,7 +66,7 @@ def test_a_signed_distance_is_that_of_the_nearest_edge(turned):
     rings = [ring[::-1] for ring in RINGS] if turned else RINGS
     points = RNG.uniform(-3, 13, (400, 3))
     expected = [distance(p, RINGS, 2.0, 7.0) for p in points]
-    assert Region.of_rings(rings, 2.0, 7.0).beyond(points) == pytest.approx(expected, abs=1e-12)
+    assert signed(Region.of_rings(rings, 2.0, 7.0), points) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("outside", [True, False])
@@ -68,7 +74,7 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
     """It is the greatest of 20,001 places, to a millimetre, and no bound along the way is below it."""
     region, sign = Region.of_rings(RINGS, 2.0, 7.0), 1.0 if outside else -1.0
     for points in curves(30):
-        dense = (sign * region.beyond(along(points, np.linspace(0, 1, 20_001)))).max()
+        dense = (sign * signed(region, along(points, np.linspace(0, 1, 20_001)))).max()
         value, bound = (x[0] for x in region.most(points[None], outside=outside))
         assert value <= dense + 1e-9
         assert bound >= dense - 1e-9
@@ -80,7 +86,7 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
         worst = greatest_of(points[None], measure, lambda _: 1e-3)
         assert dense - 1e-3 <= worst.value <= dense + 1e-3
         place = along(points, np.array([worst.place]))
-        assert sign * region.beyond(place)[0] == pytest.approx(worst.value, abs=1e-9)
+        assert sign * signed(region, place)[0] == pytest.approx(worst.value, abs=1e-9)
 
 
 def test_edges_that_cross_are_known():
@@ -315,6 +321,14 @@ def test_the_first_page_is_for_those_who_decide():
 
 def test_degrees_are_metres_on_the_ellipsoid():
     """Within a kilometre, they are those of the radii of curvature in the meridian and across it, to 1 cm."""
+
+    def metres(corner, *place):
+        origin = GeodeticOrigin(
+            **dict(zip(("latitude_deg", "longitude_deg", "altitude"), place, strict=True))
+        )
+        fence = fences.Fence(kind="inclusion", coordinates=[[[corner, [0, 0], [1, 1]]]])
+        return fence.rings(origin)[0][0]
+
     lat, lon, h = 47.4979, 19.0402, 120.0
     a, e2 = 6_378_137.0, 0.00669437999014
     s2 = math.sin(math.radians(lat)) ** 2
@@ -323,9 +337,9 @@ def test_degrees_are_metres_on_the_ellipsoid():
     for east, north in ((300.0, 0.0), (0.0, -250.0), (120.0, 90.0)):
         dlat = math.degrees(north / (along + h))
         dlon = math.degrees(east / ((across + h) * math.cos(math.radians(lat))))
-        place = fences.metres(np.array([[lon + dlon, lat + dlat]]), lat, lon, h)[0]
+        place = metres([lon + dlon, lat + dlat], lat, lon, h)
         assert place == pytest.approx([east, north], abs=0.01)
-    west = fences.metres(np.array([[-179.999, 0.0]]), 0.0, 179.999, 0.0)[0]
+    west = metres([-179.999, 0.0], 0.0, 179.999, 0.0)
     assert west[0] == pytest.approx(222.6, abs=0.1)  # across the date line
 
 
@@ -339,6 +353,7 @@ CLOSED = [*RING, RING[0]]
         ({"type": "Polygon", "coordinates": [CLOSED]}, [[RING]], None),
         ({"type": "Polygon", "coordinates": [CLOSED[::-1]]}, [[CLOSED[::-1][:-1]]], None),
         ({"type": "Polygon", "coordinates": [RING]}, [[RING]], "not closed"),
+        ({"type": "Polygon", "coordinates": [[RING[0], *CLOSED]]}, [[RING]], None),
         ({"type": "Polygon", "coordinates": [[[*p, 99.0] for p in CLOSED]]}, [[RING]], "altitudes"),
         ({"type": "MultiPolygon", "coordinates": [[CLOSED, CLOSED], [CLOSED]]}, [[RING, RING], [RING]], None),
         (
@@ -370,6 +385,12 @@ def test_polygons_of_geojson(data, polygons, note):
         ('{"type": "Point", "coordinates": [0, 0]}', "has no polygon"),
         ('{"type": "Polygon", "coordinates": [[[0], [1], [2]]]}', "no polygons"),
         ('{"type": "Polygon", "coordinates": []}', "has no polygon"),
+        ('{"type": "Polygon", "coordinates": [[]]}', "no polygons"),
+        (
+            '{"type": "Polygon", "coordinates": [[[500000, 5e6], [500100, 5e6], [500000, 6e6]]]}',
+            "in degrees",
+        ),
+        ('{"type": "Polygon", "coordinates": [[[NaN, 1], [2, 3], [3, 4]]]}', "in degrees"),
         (
             '{"type": "Polygon", "coordinates": [], "crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}}',
             "coordinate reference system",

@@ -25,6 +25,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import earlier_names
 from rigidfleet.math import riccati
 from rigidfleet.typing import Floats
 
@@ -177,7 +178,7 @@ def finite_horizon_trajectory(
     the regulator follows this moving target, not a fixed point.
     """
     t = _times("times", times)
-    return led(double_integrator_response(t, T, Q, R, S), t, start, target, T)
+    return trajectory_of_response(double_integrator_response(t, T, Q, R, S), t, start, target, T)
 
 
 def double_integrator_response(
@@ -185,7 +186,7 @@ def double_integrator_response(
 ) -> Response:
     """How a regulated double integrator responds at times (K,) [s] in [0, T]; S = None means an infinite horizon.
 
-    States (K, 2, 2) and inputs (K, 1, 2) from an error in position, and in velocity, of 1; see `led`.
+    States (K, 2, 2) and inputs (K, 1, 2) from an error of 1 in position, and in velocity; see `trajectory_of_response`.
     """
     if S is None:
         # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
@@ -193,7 +194,7 @@ def double_integrator_response(
     return _responses(*map(_key, (_A, _B, Q, R, np.zeros(_B.shape), S, T, times)))
 
 
-def led(
+def trajectory_of_response(
     response: Response,
     times: Floats,
     start: Sequence[ArrayLike] | Floats,
@@ -226,7 +227,7 @@ def infinite_horizon_trajectory(
     The target position is that at t = T; for a target at rest, T is only the end of ``times``.
     """
     t = _times("times", times)
-    return led(double_integrator_response(t, T, Q, R, None), t, start, target, T)
+    return trajectory_of_response(double_integrator_response(t, T, Q, R, None), t, start, target, T)
 
 
 def knots(
@@ -406,3 +407,6 @@ def _times(name: str, value: ArrayLike) -> Floats:
     if not np.all(np.isfinite(t)) or np.any(t < 0.0):
         raise ValueError(f"{name} must be finite and not negative [s]")
     return t
+
+
+__getattr__ = earlier_names(__name__, led="trajectory_of_response")

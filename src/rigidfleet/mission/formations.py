@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Sequence
-from itertools import combinations, islice
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,17 +31,9 @@ def sound(m: FindingCollector, name: str) -> bool:
     return m.right(("formations",), name)
 
 
-#: Number of points whose distances are all compared one by one.
-_FEW = 16
-
-
 def coincident(points: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
-    if len(p) <= _FEW and all(
-        math.dist(*pair) > 2.0 * apart for pair in combinations(p.tolist(), 2)
-    ):
-        return []
     # Cells first: a search tree of many equal points degenerates and compares all pairs.
     cell = np.round(p / apart)
     order = np.lexsort(cell.T)

@@ -1,13 +1,13 @@
 """The kinds of phases: their keys with unit and meaning, and the properties by which other modules tell them apart."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, join
 from rigidfleet.mission.values import (
@@ -29,6 +29,8 @@ from rigidfleet.mission.values import (
     Velocity,
     VelocityOrFree,
     key,
+    models_by_kind,
+    required_key,
 )
 
 #: Keys of a phase that may be automatic, and the word for it.
@@ -47,6 +49,7 @@ class Settle(Part):
     timeout: Time = key("time after which the mission fails [s]", 60.0)
 
 
+@with_earlier_names(led="follows_curves", spelled="flown_as_written", ended="keys_if_ended")
 class AnyPhase(Part):
     """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
@@ -69,12 +72,11 @@ class AnyPhase(Part):
     body_control: ClassVar[str] = "body"
 
     name: str = key("unique name; default: its kind and number", "")
-    until: Time | None = key("the phase ends at this mission time [s]", None)
+    until: Time | None = key("the phase ends at this mission time [s]")
     duration: Duration | None = key(
-        "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
-        None,
+        "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)"
     )
-    settle: Settle | None = key("the phase ends when its error has settled", None)
+    settle: Settle | None = key("the phase ends when its error has settled")
     control: Literal["open", "tracking", "body"] = key(
         "open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
         "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
@@ -85,12 +87,6 @@ class AnyPhase(Part):
         "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
     )
-
-    @property
-    def led(self) -> bool:
-        """The earlier name of `follows_curves`."""
-        warnings.warn("led is now follows_curves", DeprecationWarning, stacklevel=2)
-        return self.follows_curves
 
     @property
     def shaping(self) -> "Shaping | None":
@@ -152,7 +148,7 @@ class AnyPhase(Part):
         return self if isinstance(self, Vertical) else None
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether the phase is flown as written; others take its place before the flight (`planning.transitions`)."""
         return True
 
@@ -183,7 +179,16 @@ class AnyPhase(Part):
         """Target of the phase in words; "" if it stays."""
         return ""
 
-    def ended(self, length: float) -> dict[str, Any]:
+    @property
+    def ends(self) -> str:
+        """When the phase ends, in words: at a time, after a duration, or as it settles."""
+        if self.settle is not None:
+            return f"settled, within {self.settle.timeout:g} s"
+        if self.duration == AUTO:
+            return "as soon as the limits allow"
+        return f"at {self.until:g} s" if self.until is not None else f"after {self.duration:g} s"
+
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """Keys that change if the pilot ends the phase after another duration [s]: no motion is longer than it."""
         own = ((key, self.__dict__.get(key)) for key in ("travel", "blend"))
         return {key: min(seconds(time), length) for key, time in own if time is not None}
@@ -192,10 +197,10 @@ class AnyPhase(Part):
 class Attitude(Part):
     """Angles of an attitude; if one is given, the default of the others is 0."""
 
-    roll_deg: Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles", None)
-    pitch_deg: Angle | None = key("pitch at arrival [deg]", None)
+    roll_deg: Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: Angle | None = key("pitch at arrival [deg]")
     yaw_deg: Angle | None = key(
-        "yaw at arrival [deg]; if one angle is given, the default of the others is 0", None
+        "yaw at arrival [deg]; if one angle is given, the default of the others is 0"
     )
 
     @model_validator(mode="before")
@@ -213,12 +218,13 @@ class Attitude(Part):
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
 
+@with_earlier_names(aligned="fits_slots")
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
 
     shapes: ClassVar[bool] = True
 
-    formation: str = key("name of the formation to take")
+    formation: str = required_key("name of the formation to take")
     reference: Literal["shape", "distances", "squares", "step"] = key(
         "how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
         "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
@@ -230,7 +236,7 @@ class Shaping(AnyPhase):
     )
 
     position: Vector | None = key(
-        "centre of mass at the end, at rest [x, y, z] [m]; default: as before", None
+        "centre of mass at the end, at rest [x, y, z] [m]; default: as before"
     )
 
     @property
@@ -244,7 +250,7 @@ class Shaping(AnyPhase):
         return self.position
 
     @property
-    def aligned(self) -> bool:
+    def fits_slots(self) -> bool:
         """Whether the slots are rotated during the blend, so that they move least: unless `alignment` is none."""
         return self.__dict__.get("alignment") != "none"
 
@@ -254,10 +260,10 @@ class Shaping(AnyPhase):
         place = [] if self.position is None else [_vector(self.position, "m")]
         return ", ".join([self.formation, *place, *self.angles])
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
         return {"formation": self.formation} | (
-            {} if self.reference == "step" else super().ended(length)
+            {} if self.reference == "step" else super().keys_if_ended(length)
         )
 
 
@@ -266,7 +272,7 @@ class Establish(Attitude, Shaping):
 
     body_control: ClassVar[str] = "open"
 
-    kind: Literal["establish"] = key("take a formation")
+    kind: Literal["establish"] = required_key("take a formation")
     attitude: Literal["drawn", "free"] = key(
         "drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
         "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
@@ -278,7 +284,7 @@ class Establish(Attitude, Shaping):
 class Reshape(Shaping):
     """Change from one formation to another."""
 
-    kind: Literal["reshape"] = key("change the formation")
+    kind: Literal["reshape"] = required_key("change the formation")
     transition: Literal["straight", "layers", "ways", "auto"] = key(
         "ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
         "across, and together again, as three phases, with every pair proved; ways: bent ways for all together, found "
@@ -287,8 +293,7 @@ class Reshape(Shaping):
     )
     control_points: tuple[tuple[Vector, ...], ...] | None = key(
         "bent ways to the new slots over `blend`: control points of uniform cubic B-splines, a row of "
-        "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'",
-        None,
+        "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'"
     )
     alignment: Literal["fit", "none"] = key(
         "fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
@@ -297,7 +302,7 @@ class Reshape(Shaping):
     )
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether the ways are straight, or given."""
         return self.transition == "straight"
 
@@ -314,8 +319,7 @@ class Steering(Attitude, AnyPhase):
 
     travel: Duration | None = key(
         "time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
-        "limits",
-        None,
+        "limits"
     )
     rates_deg_s: Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
 
@@ -334,20 +338,18 @@ class Steering(Attitude, AnyPhase):
 class Through(Part):
     """A point that a `fly` phase passes without a stop."""
 
-    position: Vector = key("centre of mass [x, y, z] [m]")
+    position: Vector = required_key("centre of mass [x, y, z] [m]")
     time: Time | None = key(
-        "time from the start of the phase [s]; default: the times with the least snap", None
+        "time from the start of the phase [s]; default: the times with the least snap"
     )
-    velocity: Velocity | None = key(
-        "its velocity then [m/s]; default: the one with the least snap", None
-    )
+    velocity: Velocity | None = key("its velocity then [m/s]; default: the one with the least snap")
 
 
 class Fly(Steering):
     """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
 
-    kind: Literal["fly"] = key("fly to a waypoint")
-    position: Vector = key("centre of mass at arrival [x, y, z] [m]")
+    kind: Literal["fly"] = required_key("fly to a waypoint")
+    position: Vector = required_key("centre of mass at arrival [x, y, z] [m]")
     velocity: VelocityOrFree = key(
         "its velocity at arrival [m/s]; free: any, not judged", (0.0, 0.0, 0.0)
     )
@@ -384,15 +386,14 @@ class Go(Attitude, AnyPhase):
     replaced: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    kind: Literal["go"] = key("fly to a pose, on a way that is found round obstacles")
-    position: Vector = key("centre of mass at arrival [x, y, z] [m]")
+    kind: Literal["go"] = required_key("fly to a pose, on a way that is found round obstacles")
+    position: Vector = required_key("centre of mass at arrival [x, y, z] [m]")
     clearance: LengthOrZero = key(
         "least distance of vehicles from obstacles on the planned way [m]", 0.2
     )
     formations: tuple[str, ...] | None = key(
         "formations that may be taken on the way; default: all that have slots. The phase ends in the "
-        "formation in which it begins",
-        None,
+        "formation in which it begins"
     )
     scales: tuple[Scale, ...] = key(
         "factors by which formations may shrink on the way, below 1; default: none", ()
@@ -407,13 +408,13 @@ class Go(Attitude, AnyPhase):
 class Turn(Steering):
     """Turn on the spot to an attitude. At least one angle is required."""
 
-    kind: Literal["turn"] = key("turn on the spot")
+    kind: Literal["turn"] = required_key("turn on the spot")
 
 
 class Hold(AnyPhase):
     """Stay at the commanded position and attitude."""
 
-    kind: Literal["hold"] = key("stay at the commanded position and attitude")
+    kind: Literal["hold"] = required_key("stay at the commanded position and attitude")
 
 
 class Arriving(AnyPhase):
@@ -422,15 +423,13 @@ class Arriving(AnyPhase):
     moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    travel: Time | None = key(
-        "time from the start to the arrival [s]; default: the whole phase", None
-    )
+    travel: Time | None = key("time from the start to the arrival [s]; default: the whole phase")
 
 
 class Brake(Arriving):
     """Come to rest where braking leads, in position and attitude, with the least snap."""
 
-    kind: Literal["brake"] = key("come to rest where braking leads")
+    kind: Literal["brake"] = required_key("come to rest where braking leads")
 
 
 class Vertical(Arriving):
@@ -443,8 +442,7 @@ class Vertical(Arriving):
     )
     stagger: Time | None = key(
         "time [s] from one group's start to the next's; all arrive by the end of the phase, each before "
-        "the next starts. Default: all start together",
-        None,
+        "the next starts. Default: all start together"
     )
     by: Literal["rows", "vehicles"] = key(
         "groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
@@ -453,7 +451,7 @@ class Vertical(Arriving):
     )
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether there is one group, which does not land elsewhere."""
         return self.stagger is None and self.__dict__.get("places") != "own"
 
@@ -476,8 +474,8 @@ class Vertical(Arriving):
 class Takeoff(Vertical):
     """Climb straight up from the ground, until all vehicles are at one height."""
 
-    kind: Literal["takeoff"] = key("climb straight up to a level height")
-    height: Length = key("height of the vehicles' centres above the ground on arrival [m]")
+    kind: Literal["takeoff"] = required_key("climb straight up to a level height")
+    height: Length = required_key("height of the vehicles' centres above the ground on arrival [m]")
 
     @property
     def level(self) -> float | None:
@@ -500,7 +498,7 @@ class Land(Vertical):
 
     lands: ClassVar[bool] = True
 
-    kind: Literal["land"] = key("descend straight down to the ground")
+    kind: Literal["land"] = required_key("descend straight down to the ground")
     places: Literal["below", "own"] = key(
         "below: each vehicle lands where it is, often where another one stood; own: each goes to where it stood at the "
         "start, straight or by levels, on ways that are proved, and then down",
@@ -526,25 +524,21 @@ class Follow(Cruising):
 
     follows_curves: ClassVar[bool] = True
 
-    kind: Literal["follow"] = key("follow trajectories of a file")
+    kind: Literal["follow"] = required_key("follow trajectories of a file")
     file: str | None = key(
         "file of the trajectories, relative to the mission file: one for the virtual body, or one for each "
-        "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place",
-        None,
+        "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place"
     )
     units: str | None = key(
-        "units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'",
-        None,
+        "units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'"
     )
     axes: str | None = key(
-        "where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d",
-        None,
+        "where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d"
     )
     trajectories: Trajectories | None = key(
         "of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
         "the coefficients of x, y, z [m] and yaw [rad], in ascending powers of the time since its beginning, equally "
-        "many of each (at most 8)",
-        None,
+        "many of each (at most 8)"
     )
     yaw: Literal["fixed", "file"] = key(
         "fixed: keeps the attitude commanded before; file: the virtual body is level and has the yaw of "
@@ -553,8 +547,7 @@ class Follow(Cruising):
     )
     travel: Time | None = key(
         "time from the start to the end of the trajectories [s]; default: the whole phase, whose default "
-        "is the time in the file. With another time, all speeds scale",
-        None,
+        "is the time in the file. With another time, all speeds scale"
     )
 
     @model_validator(mode="before")
@@ -586,7 +579,7 @@ class Follow(Cruising):
         n = len(self.trajectories or ())
         return "along a trajectory" if n == 1 else f"along {n} trajectories"
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The time of the whole trajectories, so that they are flown as fast up to the new end."""
         whole = self.travel or self.duration
         return {"travel": length if whole is None else seconds(whole)}
@@ -604,10 +597,10 @@ def _time_of(trajectories: Any) -> float:
 class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
-    kind: Literal["orbit"] = key("circle a point")
-    centre: Vector = key("centre of the horizontal circle [x, y, z] [m]")
-    radius: Length = key("radius of the circle [m]")
-    rate_deg_s: Angle = key(
+    kind: Literal["orbit"] = required_key("circle a point")
+    centre: Vector = required_key("centre of the horizontal circle [x, y, z] [m]")
+    radius: Length = required_key("radius of the circle [m]")
+    rate_deg_s: Angle = required_key(
         "angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
     )
     yaw: Literal["fixed", "along"] = key(
@@ -646,7 +639,4 @@ Phase = Annotated[
     Field(discriminator="kind"),
 ]
 #: Models of all phases by `kind`.
-KINDS: dict[str, type[AnyPhase]] = {
-    get_args(model.model_fields["kind"].annotation)[0]: model
-    for model in get_args(get_args(Phase)[0])
-}
+KINDS: dict[str, type[AnyPhase]] = models_by_kind(Phase)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
+from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from pydantic import PrivateAttr
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.kept import kept
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
@@ -23,12 +25,11 @@ from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import with_own_names, with_scales
-from rigidfleet.mission.check import check, defaults
-from rigidfleet.mission.describe import ending, goal, size_in_words
+from rigidfleet.mission.check import checked_parts, defaults
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
-from rigidfleet.mission.phases import latest_end
+from rigidfleet.mission.phases import end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -84,6 +85,7 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 _STANDING = 0.5
 
 
+@with_earlier_names(linked="has_link")
 class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -132,7 +134,7 @@ class Mission(Contents, Shown):
         MissionError
             With a finding for each error.
         """
-        parts = check(data, origin)
+        parts = checked_parts(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = with_own_names(
                 parts["formations"], parts["phases"]
@@ -197,7 +199,16 @@ class Mission(Contents, Shown):
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""
-        return size_in_words(self.n_agents, len(self.formations), self.phases)
+        counts = {
+            "agent": self.n_agents,
+            "formation": len(self.formations),
+            "phase": len(self.phases),
+        }
+        words = [f"{n} {thing}{'s' * (n != 1)}" for thing, n in counts.items()]
+        most = "at most " if any(phase.settle for phase in self.phases) else ""
+        end = self.latest_end
+        lasts = "as long as its limits ask" if math.isnan(end) else f"{most}{end:g} s"
+        return ", ".join([*words, lasts])
 
     def __repr__(self) -> str:
         return f"<Mission {self.name}: {self.size_in_words}>"
@@ -212,7 +223,7 @@ class Mission(Contents, Shown):
     def phase_table(self) -> FactTable:
         """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
-            Row((n, p.name, p.kind, goal(p), ending(p), p.control))
+            Row((n, p.name, p.kind, p.leads_to, p.ends, p.control))
             for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
@@ -228,6 +239,11 @@ class Mission(Contents, Shown):
         if not self._text:
             self._text = self._about + to_toml(self._data)
         return self._text
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of its text."""
+        return sha256(self.text.encode()).hexdigest()
 
     @property
     def about(self) -> str:
@@ -452,7 +468,7 @@ class Mission(Contents, Shown):
 
         It is nan while a duration before it is automatic (`rigidfleet.planning.timing.complete_times`).
         """
-        return latest_end(self.phases)
+        return end_of_phases(self.phases)
 
     @cached_property
     def fleet(self) -> Fleet:
@@ -554,7 +570,7 @@ class Mission(Contents, Shown):
         pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
         return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
 
-    def linked(self, edges: Ints, t: float) -> Bools:
+    def has_link(self, edges: Ints, t: float) -> Bools:
         """Mask (m,) of the edges (m, 2), i < j, whose link is not lost at a time [s]."""
         pairs, times = self.links_lost
         n = self.n_agents

@@ -77,6 +77,7 @@ from rigidfleet.mission.values import (
     key,
     number_or_list,
     of_either_sign,
+    required_key,
 )
 from rigidfleet.typing import Floats, Ints
 
@@ -89,11 +90,13 @@ DRAG = 0.3
 class Start(Part):
     """Start positions of the agents on the slots of a named shape, in their order."""
 
-    shape: str = key(
+    shape: str = required_key(
         f"named shape: {', '.join(shapes.SHAPES)}", json_schema_extra={"enum": [*shapes.SHAPES]}
     )
-    size: Size = key("edge length of the shape [m], or its three sizes")
-    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = key("number of agents")
+    size: Size = required_key("edge length of the shape [m], or its three sizes")
+    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = required_key(
+        "number of agents"
+    )
     centre: Vector = key("centre of the shape [x, y, z] [m]", (0.0, 0.0, 0.0))
 
     def points(self) -> Floats:
@@ -110,49 +113,42 @@ class Start(Part):
 class Vehicle(Part):
     """A model of vehicle. Keys that are not given are those of the model; `rigidfleet.mission.vehicles` has them."""
 
-    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = key(
+    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = required_key(
         "point: a point mass that gives any force at once; the others are quadrotors: paper: the paper's, "
         "1 kg with four rotors of 5.9 N; px4-sih: PX4's simulation in hardware; hummingbird: AscTec Hummingbird; "
         "crazyflie: Crazyflie 2; x500: Holybro X500"
     )
-    mass: Mass | None = key("mass [kg]; required for a point", None)
-    inertia: Inertia | None = key(
-        "moments of inertia about the body's axes [x, y, z] [kg m^2]", None
-    )
-    arm: Length | None = key(
-        "distance of each rotor from the centre of mass [m]; rotors form an X", None
-    )
+    mass: Mass | None = key("mass [kg]; required for a point")
+    inertia: Inertia | None = key("moments of inertia about the body's axes [x, y, z] [kg m^2]")
+    arm: Length | None = key("distance of each rotor from the centre of mass [m]; rotors form an X")
     thrust_coefficient: Small | None = key(
-        "k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed", None
+        "k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed"
     )
     torque_coefficient: Small | None = key(
-        "k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed", None
+        "k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed"
     )
-    rotor_speed: RotorSpeeds | None = key("[least, greatest] speed of a rotor [rad/s]", None)
+    rotor_speed: RotorSpeeds | None = key("[least, greatest] speed of a rotor [rad/s]")
     motor_time: MotorTimes | None = key(
-        "time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down",
-        None,
+        "time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down"
     )
     rotor_drag: Coefficient | None = key(
-        "k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis", None
+        "k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis"
     )
-    rotor_inflow: Coefficient | None = key("k_z [kg/rad]: the same along its axis", None)
+    rotor_inflow: Coefficient | None = key("k_z [kg/rad]: the same along its axis")
     rotor_lift: Coefficient | None = key(
-        "k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it", None
+        "k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it"
     )
     body_drag: BodyDrag | None = key(
-        "drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]", None
+        "drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]"
     )
-    rotor_radius: Length | None = key("radius of a rotor [m], for downwash and ground effect", None)
+    rotor_radius: Length | None = key("radius of a rotor [m], for downwash and ground effect")
     attitude_gains: AttitudeGains | None = key(
-        "[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]", None
+        "[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]"
     )
-    tilt_limit_deg: Tilt | None = key("maximum tilt that the attitude control commands [deg]", None)
-    thrust_limit: Limit | None = key(
-        "maximum thrust [N], only for a point; default: unlimited", None
-    )
+    tilt_limit_deg: Tilt | None = key("maximum tilt that the attitude control commands [deg]")
+    thrust_limit: Limit | None = key("maximum thrust [N], only for a point; default: unlimited")
     drag: Weight | None = key(
-        "drag force per velocity relative to the air [N s/m], only for a point; default: 0", None
+        "drag force per velocity relative to the air [N s/m], only for a point; default: 0"
     )
 
 
@@ -197,13 +193,12 @@ class Avoidance(Part):
         True,
     )
     separation: LengthOrZero | None = key(
-        "separation of agents to keep [m]; default: that of [limits], or 0", None
+        "separation of agents to keep [m]; default: that of [limits], or 0"
     )
     clearance: LengthOrZero = key("distance of an agent's surface from obstacles to keep [m]", 0.0)
     margin: LengthOrZero | None = key(
         "by which each agent is taken to be larger [m]; default: three times the noise of positions, and "
-        "0.02 m for a quadrotor",
-        None,
+        "0.02 m for a quadrotor"
     )
     rate: Annotated[float, Strict(), Field(gt=0, le=100)] = key(
         "rate at which a barrier is approached [1/s]: lower, and vehicles give way earlier", 3.0
@@ -221,8 +216,7 @@ class Avoidance(Part):
     )
     sensing_range: Length | None = key(
         "distance of an agent's centre from an obstacle that moves within which all see it [m]; default: "
-        "its motion is known in advance",
-        None,
+        "its motion is known in advance"
     )
     sensing_noise: LengthOrZero = key(
         "standard deviation of the place of an obstacle seen, along each axis [m]", 0.0
@@ -237,7 +231,7 @@ class Avoidance(Part):
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
-    mass: Annotated[tuple[Mass, ...], number_or_list(MASS.least)] = key(
+    mass: Annotated[tuple[Mass, ...], number_or_list(MASS.least)] = required_key(
         "mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
         "vehicle's"
     )
@@ -246,7 +240,7 @@ class Agents(Part):
         "give any force at once",
         (),
     )
-    position: Annotated[tuple[Vector, ...], Field(min_length=1)] = key(
+    position: Annotated[tuple[Vector, ...], Field(min_length=1)] = required_key(
         "initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
         "shape in which the agents start, or the name of a file of points: CSV, NPY or PLY, relative to the mission "
         "file"
@@ -346,7 +340,7 @@ class Lqr(Regulator):
 
     attitude: Regulator = key(
         "regulator of the attitude; missing keys are those of lqr",
-        default_factory=Regulator.model_construct,
+        Regulator.model_construct,
     )
 
     @model_validator(mode="before")
@@ -394,16 +388,14 @@ class IntegratorOptions(Part):
     atol: Tolerance = key("absolute tolerance [m, m/s]", 1e-10)
     atol_velocity: Tolerance | None = key(
         "absolute tolerance of velocities [m/s]; default: atol, in a large formation that of positions "
-        "times beta",
-        None,
+        "times beta"
     )
     atol_integral: Tolerance | None = key(
         "absolute tolerance of the integrals of c [m s]; default: atol, plus rtol times the distance if "
-        "the solver is not dense",
-        None,
+        "the solver is not dense"
     )
     atol_attitude: Tolerance | None = key(
-        "absolute tolerance of the quaternion of the body frame [-]; default: atol", None
+        "absolute tolerance of the quaternion of the body frame [-]; default: atol"
     )
 
 
@@ -423,14 +415,12 @@ class Formation(Part):
 
     shape: str | None = key(
         f"named shape: {', '.join(shapes.SHAPES)}",
-        None,
         json_schema_extra={"enum": [*shapes.SHAPES]},
     )
-    size: Size | None = key("edge length of the shape [m]; for a cuboid also [x, y, z]", None)
+    size: Size | None = key("edge length of the shape [m]; for a cuboid also [x, y, z]")
     slots: tuple[Vector, ...] | None = key(
         "instead of a shape: desired position of each agent in the body frame [m], or the name of a "
-        "file of points: CSV, NPY or PLY, relative to the mission file and not outside its folder",
-        None,
+        "file of points: CSV, NPY or PLY, relative to the mission file and not outside its folder"
     )
     edges: Edges = key(
         "list of pairs of agents, counted from 1; 'complete': all pairs; 'neighbours': pairs within reach; "
@@ -444,31 +434,26 @@ class Formation(Part):
         graphs.REACH,
     )
     distances: tuple[Length, ...] | None = key(
-        "length of each edge [m]; default: those between the slots", None
+        "length of each edge [m]; default: those between the slots"
     )
     dimension: Literal[2, 3] | None = key(
-        "dimension of the space in which the agents keep this formation; default: that of the mission",
-        None,
+        "dimension of the space in which the agents keep this formation; default: that of the mission"
     )
     agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = key(
-        "number of vehicles in the shape, if the others rest; default: all", None
+        "number of vehicles in the shape, if the others rest; default: all"
     )
     rest: Rest | None = key(
         "where vehicles wait for which there are no slots, in the axes of the slots: a list of points [m]; "
-        "'sides': left and right of the formation, along x, mirrored so that its middle stays the same",
-        None,
+        "'sides': left and right of the formation, along x, mirrored so that its middle stays the same"
     )
-    tolerance: Length | None = key(
-        "greatest error of a distance [m]; default: by tolerance_share", None
-    )
+    tolerance: Length | None = key("greatest error of a distance [m]; default: by tolerance_share")
     tolerance_share: Share = key(
         "the same, as a share of the shortest distance [-]", SHAPE_TOLERANCE, gt=0
     )
     colour: Colour | None = key(
         "light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
         "default: that of the file of slots if it has colours, else the light before. Vehicles that rest are dark. "
-        "Replay, figures and the exports skyc and gltf show it",
-        None,
+        "Replay, figures and the exports skyc and gltf show it"
     )
 
     def greatest_error(self, shortest: float) -> float:
@@ -482,13 +467,7 @@ class Formation(Part):
         if isinstance(self.edges, str):
             slots = self.slot_array(n)
             assert slots is not None  # checked: there is a shape or slots
-            if self.edges == "neighbours":
-                return graphs.neighbours(slots, self.reach)
-            return (
-                graphs.henneberg(slots)
-                if self.edges == "henneberg"
-                else graphs.henneberg_multilevel(slots)
-            )
+            return graphs.GRAPHS[self.edges](slots, self.reach)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     @property
@@ -508,44 +487,38 @@ class Formation(Part):
 class Geofence(Part):
     """A box that no agent may leave."""
 
-    min: Vector = key("lowest corner [x, y, z] [m]")
-    max: Vector = key("highest corner [x, y, z] [m]")
+    min: Vector = required_key("lowest corner [x, y, z] [m]")
+    max: Vector = required_key("highest corner [x, y, z] [m]")
 
 
 class Limits(Part):
     """Limits for each agent: the verdict checks the flight, and `check` the plan of a smooth mission."""
 
-    speed: Speed | None = key("maximum speed [m/s]", None)
-    acceleration: Acceleration | None = key("maximum acceleration [m/s^2]", None)
-    horizontal_speed: Speed | None = key("maximum speed over the ground [m/s]", None)
-    vertical_speed: Speed | None = key("maximum speed up and down [m/s]", None)
-    horizontal_acceleration: Acceleration | None = key(
-        "maximum horizontal acceleration [m/s^2]", None
-    )
-    vertical_acceleration: Acceleration | None = key(
-        "maximum acceleration up and down [m/s^2]", None
-    )
+    speed: Speed | None = key("maximum speed [m/s]")
+    acceleration: Acceleration | None = key("maximum acceleration [m/s^2]")
+    horizontal_speed: Speed | None = key("maximum speed over the ground [m/s]")
+    vertical_speed: Speed | None = key("maximum speed up and down [m/s]")
+    horizontal_acceleration: Acceleration | None = key("maximum horizontal acceleration [m/s^2]")
+    vertical_acceleration: Acceleration | None = key("maximum acceleration up and down [m/s^2]")
     jerk: Jerk | None = key(
-        "maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission", None
+        "maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission"
     )
     horizontal_jerk: Jerk | None = key(
-        "maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`", None
+        "maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`"
     )
     vertical_jerk: Jerk | None = key(
-        "maximum jerk of the reference up and down [m/s^3]; kept like `jerk`", None
+        "maximum jerk of the reference up and down [m/s^3]; kept like `jerk`"
     )
     tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = key(
         "maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
-        "a smooth mission",
-        None,
+        "a smooth mission"
     )
     separation: LengthOrZero | None = key(
-        "minimum separation of agents [m]: centre distance minus radii", None
+        "minimum separation of agents [m]: centre distance minus radii"
     )
     separation_altitude: Coordinate | None = key(
         "altitude z [m] from which on `separation` holds: two agents that are both below it, as on their "
-        "pads, may be nearer, but not touch; default: it always holds",
-        None,
+        "pads, may be nearer, but not touch; default: it always holds"
     )
     separation_allowance: LengthOrZero = key(
         "how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
@@ -553,9 +526,9 @@ class Limits(Part):
         0.1,
     )
     separation_below: LengthOrZero | None = key(
-        "minimum separation from an agent straight below [m]: height minus radii (downwash)", None
+        "minimum separation from an agent straight below [m]: height minus radii (downwash)"
     )
-    geofence: Geofence | None = key("box that no agent may leave", None)
+    geofence: Geofence | None = key("box that no agent may leave")
     people: LengthOrZero = key(
         "least distance, as seen from above, at which a vehicle that fails falls past people [m]: less its radius",
         0.0,
@@ -565,7 +538,7 @@ class Limits(Part):
         0.01,
     )
     tracking_error: Length | None = key(
-        "maximum distance of a vehicle from the slot that it tracks [m]", None
+        "maximum distance of a vehicle from the slot that it tracks [m]"
     )
 
     @property
@@ -577,34 +550,29 @@ class Limits(Part):
 class Gusts(Part):
     """Gusts: the velocity of the air at each agent in addition to the steady wind, stationary from the start."""
 
-    model: Literal["first-order", "dryden"] = key(
+    model: Literal["first-order", "dryden"] = required_key(
         "first-order: one correlation time for all directions; dryden: spectra of MIL-F-8785C along the "
         "wind, across it and vertical"
     )
     intensity: PerAxis | None = key(
         "standard deviation [m/s]: a number, or [along the wind, across, vertical]; default: from altitude "
-        "and wind speed",
-        None,
+        "and wind speed"
     )
-    time_scale: Time | None = key("correlation time of first-order gusts [s]", None)
+    time_scale: Time | None = key("correlation time of first-order gusts [s]")
     length: Size | None = key(
-        "scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]", None
+        "scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]"
     )
     altitude: Annotated[float, Strict(), Field(ge=3.048, le=304.8)] | None = key(
         "instead of length: height above ground [m], 3.048 to 304.8, which determines the lengths by "
-        "MIL-F-8785C",
-        None,
+        "MIL-F-8785C"
     )
-    airspeed: Speed | None = key(
-        "speed at which Dryden gusts pass by [m/s]; default: wind speed", None
-    )
+    airspeed: Speed | None = key("speed at which Dryden gusts pass by [m/s]; default: wind speed")
     correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = key(
-        "correlation of the gusts at any two agents [-], 0 to 1; default: 0", None
+        "correlation of the gusts at any two agents [-], 0 to 1; default: 0"
     )
     correlation_length: Length | None = key(
         "instead of correlation: length [m] in correlation = exp(-distance / length), with the distances "
-        "of slots in the first established formation",
-        None,
+        "of slots in the first established formation"
     )
     seed: Seed = key("seed of the random numbers; the same seed gives the same gusts", 0)
 
@@ -631,8 +599,8 @@ class Noise(Part):
 class LostLink(Part):
     """Loss of a link: from this time on, two vehicles know nothing of each other, and no edge joins them."""
 
-    between: tuple[Whole, Whole] = key("the two agents, counted from 1")
-    time: Time = key("mission time of the loss [s], > 0")
+    between: tuple[Whole, Whole] = required_key("the two agents, counted from 1")
+    time: Time = required_key("mission time of the loss [s], > 0")
 
 
 class Outage(Part):
@@ -641,8 +609,8 @@ class Outage(Part):
     between: tuple[Whole, ...] = key(
         "one or two agents, counted from 1; default: all", (), max_length=2
     )
-    start: Seconds = key("mission time from which no message is sent [s]")
-    end: Time = key("mission time from which messages are sent again [s]")
+    start: Seconds = required_key("mission time from which no message is sent [s]")
+    end: Time = required_key("mission time from which messages are sent again [s]")
 
 
 class Clocks(Part):
@@ -663,8 +631,7 @@ class Clocks(Part):
     )
     wait: Length | None = key(
         "distance of a vehicle from its slot at which all clocks stand still, that hear of it [m]; from half of it on "
-        "they slow down; default: nobody waits",
-        None,
+        "they slow down; default: nobody waits"
     )
 
 
@@ -682,27 +649,23 @@ class Network(Part):
     )
     loss: Share = key("share of the messages that a link loses, 0 to 0.95", 0.0)
     burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = key(
-        "mean number of messages lost one after the other; default: losses are independent", None
+        "mean number of messages lost one after the other; default: losses are independent"
     )
-    range: Length | None = key("distance beyond which no message is heard [m]; default: none", None)
+    range: Length | None = key("distance beyond which no message is heard [m]; default: none")
     budget: Annotated[float, Strict(), Field(gt=0, le=1e9)] | None = key(
         "broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
-        "no limit",
-        None,
+        "no limit"
     )
     silence: Time = key("time without a message after which a vehicle lets go of an edge [s]", 0.5)
     event: Length | None = key(
         "distance [m] by which neighbours guess a vehicle wrongly before it sends, or before `silence` would run out; "
-        "default: it sends each time",
-        None,
+        "default: it sends each time"
     )
     seed: Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
     outages: tuple[Outage, ...] = key(
         "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()
     )
-    clocks: Clocks | None = key(
-        "clocks of the vehicles: [network.clocks]; default: one for all", None
-    )
+    clocks: Clocks | None = key("clocks of the vehicles: [network.clocks]; default: one for all")
     lost: tuple[LostLink, ...] = key(
         "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
@@ -715,16 +678,16 @@ class Network(Part):
 class Lost(Part):
     """Loss of a vehicle: from this time on it has neither thrust nor edges."""
 
-    agent: Whole = key("agent that is lost, counted from 1")
-    time: Time = key("mission time of the loss [s], > 0")
+    agent: Whole = required_key("agent that is lost, counted from 1")
+    time: Time = required_key("mission time of the loss [s], > 0")
 
 
 class Stuck(Part):
     """A vehicle that does not follow its slot for some time: it holds its place."""
 
-    agent: Whole = key("agent that is stuck, counted from 1")
-    time: Seconds = key("mission time from which on it is [s]")
-    duration: Time = key("for how long [s]")
+    agent: Whole = required_key("agent that is stuck, counted from 1")
+    time: Seconds = required_key("mission time from which on it is [s]")
+    duration: Time = required_key("for how long [s]")
 
 
 class Disturbances(Part):
@@ -735,16 +698,15 @@ class Disturbances(Part):
     )
     drag: PerAgent | None = key(
         "drag force per velocity relative to the air [N s/m]: a number or a list; default: 0.3 per kg of "
-        "mass if there is wind or gusts, else 0",
-        None,
+        "mass if there is wind or gusts, else 0"
     )
     mass_error: PerAgentError = key(
         "relative error of mass [-], > -1: a number or a list; true mass = mass (1 + mass_error), control "
         "laws use mass",
         0.0,
     )
-    gusts: Gusts | None = key("gusts: [disturbances.gusts]", None)
-    noise: Noise | None = key("measurement noise: [disturbances.noise]", None)
+    gusts: Gusts | None = key("gusts: [disturbances.gusts]")
+    noise: Noise | None = key("measurement noise: [disturbances.noise]")
     downwash: Flag = key(
         "true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]", False
     )
@@ -766,19 +728,17 @@ class Disturbances(Part):
         "continue",
     )
     hold_until: Time | None = key(
-        "mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission",
-        None,
+        "mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission"
     )
     landing_formation: str | None = key(
-        "level formation that on_loss 'land' takes before the descent; default: the one that is held",
-        None,
+        "level formation that on_loss 'land' takes before the descent; default: the one that is held"
     )
 
 
 class Aborting(Part):
     """How the flight is aborted, at any time: `check --abort` plans it, `run --abort-at` flies it."""
 
-    at: Seconds | None = key("mission time at which an abort is ordered [s]; default: never", None)
+    at: Seconds | None = key("mission time at which an abort is ordered [s]; default: never")
     step: Time = key("time between the aborts that `check --abort` plans [s]", 1.0)
     reaction: Annotated[float, Strict(), Field(ge=0, le=60)] = key(
         "time after which all vehicles have the order, or notice a loss, and act at once [s]", 0.5
@@ -798,8 +758,8 @@ class Aborting(Part):
 class MissionHeader(Part):
     """Keys at the top of a mission file."""
 
-    schema_version: Literal[1] = key("version of this format: 1")
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = key(
+    schema_version: Literal[1] = required_key("version of this format: 1")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = required_key(
         "short name, used for the files of results: letters, digits, '.', '_', '-'"
     )
     title: Annotated[str, Field(pattern=r"^[^\r\n]*$")] = key(
@@ -844,8 +804,12 @@ class MissionHeader(Part):
 class GeodeticOrigin(Part):
     """Place on the Earth of the mission's origin, for exports; x points east, y north and z up there."""
 
-    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = key("latitude [deg], WGS 84")
-    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = key("longitude [deg]")
+    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = required_key(
+        "latitude [deg], WGS 84"
+    )
+    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = required_key(
+        "longitude [deg]"
+    )
     altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = key(
         "height of z = 0 above mean sea level [m]", 0.0
     )
@@ -860,56 +824,43 @@ class VehicleYaw(Part):
         "formation",
     )
     yaw_deg: Angle = key("yaw [deg] of kind 'fixed'", 0.0)
-    point: Vector | None = key("the point [x, y, z] [m] of kind 'towards'", None)
+    point: Vector | None = key("the point [x, y, z] [m] of kind 'towards'")
 
 
 class Contents(MissionHeader):
     """A whole mission file."""
 
-    agents: Agents = key("the vehicles: [agents]")
-    vehicles: dict[str, Vehicle] = key(
-        "models of vehicles by name: [vehicles.NAME]", default_factory=dict
-    )
-    autopilot: Autopilot = key(
-        "sampled control on board: [autopilot]", default_factory=Autopilot.model_construct
-    )
-    avoidance: Avoidance | None = key("barriers and guard in flight: [avoidance]", None)
-    constraint: Constraint = key(
-        "the constraint force: [constraint]", default_factory=Constraint.model_construct
-    )
-    lqr: Lqr = key("regulator of the virtual body: [lqr]", default_factory=Lqr.model_construct)
-    tracking: Tracking = key(
-        "regulator of each agent: [tracking]", default_factory=Tracking.model_construct
-    )
+    agents: Agents = required_key("the vehicles: [agents]")
+    vehicles: dict[str, Vehicle] = key("models of vehicles by name: [vehicles.NAME]", dict)
+    autopilot: Autopilot = key("sampled control on board: [autopilot]", Autopilot.model_construct)
+    avoidance: Avoidance | None = key("barriers and guard in flight: [avoidance]")
+    constraint: Constraint = key("the constraint force: [constraint]", Constraint.model_construct)
+    lqr: Lqr = key("regulator of the virtual body: [lqr]", Lqr.model_construct)
+    tracking: Tracking = key("regulator of each agent: [tracking]", Tracking.model_construct)
     allocation: Allocation = key(
-        "from wrench to forces on agents: [allocation]", default_factory=Allocation.model_construct
+        "from wrench to forces on agents: [allocation]", Allocation.model_construct
     )
     integrator: IntegratorOptions = key(
         "tolerances of the integrator: [integrator]",
-        default_factory=IntegratorOptions.model_construct,
+        IntegratorOptions.model_construct,
     )
-    body_frame: BodyFrame | None = key("attitude of the body frame at t = 0: [body_frame]", None)
-    formations: dict[str, Formation] = key(
-        "formations by name: [formations.NAME]", default_factory=dict
-    )
+    body_frame: BodyFrame | None = key("attitude of the body frame at t = 0: [body_frame]")
+    formations: dict[str, Formation] = key("formations by name: [formations.NAME]", dict)
     obstacles: tuple[Obstacle, ...] = key("obstacles: [[obstacles]]", ())
     fences: tuple[Fence, ...] = key("fences of polygons: [[fences]]", ())
     people: tuple[People, ...] = key("places where people are: [[people]]", ())
-    limits: Limits = key(
-        "limits that the verdict checks: [limits]", default_factory=Limits.model_construct
-    )
-    yaw: VehicleYaw = key("yaw of each vehicle: [yaw]", default_factory=VehicleYaw.model_construct)
+    limits: Limits = key("limits that the verdict checks: [limits]", Limits.model_construct)
+    yaw: VehicleYaw = key("yaw of each vehicle: [yaw]", VehicleYaw.model_construct)
     geodetic_origin: GeodeticOrigin | None = key(
-        "place of the origin on the Earth, for exports: [geodetic_origin]", None
+        "place of the origin on the Earth, for exports: [geodetic_origin]"
     )
     network: Network | None = key(
-        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
-        None,
+        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states"
     )
     disturbances: Disturbances | None = key(
-        "wind, gusts, noise, mass errors, lost vehicles: [disturbances]", None
+        "wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
     )
-    abort: Aborting | None = key("how the flight is aborted: [abort]", None)
-    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = key(
+    abort: Aborting | None = key("how the flight is aborted: [abort]")
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = required_key(
         "phases of the flight, in order: [[phases]]"
     )

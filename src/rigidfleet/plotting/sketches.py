@@ -12,7 +12,6 @@ from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.space import camera, marker_look
-from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.result.lights import seen_from
 from rigidfleet.typing import Floats
@@ -69,7 +68,7 @@ def tiled_figure(
     ]
 
 
-@in_style
+@st.in_style
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)

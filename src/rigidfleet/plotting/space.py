@@ -10,7 +10,6 @@ import numpy as np
 
 from rigidfleet.plotting import areas, solids
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.result.lights import view as seen
@@ -419,7 +418,7 @@ def legend_handles(result: Result, view: Scene) -> list[Any]:
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
-@in_style
+@st.in_style
 def trajectory(result: Result) -> Figure:
     """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)

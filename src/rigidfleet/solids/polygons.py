@@ -47,12 +47,6 @@ class Region(NamedTuple):
             [np.zeros(0), *(self._distance(self._off(part), part) for part in parts)]
         )
 
-    def beyond(self, r: Floats) -> Floats:
-        """Signed distance (M,) [m] of points (M, 3): negative inside."""
-        return corner(
-            self.across(r[:, :2]), np.maximum(self.floor - r[:, 2], r[:, 2] - self.ceiling)
-        )
-
     def most(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
 
