@@ -19,9 +19,10 @@ from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
 from rigidfleet.mission.schema import GeodeticOrigin
+from rigidfleet.plotting.areas import falls_of
 from rigidfleet.reporting import html_page
 from rigidfleet.simulation.together import simulate_together
-from rigidfleet.solids.polygons import Region, crossing
+from rigidfleet.solids.polygons import Region, some_cross
 
 L_SHAPE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], dtype=float)
 HOLE = np.array([[1, 1], [1, 3], [3, 3], [3, 1]], dtype=float)
@@ -91,9 +92,9 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
 
 def test_edges_that_cross_are_known():
     """Of a bow tie, not of a triangle, and of edges that lie on each other."""
-    assert crossing(Region.of_rings([np.array([[0, 0], [4, 4], [4, 0], [0, 4.0]])]).edges)
-    assert crossing(Region.of_rings([np.array([[0, 0], [4, 0], [0, 4.0]])]).edges) is None
-    assert crossing(Region.of_rings([np.array([[0, 0], [4, 0], [1, 0], [1, 4.0]])]).edges)
+    assert some_cross(Region.of_rings([np.array([[0, 0], [4, 4], [4, 0], [0, 4.0]])]).edges)
+    assert not some_cross(Region.of_rings([np.array([[0, 0], [4, 0], [0, 4.0]])]).edges)
+    assert some_cross(Region.of_rings([np.array([[0, 0], [4, 0], [1, 0], [1, 4.0]])]).edges)
 
 
 def test_a_fall_without_drag_is_a_parabola():
@@ -125,6 +126,44 @@ def test_a_fall_with_drag_solves_its_differential_equation(k):
         assert tau == pytest.approx(solved.t_events[0][0], rel=1e-9)
         place = falls.landing(np.array(start[:3]), np.array(v), tau, np.array(k), wind)
         assert place == pytest.approx(solved.y_events[0][0][:2], abs=1e-6)
+
+
+def test_a_fall_ends_on_terrain_where_that_is_hit():
+    """On a slope, and on a roof: where SciPy's integration hits them, to the step between the heights looked at."""
+    slope = {
+        "kind": "heights",
+        "corner": [-40, -40],
+        "spacing": 80.0,
+        "heights": [[-8, -8], [8, 8]],
+    }
+    roof = {"kind": "box", "min": [2.0, -30.0, -40.0], "max": [30.0, 30.0, 2.5]}
+    wind = [3.0, -1.0, 0.0]
+    mission = rf.Mission.from_dict(
+        beside(obstacles=[slope, roof], disturbances={"wind": wind, "drag": 0.3})
+    )
+    result = rf.simulate(mission)
+    places, k = falls_of(result), mission.drag / mission.true_mass
+
+    def surface(x, y):
+        return (
+            max(0.2 * x, 2.5 if 2.0 < x < 30.0 and abs(y) < 30.0 else -math.inf)
+            if abs(x) < 40
+            else -math.inf
+        )
+
+    for row in range(0, len(result.time), max(1, len(result.time) // 12)):
+        for i in range(3):
+
+            def rates(_, y, k=k[i]):
+                return [*y[3:], *(k * (np.array(wind) - y[3:]) - [0, 0, mission.gravity])]
+
+            def above(_, y):
+                return y[2] - surface(y[0], y[1])
+
+            vars(above).update(terminal=True, direction=-1)
+            start = [*result.position[row, i], *result.velocity[row, i]]
+            solved = solve_ivp(rates, [0, 50], start, rtol=1e-9, max_step=0.01, events=above)
+            assert places[row, i] == pytest.approx(solved.y_events[0][0][:2], abs=0.1)
 
 
 def beside(**more):

@@ -13,7 +13,7 @@ from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.values import Coordinate, Flag, Part, key, required_key
-from rigidfleet.solids.polygons import Region, crossing
+from rigidfleet.solids.polygons import Region, some_cross
 from rigidfleet.typing import Floats
 
 #: Farthest corner from the origin [m]: beyond, longitude and latitude are taken to be swapped, or the origin wrong.
@@ -156,7 +156,7 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     edges = Region.of_rings(rings).edges
     if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
         return "has two corners in a row at one place", "give each corner once"
-    if crossing(edges) is not None:
+    if some_cross(edges):
         return "has edges that cross", "give the corners in their order; polygons may not overlap"
     for border, *holes in polygons:
         inside = Region.of_rings([border])
