@@ -158,9 +158,9 @@ class OwnLaws:
             links, inbox = self.links[i], {}
             for l, j in links:
                 # A message is sent at the tick that is its stamp: it says what was said last then.
-                asked, (written, content) = stamps[l] // self.every, self.newest[l]
-                if asked * self.every > written:
-                    written, content = asked * self.every, self.said[asked - k // self.every][j]
+                sent_at, (written, content) = stamps[l] // self.every, self.newest[l]
+                if sent_at * self.every > written:
+                    written, content = sent_at * self.every, self.said[sent_at - k // self.every][j]
                     self.newest[l] = written, content
                 if written >= 0:
                     inbox[j] = Message(content, (k - written) * self.tick)
