@@ -33,7 +33,7 @@ def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
     """Name, rings (m, 2) [m] and look of each fence and place with people; hatched where no vehicle may be."""
     drawn: list[tuple[Area, dict[str, Any]]] = []
     for fence in mission.fences:
-        look = {"edgecolor": st.ALERT, "facecolor": "none", "linewidth": 1.1}
+        look: dict[str, Any] = {"edgecolor": st.ALERT, "facecolor": "none", "linewidth": 1.1}
         look |= {"linestyle": _SOFT} if fence.soft else {}
         look |= {"hatch": "////"} if fence.kind == "exclusion" else {}
         drawn.append((fence, look))
@@ -75,8 +75,8 @@ def falls_of(result: Result) -> Floats:
         return np.full((*result.position.shape[:2], 2), np.nan)
     boundaries, states = Boundaries(mission), (result.position, result.velocity)
     level = mission.ground if np.isfinite(mission.ground) else 0.0
-    if mission.roofs.kind.size:
-        level = min(level, *(np.min(x.heights) for x in mission.solids if x.kind == "heights"), 0.0)
+    terrain = [np.array(x.heights).min() for x in mission.solids if x.kind == "heights"]
+    level = min([level, *terrain])
     places = boundaries.landings(*states, level)
     for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
         height = level + share * (result.position[..., 2] - level)
