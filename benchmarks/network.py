@@ -252,7 +252,7 @@ def events(page: Page, seeds: int, time: float) -> None:
     words = f"Broadcasts on events, {seeds} seeds of {time:g} s, no noise:"
     page.title(words, "shape", "Hz", "network", "ratio", "goal", "push [N]", "broadcasts", "goal")
     for shape, rate in (("triangle", 100.0), ("triangle", 50.0), ("cube", 100.0), ("cube", 50.0)):
-        settings: list[dict[str, float]] = [{"event": 0.005}, {"event": 0.002, "loss": 0.3}]
+        settings: list[dict[str, float]] = [{"event": 0.005}, {"event": 0.0005, "loss": 0.3}]
         central = [flown(mission(shape, rate, None, k, time, 0.0))[0] for k in range(seeds)]
         for network in settings:
             ours, sent = [], []
@@ -269,7 +269,7 @@ def events(page: Page, seeds: int, time: float) -> None:
             page.row(
                 shape, f"{rate:g}", ", ".join(f"{name} {value:g}" for name, value in network.items()),
                 interval(ratios), "1.1", f"{push:.2f}", f"{np.mean(sent):.2f}", "0.5",
-                kept=ratios.mean() <= 1.1 and bool(np.mean(sent) <= 0.5),
+                kept=ratios.mean() <= 1.1 and push <= PUSH and bool(np.mean(sent) <= 0.5),
             )  # fmt: skip
 
 

@@ -14,7 +14,14 @@ from rigidfleet.assessment.alignment import align
 from rigidfleet.cli.app import main
 from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
-from rigidfleet.math.smoothing import PositionNoise, Positions, knots_over, noise_of, smooth
+from rigidfleet.math.smoothing import (
+    PositionNoise,
+    Positions,
+    knots_over,
+    noise_of,
+    smooth,
+    spline_states,
+)
 from rigidfleet.simulation.as_logged import Doubts, judge_log
 
 SIGMA, RATE, END = 0.003, 100.0, 12.0
@@ -112,7 +119,8 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
         curve = noisy(kind, random).curves[0]
         log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
         likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
-        drawn = np.std([likely.deviation(random).at(t) for _ in range(40)], axis=0)
+        ways = spline_states(likely.knots, likely.draw(40, random), t, 1)[0]
+        drawn = np.std(ways, axis=2)
         held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)
     assert np.mean(held) > 0.9
 
@@ -141,6 +149,16 @@ def test_noise_is_shown_by_samples(kind: str, tau: float) -> None:
     assert noise is not None
     assert noise.sigma == pytest.approx(SIGMA, rel=0.1)
     assert noise.tau == pytest.approx(tau, rel=0.3)
+
+
+def test_noise_far_from_the_origin_is_told() -> None:
+    """White noise of a slow flight 20 m wide is white: rounding of far positions is not taken for more."""
+    t = np.arange(0.0, 60.0, 1.0 / RATE)
+    x = 20.0 * np.stack([np.sin(0.05 * t), np.cos(0.05 * t), 0.1 * np.sin(0.1 * t)], axis=1)
+    noise = SIGMA * np.random.default_rng(0).standard_normal(x.shape)
+    estimate = noise_of([Positions(t, x + noise, np.ones(len(t)))], SIGMA, 0.025)
+    assert estimate.noise == PositionNoise(SIGMA)
+    assert not estimate.words
 
 
 @pytest.mark.parametrize("kind", ["ar 1", "filtered"])

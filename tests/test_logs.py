@@ -16,6 +16,7 @@ from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError, TrajectoryError
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.math.geodesy import enu_of
+from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.trajectories import of_curves
 
 LOGS = Path(__file__).parent / "data" / "logs"
@@ -28,9 +29,11 @@ def log(tmp_path):
     """A kept log, unpacked."""
 
     def unpack(name: str) -> Path:
-        needs = {".bin": "pymavlink", ".tlog": "pymavlink", ".mcap": "mcap", ".db3": "sqlite3"}
-        pytest.importorskip(needs[Path(name).suffix])
         path = tmp_path / name
+        if path.suffix in (".mcap", ".db3"):
+            pytest.importorskip("mcap")
+            return record(path)
+        pytest.importorskip("pymavlink")
         path.write_bytes(lzma.decompress((LOGS / f"{name}.xz").read_bytes()))
         return path
 
@@ -45,7 +48,7 @@ def at_samples(read, i=0):
 
 def measured(read, i=0) -> SimpleNamespace:
     """Velocities and deviations of a vehicle."""
-    velocity, deviation = (np.asarray(x, dtype=float) for x in read.measured[i])
+    velocity, deviation = (np.asarray(x, dtype=float) for x in read.measured[i][:2])
     return SimpleNamespace(velocity=velocity, deviation=deviation)
 
 
@@ -282,6 +285,22 @@ def test_local_positions_of_px4_are_turned_and_timed(tmp_path):
     assert read.read[0]["origin"] == pytest.approx([47.4, 8.55, 488.0])
 
 
+def test_a_reset_is_no_flight(tmp_path):
+    """A step that the estimator counts as its own fails no limit: it is undecided; the same step of a vehicle fails."""
+    pytest.importorskip("pyulog")
+    judged = []
+    for counts in (True, False):
+        rows = [row if counts else (*row[:14], 0, *row[15:]) for row in local_rows(valid=0)]
+        read = read_trajectories(
+            ulog(tmp_path / "one.ulg", [("vehicle_local_position", 0, LOCAL, rows)])
+        )
+        _, verdict = judge_log(read, None, Doubts(0.01, 0.0), limits={"speed": 3.0})
+        judged.append(verdict)
+    assert [verdict.word for verdict in judged] == ["undecided", "failed"]
+    assert (judged[0].doubt or {})["resets_s"] == [pytest.approx(6.1992)]
+    assert "as an estimator moves its position at 6.20 s" in judged[0].by_name["speed"].message
+
+
 def test_what_is_not_valid_is_not_read(tmp_path):
     """Without a valid local position another topic is read, and said; without any there is one error."""
     pytest.importorskip("pyulog")
@@ -373,6 +392,53 @@ def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
 # -- ROS 2 -------------------------------------------------------------------------------------------
 
 
+def record(path: Path) -> Path:
+    """A recording that `rosbags` writes: a robot that circles and climbs, as odometry, poses, transforms and fixes."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.rosbag2.enums import StoragePlugin
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    of = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    with rosbag2.Writer(path.with_suffix(""), version=9, storage_plugin=plugin) as writer:
+        topics = {"/odom": "Odometry", "/amcl_pose": "PoseWithCovarianceStamped", "/tf": "TFMessage",
+                  "/tf_static": "TFMessage", "/fix": "NavSatFix"}  # fmt: skip
+        kinds = {topic: of[kind].__msgtype__ for topic, kind in topics.items()}
+        to = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in kinds.items()
+        }
+        for k in range(200):
+            t, a = 1_700_000_000_000_000_000 + 50_000_000 * k, 0.02 * k
+            header = lambda frame, t=t: of["Header"](of["Time"](t // 10**9, t % 10**9), frame)  # noqa: E731
+            x, y, z = 2.0 * np.sin(a), 2.0 - 2.0 * np.cos(a), 0.01 * k
+            turned = of["Quaternion"](*Rotation.from_euler("z", a).as_quat())
+            covariance = np.diag([0.01 + 1e-4 * k, 0.02, 0.0, 1.0, 1.0, 1.0]).ravel()
+            pose = of["PoseWithCovariance"](of["Pose"](of["Point"](x, y, z), turned), covariance)
+            v = of["Twist"](of["Vector3"](0.8, 0.0, 0.2), of["Vector3"](0.0, 0.0, 0.4))
+            twist = of["TwistWithCovariance"](v, covariance)
+            moved = of["Transform"](of["Vector3"](x, y, z), turned)
+            status = of["NavSatStatus"](0 if k else -1, 1, *[0] * 9)
+            messages = {
+                "/odom": of["Odometry"](header("odom"), "base_footprint", pose, twist),
+                "/amcl_pose": of["PoseWithCovarianceStamped"](header("map"), pose),
+                "/tf": of["TFMessage"](
+                    [of["TransformStamped"](header("odom"), "base_footprint", moved)]
+                ),
+                "/tf_static": of["TFMessage"](
+                    [of["TransformStamped"](header("base_footprint"), "lidar", moved)]
+                ),
+                "/fix": of["NavSatFix"](
+                    header("gps"), status, 47.4 + 1e-7 * k, 8.5, 500.0 + z, np.zeros(9), 0
+                ),
+            }
+            for topic, message in messages.items():
+                writer.write(to[topic], t + 3_000_000, store.serialize_cdr(message, kinds[topic]))
+    (made,) = path.with_suffix("").glob(f"*{path.suffix}")
+    return made.rename(path)
+
+
 def messages_of(path: Path, topic: str) -> list:
     """Messages as rosbags reads them."""
     reader = pytest.importorskip("rosbags.highlevel").AnyReader([path])
@@ -388,13 +454,11 @@ def seconds(message) -> float:
 def test_odometry_is_read_with_its_velocity_and_covariance(log):
     """Velocities in a robot's axes are turned into the frame of its positions; topics that are not read are named."""
     path = log("odometry.mcap")
-    every = messages_of(path, "/odom")
     read = read_trajectories(path, gaps="bridge")
     assert read.names == ("/odom",)
     time, place = at_samples(read)
-    kept = np.isin(np.round([seconds(m) for m in every], 6), np.round(time, 6))
-    assert np.count_nonzero(kept) == len(time)
-    own = [m for m, k in zip(every, kept, strict=True) if k]
+    own = messages_of(path, "/odom")
+    np.testing.assert_allclose(time + read.since, [seconds(m) for m in own], atol=1e-6)
     point = [m.pose.pose.position for m in own]
     np.testing.assert_allclose(place, [[p.x, p.y, p.z] for p in point])
     q = [m.pose.pose.orientation for m in own]
@@ -403,7 +467,7 @@ def test_odometry_is_read_with_its_velocity_and_covariance(log):
     np.testing.assert_allclose(
         measured(read).velocity, turn.apply([[x.x, x.y, x.z] for x in v]), atol=1e-12
     )
-    assert said(read, "topics that are not read: /amcl_pose, /tf:base_link")
+    assert said(read, "topics that are not read: /amcl_pose, /fix, /tf:base_footprint")
     pose = messages_of(path, "/amcl_pose")
     read = read_trajectories(path, gaps="bridge", topic="/amcl*")
     deviation = [[m.pose.covariance[0] ** 0.5, m.pose.covariance[7] ** 0.5] for m in pose]
@@ -414,20 +478,11 @@ def test_odometry_is_read_with_its_velocity_and_covariance(log):
 def test_rosbag2_is_read(log, tmp_path):
     """A folder that rosbag2 wrote, or its base of SQLite: bodies of a topic of transforms."""
     path = log("transforms.db3")
+    own = [m.transforms[0] for m in messages_of(path, "/tf")]
     (folder := tmp_path / "bag").mkdir()
     (folder / "transforms.db3").write_bytes(path.read_bytes())
     (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n")
-    read, alone = read_trajectories(folder), read_trajectories(path)
-    pytest.importorskip("rosbags")
-    import sqlite3
-
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    rows = sqlite3.connect(path).execute(
-        "SELECT data FROM messages WHERE topic_id = 2 ORDER BY timestamp"
-    )
-    own = [store.deserialize_cdr(data, "tf2_msgs/msg/TFMessage").transforms[0] for (data,) in rows]
+    read, alone = (read_trajectories(x, topic="/tf:*") for x in (folder, path))
     assert read.names == alone.names == ("/tf:base_footprint",)
     time, place = at_samples(read)
     moved = [m.transform.translation for m in own]
@@ -437,6 +492,17 @@ def test_rosbag2_is_read(log, tmp_path):
     path.write_bytes(path.read_bytes()[:50_000])
     with pytest.raises(TrajectoryError, match="the recording is damaged"):
         read_trajectories(path)
+
+
+def test_fixes_of_ros_are_places_on_the_earth(log):
+    """Latitudes and longitudes of NavSatFix in degrees become east, north, up; without a fix, there is no place."""
+    read = read_trajectories(log("fixes.mcap"), topic="/fix", origin=(47.4, 8.5, 500.0))
+    place = at_samples(read)[1]
+    k = np.arange(1, 200)
+    np.testing.assert_allclose(
+        place, flat(47.4 + 1e-7 * k, 8.5 + 0.0 * k, 500.0 + 0.01 * k, (47.4, 8.5, 500.0)), atol=2e-3
+    )
+    assert said(read, "1 samples without a valid position are left out")
 
 
 def test_damaged_logs_are_one_error(log, tmp_path, capfd):

@@ -51,7 +51,6 @@ class Watched:
             "who": np.full((records.QUANTITIES, 2), -1), "sign": np.zeros(1), "left": np.ones(self.n, dtype=np.bool_),
             "standing": np.zeros(self.n, dtype=np.int64), "low": np.full((self.n, 3), np.inf), "pad": 0.0,
             "altitude": math.inf, "pairs": pairs, "columns": pairs, "struck": np.zeros((0, 2), dtype=np.int64),
-            "listed": np.zeros((2, 0), dtype=np.int64),
         } | changes  # fmt: skip
         self.watch = native.Watch(
             records.monitor(

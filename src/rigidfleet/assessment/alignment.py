@@ -1,8 +1,8 @@
 """What of the distance between a flight and its plan a clock and a set-up explain: offsets, a turn, a shift, a scale.
 
 A place p of the plan at its time t is at scale Rz(turn) p + shift in the log, at t + offset. All are fitted at once by
-least squares. Errors are those of a fit whose remains are independent from one part of the flight to another alone, not
-from sample to sample ("sandwich"), as what a controller leaves is not.
+least squares. Errors come from leaving out one part of the flight after the other (the jackknife of blocks: Kunsch,
+Ann. Statist. 17, 1989), as what a controller leaves is not independent from sample to sample.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from rigidfleet.typing import Bools, Floats
 PlanStates = Callable[[int, Floats], tuple[Floats, Floats]]
 #: Times (K,) [s] and smoothed positions (K, 3) [m] of each vehicle.
 Logs = Sequence[tuple[Floats, Floats]]
-#: Parts of a flight that count as independent; turns of the fit; step of the search for a clock far off [s], and
-#: samples of a vehicle that are used for it, and for the fit.
-_PARTS, _TURNS, _STEP, _FEW, _MANY = 16, 12, 0.25, 150, 2000
+#: Parts of a flight that count as independent, and by how much Student's distribution of so few is wider (97.5 %).
+_PARTS, _WIDER = 4, 1.62
+#: Turns of the fit; step of the search for a clock far off [s], and samples of a vehicle for it, and for the fit.
+_TURNS, _STEP, _FEW, _MANY = 12, 0.25, 150, 2000
 #: Parameters: offset [s], turn [rad], logarithm of the scale, shift [m]. What moves places less than this tells none
 #: of the first three [m/s, m, m]; errors from which on they are not told, and least errors, as what a controller leaves
 #: looks like a little of each.
 _MOVES, _UNTOLD = (0.02, 0.05, 0.05), np.array([0.1, 0.1, 0.1, np.inf, np.inf, np.inf])
 _FLOOR = np.array([1e-3, 5e-4, 2e-4, 1e-3, 1e-3, 1e-3])
-#: Parameters of one vehicle beside those of all: its offset and its shift.
-_OF_ONE = np.array([True, False, False, True, True, True])
 #: Errors from which on a vehicle's offset differs from that of others, and the least that does [s].
 _SURE, _LATE = 4.0, 0.01
 
@@ -83,7 +82,7 @@ def align(logs: Logs, plan: PlanStates, span: tuple[float, float], clock: str) -
     whole, errors, left = _fit(logs, plan, span, start, every)
     own = np.empty((2, len(logs)))
     for i, log in enumerate(logs):
-        alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, _OF_ONE)
+        alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, every)
         own[:, i] = np.where(np.isfinite(error[0]), [alone[0], error[0]], np.nan)
     own[0] += apart
     errors[0] = errors[0] if np.ptp(apart) == 0.0 else np.nan  # all have none in common
@@ -95,60 +94,66 @@ def align(logs: Logs, plan: PlanStates, span: tuple[float, float], clock: str) -
 def _residuals(
     logs: Logs, plan: PlanStates, span: tuple[float, float], q: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Off (M, 3), its derivatives (M, 3, 6) by the parameters q, and to which part (M,) of the flight each belongs."""
+    """Off (M, 3), its derivatives (M, 3, 6) by the parameters q, and times (M,) of the plan."""
     rows = []
     c, s = np.cos(q[1]), np.sin(q[1])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) * np.exp(q[2])
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     for i, (t, x) in enumerate(logs):
         inside = (t - q[0] >= span[0]) & (t - q[0] <= span[1])
-        p, v = (y @ turn.T for y in plan(i, t[inside] - q[0]))
-        slope = np.zeros((len(p), 3, 6))
-        slope[:, :, 0], slope[:, :, 1], slope[:, :, 2], slope[:, :, 3:] = (
-            -v,
-            p @ quarter.T,
-            p,
-            np.eye(3),
-        )
-        part = _PARTS * i + (_PARTS * (t[inside] - t[0]) / (t[-1] - t[0] + 1e-9)).astype(np.int64)
-        rows.append((x[inside] - p - q[3:], slope, part))
-    off, slopes, parts = zip(*rows, strict=True)
-    return np.concatenate(off), np.concatenate(slopes), np.concatenate(parts)
+        time = t[inside] - q[0]
+        p, v = (y @ turn.T for y in plan(i, time))
+        shifts = np.broadcast_to(np.eye(3), (len(p), 3, 3))
+        slope = np.concatenate([np.stack([-v, p @ quarter.T, p], axis=2), shifts], axis=2)
+        rows.append((x[inside] - p - q[3:], slope, time))
+    off, slopes, times = zip(*rows, strict=True)
+    return np.concatenate(off), np.concatenate(slopes), np.concatenate(times)
 
 
 def _fit(
     logs: Logs, plan: PlanStates, span: tuple[float, float], start: Floats, free: Bools
 ) -> tuple[Floats, Floats, float]:
     """The ``free`` parameters (6,) that a flight tells, from a start; their errors; the distance that is left."""
-    q, free, k = start.copy(), free.copy(), 0
-    while True:
-        off, slope, part = _residuals(logs, plan, span, q)
-        if not (len(off) and free.any()) or k == _TURNS:
+    q, free, errors = start.copy(), free.copy(), np.full(6, np.nan)
+    for _ in range(_TURNS):
+        off, slope, time = _residuals(logs, plan, span, q)
+        if not (len(off) and free.any()):
             break
         for j in np.flatnonzero(free[:3]):  # what the others do not explain of it
-            rest, column = (
-                slope[..., free & (np.arange(6) != j)].reshape(3 * len(off), -1),
-                slope[..., j].ravel(),
-            )
-            alone = column - rest @ np.linalg.lstsq(rest, column, rcond=None)[0]
+            others = slope[..., free & (np.arange(6) != j)].reshape(3 * len(off), -1)
+            column = slope[..., j].ravel()
+            alone = column - others @ np.linalg.lstsq(others, column, rcond=None)[0]
             if np.sqrt(3.0 * (alone**2).mean()) < _MOVES[j]:
                 free[j], q[j] = False, start[j]
-        step = np.linalg.lstsq(slope[..., free].reshape(3 * len(off), -1), off.ravel(), rcond=None)[
-            0
-        ]
+        A = slope[..., free]
+        step = np.linalg.lstsq(A.reshape(3 * len(off), -1), off.ravel(), rcond=None)[0]
         step[: int(free[0])] = np.clip(step[: int(free[0])], -0.5, 0.5)
         q[free] += step
-        k = _TURNS if np.abs(step).max() < 1e-7 else k + 1
-    errors = np.full(6, np.nan)
-    if len(off) and free.any():
-        A = slope[..., free]
-        inverse = np.linalg.pinv(np.einsum("kij,kil->jl", A, A))
-        moments = np.einsum("kij,ki->kj", A, off)
-        sums = np.array([moments[part == j].sum(axis=0) for j in np.unique(part)])
-        spread = inverse @ sums.T @ sums @ inverse * len(sums) / max(len(sums) - 1, 1)
-        errors[free] = np.sqrt(np.diag(spread) + _FLOOR[free] ** 2)
-        errors[errors > _UNTOLD] = np.nan
+        errors[:] = np.nan
+        errors[free] = np.hypot(_errors(A, off - A @ step, time), _FLOOR[free])
+        if np.abs(step).max() < 1e-7:
+            break
+    errors[errors > _UNTOLD] = np.nan
     return q, errors, float(np.sqrt((off**2).sum(axis=1).mean())) if len(off) else np.nan
+
+
+def _errors(A: Floats, left: Floats, time: Floats) -> Floats:
+    """Standard errors of a fit of rows A (M, 3, P) that leaves (M, 3): how it changes without one part of the flight.
+
+    Each part has a like share of time and motion together.
+    """
+    order = np.argsort(time, kind="stable")
+    motion = (A[..., 0] ** 2).sum(axis=1)
+    share = np.cumsum(motion[order] / max(motion.mean(), 1e-12) + 1.0)
+    part = np.empty(len(time), dtype=np.int64)
+    part[order] = np.minimum(_PARTS * share / share[-1], _PARTS - 1)
+    squares, moments = np.zeros((_PARTS, A.shape[2], A.shape[2])), np.zeros((_PARTS, A.shape[2]))
+    np.add.at(squares, part, np.einsum("kij,kil->kjl", A, A))
+    np.add.at(moments, part, np.einsum("kij,ki->kj", A, left))
+    without = np.linalg.pinv(squares.sum(axis=0) - squares)
+    changes = np.einsum("gij,gj->gi", without, moments)
+    spread = ((changes - changes.mean(axis=0)) ** 2).sum(axis=0)
+    return _WIDER * np.sqrt(spread * (_PARTS - 1) / _PARTS)
 
 
 def _nearest_offset(logs: Logs, plan: PlanStates, span: tuple[float, float]) -> float:

@@ -49,8 +49,10 @@ _APPLIED = {
     "recorded": "clocks count as recorded (--clock offset takes it out)", "offset": "that is taken out",
     "own": "each vehicle's own offset is taken out, and separation is not judged",
 }  # fmt: skip
+#: Time about a reset of an estimator in which a smoothed way is not what was flown [s].
+_RESET = 1.0
 #: Pairs and times that may be nearest, of which so many are compared, and distances that are computed together.
-_CANDIDATES, _AT_ONCE = 200_000, 4_000_000
+_CANDIDATES, _AT_ONCE = 100_000, 500_000
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def verdict_with_doubt(
     facts : what is told of noise, clock, set-up and vehicles
     shared : whether all vehicles have one clock
     """
-    checks = []
+    checks, resets = [], facts.get("resets_s", [])
     for check in verdict.checks:
         why = "" if deviations else "the noise is not told. State it: --noise"
         if not shared and _is_of_pairs(check.check):
@@ -150,17 +152,15 @@ def verdict_with_doubt(
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
         if check.check in _UNSEEN:
             continue
-        if check.check in _CERTAIN or not (why or deviations):
+        if check.check in _CERTAIN:
             checks.append(check)
         elif why or deviations is None:
             words = f"{check.check.replace('_', ' ')} is not judged: {why}"
-            checks.append(
-                replace(check, passed=False, undecided=True, message=words)
-                if check.judged
-                else check
-            )
+            undecided = replace(check, passed=False, undecided=True, message=words)
+            checks.append(undecided if check.judged else check)
         else:
-            checks.append(_with_interval(check, deviations.of_check(check), facts["noise_m"]))
+            check = _with_interval(check, deviations.of_check(check), facts["noise_m"])  # noqa: PLW2901
+            checks.append(_unless_reset(check, resets))
     return replace(verdict, checks=checks, doubt=facts, notes=[*doubt_notes(facts), *verdict.notes])
 
 
@@ -199,6 +199,15 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
 
 
+def _unless_reset(check: CheckResult, resets: list[float]) -> CheckResult:
+    """A check, undecided if it is missed where an estimator sets its position anew: no vehicle flew that."""
+    near = [t for t in resets if check.when is not None and abs(t - check.when) < _RESET]
+    if check.passed or check.undecided or not near:
+        return check
+    words = f"{check.message}: undecided, as an estimator moves its position at {near[0]:.2f} s"
+    return replace(check, undecided=True, message=words)
+
+
 def facts_of(
     flown: Result, deviations: DrawnWays | None, estimate: NoiseEstimate, alignment: Alignment | None, clock: str
 ) -> dict[str, Any]:  # fmt: skip
@@ -209,6 +218,8 @@ def facts_of(
         "correlation_s": None if noise is None else noise.tau,
         "source": estimate.source, "remark": estimate.words, "clock": clock,
     }  # fmt: skip
+    if resets := flown.statistics["resets"]:
+        facts["resets_s"] = resets
     if alignment is None:
         return facts
     off = np.where(flown.left[..., None], flown.position - flown.slot_position, np.nan)

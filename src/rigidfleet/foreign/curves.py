@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Names of the channels of a curve.
 NAMES = ("x", "y", "z", "yaw")
@@ -26,10 +26,12 @@ class LoggedStates(NamedTuple):
     ----------
     velocity : (K, 3) [m/s]
     deviation : (K, 3) standard deviations of the positions, by the estimator that wrote them [m]
+    resets : (R,) knots at which its position is set anew: no vehicle flew there from the knot before
     """
 
     velocity: Floats | None
     deviation: Floats | None
+    resets: Ints
 
 
 class Trajectories(NamedTuple):

@@ -85,6 +85,7 @@ _MESSAGES = [
     *[(name, _Fields("geodetic", "Lat Lng Alt")) for name in ("POS", "GPS", "SIM")],
     *[(name, _POSE) for name in ("PoseStamped", "NamedPoseArray", "Odometry", "PoseWithCovarianceStamped",
                                  "TransformStamped", "TFMessage")],
+    ("NavSatFix", _GLOBAL._replace(spread="")),
 ]  # fmt: skip
 _RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
@@ -221,7 +222,7 @@ def trajectories_of(
         each = (
             None if x is None else np.resize(x, size) for x in (track.velocity, track.deviation)
         )
-        measured.append(LoggedStates(*each))
+        measured.append(LoggedStates(*each, track.resets))
     frames = [*dict.fromkeys(track.frame for track in tracks.values())]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
@@ -251,7 +252,7 @@ def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
 
 
 class _Track(NamedTuple):
-    """Times (K,) [ns], places, velocities and deviations (K, 3) in east, north, up, and yaws (K,) of a vehicle."""
+    """Times (K,) [ns], places, velocities, deviations (K, 3) in east, north, up, yaws (K,), and resets of a vehicle."""
 
     topic: str
     frame: str
@@ -262,6 +263,7 @@ class _Track(NamedTuple):
     yaw: Floats | None
     origin: Geodetic | None
     notes: list[str]
+    resets: Ints
 
 
 def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
@@ -312,9 +314,19 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     for name in {*form.yaw.split()} & own.keys():
         yaw = own[name].astype(np.float64) * form.units[4]
         yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
-    notes += _notes_on_resets(own, time / 1e9, place, velocity)
+    resets = _resets(own, time / 1e9, place, velocity)
+    if len(resets):
+        far = np.linalg.norm(place[resets] - place[resets - 1], axis=1)
+        when = (time[resets] - time[0]) / 1e9
+        words = ", ".join(
+            f"{x:.3g} m at {t:.6g} s" for x, t in zip(far[:_LISTED], when, strict=False)
+        )
+        words += f" from its first sample ({len(resets):,} times in all): no vehicle flew that"
+        notes.append(f"the estimator moves its position by {words}")
     origin, frame = reference and (origin or reference), f"{frame} {channel.frame}".strip()
-    return _Track(channel.topic, frame, time, place, velocity, deviation, yaw, origin, notes)
+    return _Track(
+        channel.topic, frame, time, place, velocity, deviation, yaw, origin, notes, resets
+    )
 
 
 def _fields(columns: dict[str, Any], names: str) -> Floats:
@@ -339,21 +351,16 @@ def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:
     return rows[later]
 
 
-def _notes_on_resets(
-    columns: dict[str, Any], time: Floats, place: Floats, velocity: Floats | None
-) -> list[str]:
-    """A note on where the estimator set the position anew: as it counts that, or as its velocities show."""
-    move, again = np.diff(place, axis=0), np.zeros(len(time) - 1, dtype=np.bool_)
+def _resets(columns: dict[str, Any], time: Floats, place: Floats, velocity: Floats | None) -> Ints:
+    """Samples at which the estimator set the position anew: as it counts that, or as its velocities show."""
     if names := [name for name in _RESETS if name in columns]:
         again = (np.diff(_fields(columns, " ".join(names)), axis=0) != 0.0).any(axis=1)
-    elif velocity is not None and len(move):
-        off = move - 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)[:, None]
-        far = np.linalg.norm(off, axis=1)
-        again = far > max(_JUMP, _UNUSUAL * float(np.median(far)))
-    far, rows = np.linalg.norm(move, axis=1), np.flatnonzero(again)
-    words = ", ".join(f"{far[k]:.3g} m at {time[k + 1] - time[0]:.6g} s" for k in rows[:_LISTED])
-    words += f" from its first sample ({len(rows):,} times in all): no vehicle flew that"
-    return [f"the estimator moves its position by {words}"] if len(rows) else []
+        return np.flatnonzero(again) + 1
+    if velocity is None or len(time) < 2:
+        return np.zeros(0, dtype=np.int64)
+    moved = 0.5 * (velocity[1:] + velocity[:-1]) * np.diff(time)[:, None]
+    far = np.linalg.norm(np.diff(place, axis=0) - moved, axis=1)
+    return np.flatnonzero(far > max(_JUMP, _UNUSUAL * float(np.median(far)))) + 1
 
 
 def _place_of(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:

@@ -1,13 +1,14 @@
 """Positions in recordings of ROS 2 (MCAP, and rosbag2's SQLite), whoever wrote them.
 
-Sources: the definitions of `geometry_msgs`, `nav_msgs` and `tf2_msgs` (ROS 2 common_interfaces and geometry2),
-`NamedPoseArray` of motion_capture_tracking_interfaces; CDR: after 4 bytes that say the order of bytes, each field is
-aligned to its size; rosbag2's tables (`rosbag2_storage_sqlite3`); and REP 103: frames are east, north, up, and one
-whose name ends in ``_ned`` is north, east, down.
+Sources: the definitions of `geometry_msgs`, `nav_msgs`, `sensor_msgs` and `tf2_msgs` (ROS 2's common_interfaces and
+geometry2), `NamedPoseArray` of motion_capture_tracking_interfaces; CDR: after 4 bytes that say the order of bytes, each
+field is aligned to its size; rosbag2's tables (`rosbag2_storage_sqlite3`); and REP 103: frames are east, north, up, and
+one whose name ends in ``_ned`` is north, east, down.
 """
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import struct
 from array import array
@@ -43,10 +44,10 @@ _DAMAGED = (
     sqlite3.Error,
 )
 #: Numbers of a message after its names: a position and a quaternion (7), the covariance of a pose (36, by rows), and a
-#: velocity in the vehicle's axes (3).
+#: velocity in the vehicle's axes (3); or latitude, longitude [deg] and height [m] (3).
 _NUMBERS = {
     "PoseStamped": 7, "PoseWithCovarianceStamped": 43, "Odometry": 46, "TransformStamped": 7, "TFMessage": 7,
-    "NamedPoseArray": 7,
+    "NamedPoseArray": 7, "NavSatFix": 3,
 }  # fmt: skip
 
 
@@ -166,16 +167,22 @@ def _decode(kind: str, data: bytes) -> Iterator[tuple[str, str, int, Sequence[fl
         if kind == "NamedPoseArray":
             yield from ((f":{text()}", frame, stamp, read("7d")) for _ in range(*read("I")))
             return
+        if kind == "NavSatFix":
+            fixed = read("b")[0] >= 0 and read("H")
+            yield "", frame, stamp, read("3d") if fixed else (math.nan,) * 3
+            return
         who = f":{text()}" if kind in ("TransformStamped", "TFMessage", "Odometry") else ""
         yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind]}d")
 
 
 def _columns(rows: _Rows) -> dict[str, Floats]:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
-    table = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1)
+    table, time = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1), np.asarray(rows.stamps)
+    if rows.message == "NavSatFix":
+        return dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
     known = np.asarray(np.abs(table[:, :7]).max(axis=1) < _FAR)
     columns: dict[str, Any] = {
-        "time": np.frombuffer(rows.stamps, dtype=np.int64), "x": np.where(known, table[:, 0], np.nan),
+        "time": time, "x": np.where(known, table[:, 0], np.nan),
         "y": table[:, 1], "z": table[:, 2], "yaw": yaws_of(np.where(known[:, None], table[:, 3:7], 0.0)),
     }  # fmt: skip
     if table.shape[1] > 7:

@@ -25,9 +25,9 @@ QUARTIC = np.array(
 _POINTS, _APART = 5, 3
 _WINDOW = _POINTS + _APART
 #: Third differences of control points, and the search for their variance in that of the noise (natural logarithm; from,
-#: to, close enough). The least smooths over 40 knots: beyond it, matrices are no longer positive definite in rounding.
+#: at first, to, close enough). The least smooths over 40 knots: beyond it, matrices are not positive definite any more.
 _THIRD = np.array([-1.0, 3.0, -3.0, 1.0])
-_SMALLEST, _LARGEST, _CLOSE = -22.0, 25.0, 0.1
+_SMALLEST, _FIRST, _LARGEST, _CLOSE = -22.0, -6.0, 25.0, 0.1
 #: Turns in which third differences get sizes of their own, ways drawn in each, and degrees of freedom of the sizes.
 _TURNS, _DRAWN, _FREEDOM = 8, 8, 0.3
 #: Vehicles and samples of each by which noise is judged; correlation times that are tried, and the longest [s].
@@ -88,17 +88,28 @@ class Smoothed:
     @property
     def way(self) -> Piecewise:
         """The likely way: pieces (M, 3, 5)."""
-        return _way_of(self.knots, self.points)
+        h, spans = self.knots[1] - self.knots[0], len(self.knots) - 1
+        windows = np.stack([self.points[k : k + spans] for k in range(_POINTS)], axis=-1)
+        return Piecewise(self.knots, windows @ QUARTIC / h ** np.arange(5.0))
 
-    def deviation(self, random: np.random.Generator) -> Piecewise:
-        """By what a way as likely as the true one, given the samples, differs from the likely one."""
-        return _way_of(self.knots, _draws(self.factor, random.standard_normal(self.points.shape)))
+    def draw(self, count: int, random: np.random.Generator) -> Floats:
+        """Control points (M + 4, 3, count) of ways as likely as the true one, given the samples."""
+        normal = random.standard_normal((len(self.points), 3 * count))
+        return self.points[..., None] + _draws(self.factor, normal).reshape(-1, 3, count)
 
 
-def _way_of(knots: Floats, points: Floats) -> Piecewise:
-    h, spans = knots[1] - knots[0], len(knots) - 1
-    windows = np.stack([points[k : k + spans] for k in range(_POINTS)], axis=-1)
-    return Piecewise(knots, windows @ QUARTIC / h ** np.arange(5.0))
+def spline_states(knots: Floats, points: Floats, t: Floats, orders: int) -> Floats:
+    """Value and derivatives (orders, T, ...) at times (T,) [s] of a spline with control points (M + 4, ...)."""
+    h = knots[1] - knots[0]
+    span = np.clip(((t - knots[0]) / h).astype(np.int64), 0, len(knots) - 2)
+    powers = ((t - knots[0]) / h - span)[:, None] ** np.arange(5.0)
+    out, basis = np.zeros((orders, len(t), *points.shape[1:])), QUARTIC
+    for order in range(orders):
+        weight = powers[:, : basis.shape[1]] @ basis.T
+        for k in range(_POINTS):
+            out[order] += weight[:, k].reshape(-1, *(1,) * (points.ndim - 1)) * points[span + k]
+        basis = basis[:, 1:] * np.arange(1.0, basis.shape[1]) / h
+    return out
 
 
 def knots_over(time: Floats, zero: float, step: float) -> Floats:
@@ -180,19 +191,24 @@ def smooth(
     band, right = rows.normal_equations(count)
     whole, turns = count - 3, _TURNS if calm is None else 0
     calm = np.ones(whole) if calm is None else calm
-    squares, numbers = float((rows.value**2).sum()), 3 * max(len(samples.time) - 3, 1)
+    numbers, about = 3 * max(len(samples.time) - 3, 1), np.zeros((count, 3))
 
-    def solve(weight: Floats) -> tuple[Floats, Floats]:
-        full = band.copy()
+    def solve(weight: Floats) -> tuple[Floats, Floats, Floats]:
+        """Control points from ``about`` on (C, 3), what they were solved of, and the factor."""
+        full, of = band.copy(), right.copy()
+        third = weight[:, None] * np.diff(about, 3, axis=0)
         for i in range(4):
+            of[i : i + whole] -= _THIRD[i] * third
             for j in range(i, 4):
                 full[j - i, i : i + whole] += _THIRD[i] * _THIRD[j] * weight
         factor = cholesky_banded(full, lower=True)
-        return cho_solve_banded((factor, True), right), factor
+        return cho_solve_banded((factor, True), of), of, factor
 
     def evaluate(log_variance: float) -> tuple[float, float]:
-        points, factor = solve(calm * np.exp(-log_variance))
-        quadratic = max(squares - float((points * right).sum()), 1e-12 * squares)
+        weight = calm * np.exp(-log_variance)
+        points, of, factor = solve(weight)
+        quadratic = squares + float((weight @ np.diff(about, 3, axis=0) ** 2).sum())
+        quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
         variance = quadratic / numbers if free else 1.0
         return rows.deviance + numbers * np.log(
@@ -201,6 +217,10 @@ def smooth(
 
     zero = 0.0 if free else 2.0 * np.log(noise.sigma)  # in units of the noise, where it is known
     bounds = _SMALLEST + zero, _LARGEST + zero
+    # Only what a first way leaves is fitted: of far positions, the quadratic would be all rounding.
+    about = solve(calm * np.exp(-_FIRST - zero))[0]
+    rows = rows._replace(value=rows.value - rows.times(about))
+    squares, right = float((rows.value**2).sum()), rows.normal_equations(count)[1]
     best = minimize_scalar(
         lambda x: evaluate(x)[0], bounds=bounds, method="bounded", options={"xatol": _CLOSE}
     )
@@ -208,18 +228,18 @@ def smooth(
     weight = calm * np.exp(-best.x)
     random = np.random.default_rng(0)
     for _ in range(turns):
-        points, factor = solve(weight)
+        points, _, factor = solve(weight)
         drawn = _draws(factor, random.standard_normal((count, _DRAWN)))
-        size = (np.diff(points, 3, axis=0) ** 2).sum(axis=1)
+        size = (np.diff(about + points, 3, axis=0) ** 2).sum(axis=1)
         size = size / variance + 3.0 * (np.diff(drawn, 3, axis=0) ** 2).mean(axis=1)
         weight = (_FREEDOM + 3.0) / (_FREEDOM / weight.mean() + size)
         weight = np.minimum(weight, np.exp(-bounds[0]))
-    points, factor = solve(weight)
+    points, _, factor = solve(weight)
     sigma = float(np.sqrt(variance))
     residual = (rows.value - rows.times(points)) / sigma
     known = PositionNoise(sigma * unit.sigma, noise.tau)
     calm = np.minimum(weight / np.median(weight), 1.0)
-    return Smoothed(knots, points, factor / sigma, calm, known, deviance, residual)
+    return Smoothed(knots, about + points, factor / sigma, calm, known, deviance, residual)
 
 
 def _draws(factor: Floats, normal: Floats) -> Floats:

@@ -34,6 +34,8 @@ def sound(m: FindingCollector, name: str) -> bool:
 def coincident(points: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
+    if len(p) < 2:
+        return []
     # Cells first: a search tree of many equal points degenerates and compares all pairs.
     cell = np.round(p / apart)
     order = np.lexsort(cell.T)
@@ -41,7 +43,7 @@ def coincident(points: ArrayLike) -> list[tuple[int, int]]:
     first = np.empty(len(p), dtype=np.int64)
     first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
     later = np.flatnonzero(first != np.arange(len(p)))
-    if not len(later) and len(p) > 1:
+    if not len(later):
         later = np.flatnonzero(proximity.nearest(p) < apart)[1:]
         for j in later:
             away = np.linalg.norm(p - p[j], axis=1)

@@ -10,28 +10,8 @@ from pydantic import Field, model_validator
 from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, join
-from rigidfleet.mission.values import (
-    AUTO,
-    AgentNumber,
-    Angle,
-    Duration,
-    Dwell,
-    Force,
-    Length,
-    LengthOrZero,
-    Part,
-    Rates,
-    Scale,
-    Time,
-    Tolerance,
-    Trajectories,
-    Vector,
-    Velocity,
-    VelocityOrFree,
-    key,
-    models_by_kind,
-    required_key,
-)
+from rigidfleet.mission import values
+from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
@@ -44,9 +24,9 @@ ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 class Settle(Part):
     """The phase ends when its error has stayed within a tolerance for some time."""
 
-    tolerance: Tolerance = key("maximum error [m]", 1e-3)
-    dwell: Dwell = key("time that the error must stay within tolerance [s]", 1.0)
-    timeout: Time = key("time after which the mission fails [s]", 60.0)
+    tolerance: values.Tolerance = key("maximum error [m]", 1e-3)
+    dwell: values.Dwell = key("time that the error must stay within tolerance [s]", 1.0)
+    timeout: values.Time = key("time after which the mission fails [s]", 60.0)
 
 
 @with_earlier_names(led="follows_curves", spelled="flown_as_written", ended="keys_if_ended")
@@ -72,8 +52,8 @@ class AnyPhase(Part):
     body_control: ClassVar[str] = "body"
 
     name: str = key("unique name; default: its kind and number", "")
-    until: Time | None = key("the phase ends at this mission time [s]")
-    duration: Duration | None = key(
+    until: values.Time | None = key("the phase ends at this mission time [s]")
+    duration: values.Duration | None = key(
         "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)"
     )
     settle: Settle | None = key("the phase ends when its error has settled")
@@ -83,7 +63,7 @@ class AnyPhase(Part):
         "orbit and body for other phases",
         "tracking",
     )
-    input_force: Force = key(
+    input_force: values.Force = key(
         "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
     )
@@ -133,7 +113,7 @@ class AnyPhase(Part):
         return False
 
     @property
-    def place(self) -> Vector | None:
+    def place(self) -> values.Vector | None:
         """Centre of mass to rest at [m], of a phase that comes to rest; None for where it is."""
         return None
 
@@ -197,9 +177,9 @@ class AnyPhase(Part):
 class Attitude(Part):
     """Angles of an attitude; if one is given, the default of the others is 0."""
 
-    roll_deg: Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles")
-    pitch_deg: Angle | None = key("pitch at arrival [deg]")
-    yaw_deg: Angle | None = key(
+    roll_deg: values.Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: values.Angle | None = key("pitch at arrival [deg]")
+    yaw_deg: values.Angle | None = key(
         "yaw at arrival [deg]; if one angle is given, the default of the others is 0"
     )
 
@@ -230,12 +210,12 @@ class Shaping(AnyPhase):
         "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
         "shape",
     )
-    blend: Duration = key(
+    blend: values.Duration = key(
         "duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
         4.0,
     )
 
-    position: Vector | None = key(
+    position: values.Vector | None = key(
         "centre of mass at the end, at rest [x, y, z] [m]; default: as before"
     )
 
@@ -245,7 +225,7 @@ class Shaping(AnyPhase):
         return () if self.position is None else ("position", "velocity")
 
     @property
-    def place(self) -> Vector | None:
+    def place(self) -> values.Vector | None:
         """The position, if it is commanded."""
         return self.position
 
@@ -291,7 +271,7 @@ class Reshape(Shaping):
         "within limits.speed and acceleration, and proved; auto: straight if that keeps limits.separation, else layers",
         "straight",
     )
-    control_points: tuple[tuple[Vector, ...], ...] | None = key(
+    control_points: tuple[tuple[values.Vector, ...], ...] | None = key(
         "bent ways to the new slots over `blend`: control points of uniform cubic B-splines, a row of "
         "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'"
     )
@@ -317,11 +297,11 @@ class Steering(Attitude, AnyPhase):
 
     moves: ClassVar[bool] = True
 
-    travel: Duration | None = key(
+    travel: values.Duration | None = key(
         "time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
         "limits"
     )
-    rates_deg_s: Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
+    rates_deg_s: values.Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
 
     @property
     def meets(self) -> tuple[str, ...]:
@@ -338,19 +318,21 @@ class Steering(Attitude, AnyPhase):
 class Through(Part):
     """A point that a `fly` phase passes without a stop."""
 
-    position: Vector = required_key("centre of mass [x, y, z] [m]")
-    time: Time | None = key(
+    position: values.Vector = required_key("centre of mass [x, y, z] [m]")
+    time: values.Time | None = key(
         "time from the start of the phase [s]; default: the times with the least snap"
     )
-    velocity: Velocity | None = key("its velocity then [m/s]; default: the one with the least snap")
+    velocity: values.Velocity | None = key(
+        "its velocity then [m/s]; default: the one with the least snap"
+    )
 
 
 class Fly(Steering):
     """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
 
     kind: Literal["fly"] = required_key("fly to a waypoint")
-    position: Vector = required_key("centre of mass at arrival [x, y, z] [m]")
-    velocity: VelocityOrFree = key(
+    position: values.Vector = required_key("centre of mass at arrival [x, y, z] [m]")
+    velocity: values.VelocityOrFree = key(
         "its velocity at arrival [m/s]; free: any, not judged", (0.0, 0.0, 0.0)
     )
     through: tuple[Through, ...] = key(
@@ -387,15 +369,15 @@ class Go(Attitude, AnyPhase):
     body_control: ClassVar[str] = "tracking"
 
     kind: Literal["go"] = required_key("fly to a pose, on a way that is found round obstacles")
-    position: Vector = required_key("centre of mass at arrival [x, y, z] [m]")
-    clearance: LengthOrZero = key(
+    position: values.Vector = required_key("centre of mass at arrival [x, y, z] [m]")
+    clearance: values.LengthOrZero = key(
         "least distance of vehicles from obstacles on the planned way [m]", 0.2
     )
     formations: tuple[str, ...] | None = key(
         "formations that may be taken on the way; default: all that have slots. The phase ends in the "
         "formation in which it begins"
     )
-    scales: tuple[Scale, ...] = key(
+    scales: tuple[values.Scale, ...] = key(
         "factors by which formations may shrink on the way, below 1; default: none", ()
     )
 
@@ -423,7 +405,9 @@ class Arriving(AnyPhase):
     moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    travel: Time | None = key("time from the start to the arrival [s]; default: the whole phase")
+    travel: values.Time | None = key(
+        "time from the start to the arrival [s]; default: the whole phase"
+    )
 
 
 class Brake(Arriving):
@@ -437,10 +421,10 @@ class Vertical(Arriving):
 
     grounded: ClassVar[bool] = True
 
-    agents: tuple[AgentNumber, ...] = key(
+    agents: tuple[values.AgentNumber, ...] = key(
         "numbers of the vehicles that move; the others stay. Default: all", ()
     )
-    stagger: Time | None = key(
+    stagger: values.Time | None = key(
         "time [s] from one group's start to the next's; all arrive by the end of the phase, each before "
         "the next starts. Default: all start together"
     )
@@ -475,7 +459,9 @@ class Takeoff(Vertical):
     """Climb straight up from the ground, until all vehicles are at one height."""
 
     kind: Literal["takeoff"] = required_key("climb straight up to a level height")
-    height: Length = required_key("height of the vehicles' centres above the ground on arrival [m]")
+    height: values.Length = required_key(
+        "height of the vehicles' centres above the ground on arrival [m]"
+    )
 
     @property
     def level(self) -> float | None:
@@ -535,7 +521,7 @@ class Follow(Cruising):
     axes: str | None = key(
         "where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d"
     )
-    trajectories: Trajectories | None = key(
+    trajectories: values.Trajectories | None = key(
         "of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
         "the coefficients of x, y, z [m] and yaw [rad], in ascending powers of the time since its beginning, equally "
         "many of each (at most 8)"
@@ -545,7 +531,7 @@ class Follow(Cruising):
         "the file. The yaw of single vehicles follows [yaw]",
         "fixed",
     )
-    travel: Time | None = key(
+    travel: values.Time | None = key(
         "time from the start to the end of the trajectories [s]; default: the whole phase, whose default "
         "is the time in the file. With another time, all speeds scale"
     )
@@ -598,9 +584,9 @@ class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
     kind: Literal["orbit"] = required_key("circle a point")
-    centre: Vector = required_key("centre of the horizontal circle [x, y, z] [m]")
-    radius: Length = required_key("radius of the circle [m]")
-    rate_deg_s: Angle = required_key(
+    centre: values.Vector = required_key("centre of the horizontal circle [x, y, z] [m]")
+    radius: values.Length = required_key("radius of the circle [m]")
+    rate_deg_s: values.Angle = required_key(
         "angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
     )
     yaw: Literal["fixed", "along"] = key(
@@ -608,7 +594,7 @@ class Orbit(Cruising):
         "side towards the centre as at the start",
         "fixed",
     )
-    blend: Duration = key(
+    blend: values.Duration = key(
         "duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
         "the limits",
         4.0,
@@ -630,8 +616,8 @@ def seconds(time: float | Literal["auto"]) -> float:
     return math.nan if isinstance(time, str) else time
 
 
-def _vector(values: Sequence[float], unit: str) -> str:
-    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
+def _vector(numbers: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in numbers)}) {unit}"
 
 
 Phase = Annotated[

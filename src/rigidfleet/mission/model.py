@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
-from rigidfleet._common.kept import kept
 from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
@@ -592,7 +591,7 @@ class Mission(Contents, Shown):
         words += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
         return " and ".join(words)
 
-    @property
+    @cached_property
     def aborting(self) -> Aborting:
         """How the flight is aborted: [abort], or its defaults."""
         return self.abort or Aborting.model_construct()
@@ -600,16 +599,16 @@ class Mission(Contents, Shown):
     @property
     def abandons_at(self) -> float:
         """Time [s] at which the flight leaves its plan, for a loss that is answered or an abort; infinity if never."""
-        return min(self._answers)
+        return min(self._loss_and_order)
 
     @property
     def aborts(self) -> bool:
         """Whether it then aborts, by [abort]."""
-        loss, abort = self._answers
+        loss, abort = self._loss_and_order
         return abort < loss
 
     @property
-    def _answers(self) -> tuple[float, float]:
+    def _loss_and_order(self) -> tuple[float, float]:
         """Times [s] at which the others brake after a loss, and at which the flight aborts; infinity if never."""
         options, loss = self.aborting, math.inf if self.on_loss == "continue" else self.first_loss
         order = math.inf if options.at is None else options.at
@@ -626,17 +625,6 @@ class Mission(Contents, Shown):
 def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
     least, most = _DAMPING
-    m = masses.tolist()
-    # J M^-1 J^T is at least J J^T / max m: with enough of this, no mass of a sweep needs its own decomposition.
-    w = sum(m) / len(m) / max(m) * _smallest_eigenvalue(slots, edges, None)
-    if not w > 4 * most:
-        w = _smallest_eigenvalue(slots, edges, masses)
-    return min(max(w / 4, least), most)
-
-
-# Saves a twentieth of a short flight, such as narrow-passage.
-@kept
-def _smallest_eigenvalue(slots: Floats, edges: Ints, masses: Floats | None) -> float:
-    """The smallest non-zero eigenvalue w of mbar J M^-1 J^T, or of J J^T without masses."""
     J = constraint_jacobian.jacobian(slots[None], edges)
-    return float(constraint_jacobian.smallest_of(J, masses)[0]) ** 2
+    w = float(constraint_jacobian.smallest_of(J, masses)[0]) ** 2  # of mbar J M^-1 J^T
+    return min(max(w / 4, least), most)

@@ -10,23 +10,11 @@ import numpy as np
 from pydantic import Field
 
 from rigidfleet.math.attitude import dcm_from_euler
-from rigidfleet.mission import bounds
+from rigidfleet.mission import bounds, values
 from rigidfleet.mission.files import FILL, NOT_A_FILE, without_data
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.rules import Breach, Breaches
-from rigidfleet.mission.values import (
-    Angle,
-    Coordinate,
-    Flag,
-    Length,
-    Part,
-    Seconds,
-    Vector,
-    Velocity,
-    key,
-    models_by_kind,
-    required_key,
-)
+from rigidfleet.mission.values import Part, key, models_by_kind, required_key
 from rigidfleet.solids import records
 from rigidfleet.solids.records import Form, Solids
 
@@ -38,7 +26,9 @@ class Solid(Part):
     """An obstacle, which is a solid shape; distances to it are those of `rigidfleet.solids`."""
 
     name: str = key("name; default: the kind and a number", "")
-    zone: Flag = key("true: a no-fly zone; judged as an obstacle, and drawn as a zone", False)
+    zone: values.Flag = key(
+        "true: a no-fly zone; judged as an obstacle, and drawn as a zone", False
+    )
 
     @property
     @abstractmethod
@@ -76,16 +66,18 @@ class Solid(Part):
 class Moving(Solid):
     """An obstacle that may move, without turning."""
 
-    velocity: Velocity | None = key("constant velocity [m/s], from the start of the mission")
-    waypoints: tuple[Vector, ...] | None = key(
+    velocity: values.Velocity | None = key("constant velocity [m/s], from the start of the mission")
+    waypoints: tuple[values.Vector, ...] | None = key(
         "places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant "
         "speed, at rest before the first and after the last"
     )
-    times: tuple[Seconds, ...] | None = key("mission times of the waypoints [s], increasing")
-    appears: Seconds | None = key(
+    times: tuple[values.Seconds, ...] | None = key("mission times of the waypoints [s], increasing")
+    appears: values.Seconds | None = key(
         "mission time from which the obstacle is there [s]; default: from the start"
     )
-    vanishes: Seconds | None = key("mission time until which it is there [s]; default: to the end")
+    vanishes: values.Seconds | None = key(
+        "mission time until which it is there [s]; default: to the end"
+    )
 
     @property
     def motion(self) -> tuple[Any, Any]:
@@ -116,11 +108,11 @@ class Box(Moving):
     """A box, parallel to the world axes or turned."""
 
     kind: Literal["box"] = required_key("a box, parallel to the world axes unless turned")
-    min: Vector = required_key("lowest corner [x, y, z] [m], before turning")
-    max: Vector = required_key("highest corner [x, y, z] [m], before turning")
-    roll_deg: Angle = key("roll [deg] about the box's centre, 3-2-1 Euler angles", 0.0)
-    pitch_deg: Angle = key("pitch [deg]", 0.0)
-    yaw_deg: Angle = key("yaw [deg]", 0.0)
+    min: values.Vector = required_key("lowest corner [x, y, z] [m], before turning")
+    max: values.Vector = required_key("highest corner [x, y, z] [m], before turning")
+    roll_deg: values.Angle = key("roll [deg] about the box's centre, 3-2-1 Euler angles", 0.0)
+    pitch_deg: values.Angle = key("pitch [deg]", 0.0)
+    yaw_deg: values.Angle = key("yaw [deg]", 0.0)
 
     @property
     def corners(self) -> tuple[float, ...] | None:
@@ -150,8 +142,8 @@ class Sphere(Moving):
     """A sphere."""
 
     kind: Literal["sphere"] = required_key("a sphere")
-    centre: Vector = key("centre [x, y, z] [m]", (0.0, 0.0, 0.0))
-    radius: Length = required_key("radius [m]")
+    centre: values.Vector = key("centre [x, y, z] [m]", (0.0, 0.0, 0.0))
+    radius: values.Length = required_key("radius [m]")
 
     @property
     def form(self) -> Form:
@@ -163,10 +155,10 @@ class Cylinder(Moving):
     """A cylinder along any axis."""
 
     kind: Literal["cylinder"] = required_key("a cylinder along any axis, with flat ends")
-    ends: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=2)] = required_key(
+    ends: Annotated[tuple[values.Vector, ...], Field(min_length=2, max_length=2)] = required_key(
         "centres of the two ends, [[x, y, z], [x, y, z]] [m]"
     )
-    radius: Length = required_key("radius [m]")
+    radius: values.Length = required_key("radius [m]")
 
     @property
     def form(self) -> Form:
@@ -178,7 +170,7 @@ class Hull(Moving):
     """The convex hull of points."""
 
     kind: Literal["hull"] = required_key("the convex hull of points; its centre is their mean")
-    points: Annotated[tuple[Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = (
+    points: Annotated[tuple[values.Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = (
         required_key("points [x, y, z] [m], four or more, not all in a plane")
     )
 
@@ -194,11 +186,11 @@ class Heights(Solid):
     kind: Literal["heights"] = required_key(
         "everything between a surface of given heights and a base, over a rectangle"
     )
-    corner: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)] = key(
+    corner: Annotated[tuple[values.Coordinate, ...], Field(min_length=2, max_length=2)] = key(
         "place [x, y] [m] of the first height", (0.0, 0.0)
     )
-    spacing: Length = required_key("distance between neighbouring heights along x and y [m]")
-    heights: tuple[tuple[Coordinate, ...], ...] | None = key(
+    spacing: values.Length = required_key("distance between neighbouring heights along x and y [m]")
+    heights: tuple[tuple[values.Coordinate, ...], ...] | None = key(
         "heights [m]: a list for each x, in which y increases; each square between four heights is two "
         "triangles, divided from its lowest x and y to its highest"
     )
@@ -206,7 +198,7 @@ class Heights(Solid):
         "instead of heights: a CSV or NPY file with them, relative to the mission file; the result holds "
         "the heights themselves"
     )
-    base: Coordinate | None = key(
+    base: values.Coordinate | None = key(
         "height of the underside [m]; default: as far below the lowest height as the map is wide"
     )
 
@@ -224,7 +216,7 @@ class Ground(Part):
 
     kind: Literal["ground"] = required_key("everything below a height")
     name: str = key("name; default: 'ground'", "")
-    height: Coordinate = key("height of the ground [m]", 0.0)
+    height: values.Coordinate = key("height of the ground [m]", 0.0)
 
     @property
     def zone(self) -> bool:

@@ -31,7 +31,13 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import is_ground
-from rigidfleet.planning.certificate import Certificate, certificate_of, in_step, of_ways
+from rigidfleet.planning.certificate import (
+    CLOSE,
+    Certificate,
+    certificate_of,
+    in_step,
+    of_ways,
+)
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
@@ -107,12 +113,12 @@ class Step(NamedTuple):
 
 
 class Home(NamedTuple):
-    """Steps from rest, what their way is called, why there are none, and their number, which aborts may share."""
+    """Steps from rest, what their way is called, why there is none, and its number, which aborts may share."""
 
     steps: tuple[Step, ...] = ()
     way: str = ""
     reason: str = ""
-    number: int = 0
+    number: int | None = None
 
 
 @dataclass(frozen=True)
@@ -283,7 +289,8 @@ class Aborts:
             if self.lost.any():
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
             least = min(least, proved or least)
-        return Step(name, way, least._replace(time=0.0), self._off(way), end)
+        # Its polynomials differ from the plan's ways by less than `CLOSE`.
+        return Step(name, way, least._replace(time=0.0), self._off(way) + CLOSE, end)
 
     def slow_down(self, begins: float) -> tuple[Step, str]:
         """Slow down along the plan from a time on [s], in the least time that keeps the limits, or fly to its landing.

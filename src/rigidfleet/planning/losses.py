@@ -82,10 +82,15 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
     legs: list[Leg] = []
 
-    def then(make: Callable[[float], Phase], least: float = _SHORTEST) -> None:
+    def then(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
+        """Add the leg of a phase; with ``freely``, only if it leads into nothing. Return whether it was added."""
         nonlocal now
-        legs.append(_shortest(mission, now, make, least))
-        now = legs[-1].after
+        leg = _shortest(mission, now, make, _SHORTEST)
+        if freely and _hits(mission, leg):
+            return False
+        legs.append(leg)
+        now = leg.after
+        return True
 
     start = now
     then(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
@@ -102,26 +107,34 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
             legs.append(leg_of(mission, Hold(kind="hold", name="hold (loss)", until=until), now))
         return legs
     name = d.landing_formation
+    shaped = now.formation is not None
     if name is not None and name != now.formation:
         spread = partial(Reshape, kind="reshape", name="spread (loss)", formation=name)
-        then(lambda t: spread(blend=t, duration=t))
+        shaped = then(lambda t: spread(blend=t, duration=t), freely=True)
     assert now.goal is not None
     axes = now.goal.T.T
-    if now.formation is not None and math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
+    if shaped and math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
         yaw = math.degrees(math.atan2(axes[1, 0] - axes[0, 1], axes[0, 0] + axes[1, 1]))
         level = partial(Turn, kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0)
-        then(lambda t: level(yaw_deg=yaw, duration=t))
+        shaped = then(lambda t: level(yaw_deg=yaw, duration=t), freely=True)
+    everyone = tuple(range(1, mission.n_agents + 1))
     land = partial(Land, kind="land", name="land (loss)")
-    depth = height(mission, now)
-    if now.formation is None:  # each by itself
-        land = partial(land, agents=tuple(range(1, mission.n_agents + 1)))
-        depth = -float(rises(mission, land(duration=1.0), now).min())
-    if depth > 0.0:
-        least = max(
-            _PEAK_SPEED * depth / DESCENT, math.sqrt(_PEAK_ACCELERATION * depth / _DESCENDING)
+    each = partial(land, agents=everyone)
+    ways = [(each, -float(rises(mission, each(duration=1.0), now).min()))]
+    if shaped:  # together, unless something is below some
+        ways.insert(0, (land, height(mission, now)))
+    for make, depth in ways:
+        if depth <= 0.0:
+            return legs
+        speed, acceleration = (
+            _PEAK_SPEED * depth / DESCENT,
+            _PEAK_ACCELERATION * depth / _DESCENDING,
         )
-        then(lambda t: land(duration=t), max(least, _SHORTEST))
-    return legs
+        least = max(speed, math.sqrt(acceleration), _SHORTEST)
+        down = _shortest(mission, now, lambda t, make=make: make(duration=t), least)
+        if not _hits(mission, down):
+            break
+    return [*legs, down]
 
 
 def _hits(mission: Mission, leg: Leg) -> bool:

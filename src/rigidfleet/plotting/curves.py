@@ -192,9 +192,7 @@ def widen_limits(ax: Axes, least: float) -> None:
 
 def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
     """Time [s] and value of the waypoints that the flight reached."""
-    targets = [p.target for p in result.phases if p.target is not None]
-    moments = (at for target in targets for at in (*target.get("through", ()), target))
-    values = [(at["time"], at.get(key)) for at in moments]
+    values = [(at["time"], at.get(key)) for _, at in st.targets(result)]
     return [(t, value) for t, value in values if value is not None and t <= result.time[-1] + 1e-9]
 
 
@@ -268,7 +266,10 @@ def attitude(result: Result) -> Figure:
 
 
 def draw_thrust(ax: Axes, result: Result) -> None:
-    """Thrust of each agent with its limit, from zero."""
+    """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
+    if not np.isfinite(result.thrust).any() and np.isfinite(result.slot_position).any():
+        quadrotors.draw_off_slot(ax, result)
+        return
     ax.set_ylabel("thrust [N]")
     if not np.isfinite(result.thrust).any():
         st.write_note(ax, "forces are not known")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.facts import value
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
 from rigidfleet.typing import Bools, Floats
@@ -59,7 +60,7 @@ class OffPlan(NamedTuple):
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
         for i, off in enumerate(self.off.T):
-            for a, b in _joined(runs(off), time):
+            for a, b in _spans(runs(off), time):
                 k = a + int(np.nanargmax(self.far[a:b, i]))
                 ends = float(time[a]), float(time[b - 1])
                 drifts.append(Drift(i, *ends, float(self.far[k, i]), float(time[k])))
@@ -72,7 +73,7 @@ def runs(mask: Bools) -> list[tuple[int, int]]:
     return list(pairwise(ends))[::2]
 
 
-def _joined(spans: list[tuple[int, int]], time: Floats) -> list[tuple[int, int]]:
+def _spans(spans: list[tuple[int, int]], time: Floats) -> list[tuple[int, int]]:
     """Runs of samples, those that follow soon after another joined to it."""
     joined: list[tuple[int, int]] = []
     for a, b in spans:
@@ -131,12 +132,12 @@ def plan_and_flight(result: Result) -> Figure:
             below.plot(time[k], 1e3 * off.far[k, i], **bold)
         if mine:
             worst = max(mine, key=lambda drift: drift.worst)
-            words = f"{names[i]}: {1e3 * worst.worst:.3g} mm at {worst.at:.2f} s"
+            words = f"{names[i]}: {value(1e3 * worst.worst, 'mm')} at {worst.at:.2f} s"
             place = st.places_around(worst.at, 1e3 * worst.worst)
             st.annotate(below, words, place, color=colours[i])
     below.set_ylim(0.0, 1.25 * float(np.fmax.reduce(high, axis=None, initial=1e-3)))
     words = "unusual from" if result.mission.limits.tracking_error is None else "limit"
-    st.draw_limit(below, 1e3 * off.limit, f"{words} {1e3 * off.limit:.3g} mm")
+    st.draw_limit(below, 1e3 * off.limit, f"{words} {value(1e3 * off.limit, 'mm')}")
     above.set(xlabel="x, east [m]", ylabel="y, north [m]")
     above.set_aspect("equal", adjustable="datalim")
     below.set(xlabel="time [s]", ylabel="distance from the slot [mm]")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.result import Result
+from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -183,6 +183,12 @@ def time_figure(
     axes = axes.reshape(stacked).T if stacked else axes
     _name_phases(axes[0], result)
     return fig, axes
+
+
+def targets(result: Result) -> list[tuple[PhaseRecord, dict[str, Any]]]:
+    """All that phases are to reach: points to pass on the way, and the target at the end."""
+    reached = ((p, p.target) for p in result.phases if p.target is not None)
+    return [(p, at) for p, target in reached for at in (*target.get("through", ()), target)]
 
 
 def draw_head(fig: Figure, result: Result, title: str) -> None:

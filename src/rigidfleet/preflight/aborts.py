@@ -119,11 +119,12 @@ class AbortsCheck(Shown):
         Each vehicle flies its own trajectory until the abort begins and has waited, slows down along it by the clock,
         so that its time along it goes on by T (x - 2.5 x^4 + 3 x^5 - x^6), with x the share of the time T of slowing
         down, and flies straight from place to place, by the share 35 x^4 - 84 x^5 + 70 x^6 - 20 x^7 of each way. In a
-        step with ``back_to_s``, its time along its trajectory goes back to that, by the same share.
+        step with ``back_to_s``, its time along its trajectory goes back to that, by the same share. Where ``ways`` is
+        null, it flies its own trajectory to the end.
         """
         folder.mkdir(parents=True, exist_ok=True)
         data = self.data()
-        homes = {x.home.number: x.home.steps for x in self.aborts}
+        homes = {x.home.number: x.home.steps for x in self.aborts if x.home.number is not None}
         keys = ("ordered_s", "begins_s", "waits_s", "stops_s", "ways")
         aborts = [{key: x[key] for key in keys} for x in data["aborts"] if x["way"]]
         tables = {"aborts.json": data}

@@ -239,7 +239,8 @@ def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
     when = f"{worst.when:.2f} s" + ", at samples" * worst.at_samples
     margin, at = Cell(left, share=row.used), Cell(when, worst.phase)
-    return row.fact.bound, value(worst.value, row.unit), margin, at, worst.who
+    size = Cell(value(worst.value, row.unit), row.fact.doubt)
+    return row.fact.bound, size, margin, at, worst.who
 
 
 def _safety_cell(name: str, row: Safety | None) -> Cell:

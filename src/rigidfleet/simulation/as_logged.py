@@ -29,6 +29,7 @@ from rigidfleet.math.smoothing import (
     knots_over,
     noise_of,
     smooth,
+    spline_states,
 )
 from rigidfleet.result import Extremum, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
@@ -91,37 +92,49 @@ def judge_log(
     if plan is not None and plan.n_agents != len(read.names):
         words = f"has {plan.n_agents} agents, and the log {len(read.names)} vehicles"
         raise TrajectoryError(f"the plan {plan.mission.name!r} {words}. Give the log of each.")
-    logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
-    own_sizes = [
-        x.deviation for x in read.measured if x.deviation is not None and (x.deviation > 0.0).all()
-    ]
-    if doubts.noise == "log" and len(own_sizes) < len(logs):
-        raise TrajectoryError(
-            f"{read.names[0]}: the log does not say its noise. State it: --noise."
-        )
-    if doubts.noise in ("log", "") and len(own_sizes) == len(logs):
-        # The least of a log is the unit.
-        least = float(min(x.min() for x in own_sizes))
-        doubts = doubts._replace(noise=least)
-        sizes = (np.sqrt((x**2).mean(axis=1)) / least for x in own_sizes)
-        logs = [log._replace(scale=size) for log, size in zip(logs, sizes, strict=True)]
     if read.own_clocks:
         if plan is None:
             raise TrajectoryError(
                 "each vehicle has a clock of its own. Give a plan to compare them with."
             )
         doubts = doubts._replace(clock="own")
+    flown, drawn, estimate, alignment = _likely_flight(read, plan, doubts, judged)
+    deviations = None if drawn is None else DrawnWays(flown, drawn)
+    facts = facts_of(flown, deviations, estimate, alignment, doubts.clock)
+    verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
+    flown.statistics["doubt"] = facts
+    return flown, verdict
+
+
+def _likely_flight(
+    read: Trajectories, plan: Result | None, doubts: Doubts, judged: dict[str, Any]
+) -> tuple[Result, Any, NoiseEstimate, Alignment | None]:
+    """The likely flight of a log, how ways drawn differ from it, and what is known of noise, clock and set-up."""
+    logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
+    sizes = [x.deviation for x in read.measured if x.deviation is not None]
+    told = len(sizes) == len(logs) and all((x > 0.0).all() for x in sizes)
+    if doubts.noise == "log" and not told:
+        raise TrajectoryError(
+            f"{read.names[0]}: the log does not say its noise. State it: --noise."
+        )
+    if doubts.noise in ("log", "") and told:
+        # The least of a log is the unit.
+        least = float(min(x.min() for x in sizes))
+        doubts = doubts._replace(noise=least)
+        scales = (np.sqrt((x**2).mean(axis=1)) / least for x in sizes)
+        logs = [log._replace(scale=scale) for log, scale in zip(logs, scales, strict=True)]
     step = max(_STEP, *(float(np.median(np.diff(log.time))) for log in logs))
     estimate = _noise_of_logs(logs, doubts, step)
     noise = estimate.noise or PositionNoise(math.nan)
     planned = None if plan is None else _planned_ways(plan)
-    alignment, offsets = None, np.zeros(len(logs))
+    alignment, smoothed, late = None, _smooth_all(logs, noise, step), np.zeros(1)
     if planned is not None:
-        smoothed = _smooth_all(logs, noise, step)
         alignment = _alignment(smoothed, logs, planned, doubts.clock)
-        offsets = _offsets(alignment, doubts.clock)
-        logs = [log._replace(time=log.time - by) for log, by in zip(logs, offsets, strict=True)]
-    smoothed = _smooth_all(logs, noise, step)
+        offsets, late = _offsets(alignment, doubts.clock)
+        every = np.broadcast_to(offsets, len(logs))
+        logs = [log._replace(time=log.time - by) for log, by in zip(logs, every, strict=True)]
+        if offsets.any():
+            smoothed = _smooth_all(logs, noise, step)
     # Beside a plan, a sample counts a usual step beyond it, by part of which clocks may be off.
     ends = np.array([log.time[[0, -1]] for log in logs])
     if planned is not None:
@@ -137,32 +150,24 @@ def judge_log(
         )
     else:
         flown = flight_of_plan(plan, planned, whole, spans)
-    touch = _TOUCH * np.nan_to_num(noise.sigma)
-    more = {
-        "names": list(read.names),
-        "notes": list(read.notes),
-        "read": list(read.read),
-        "touch": touch,
-    }
-    flown.statistics |= more
-    deviations = None
-    if estimate.noise is not None:
-        # Noise of a known size and an unknown course may be any of several; each gives ways of its own.
-        unknown = _COURSES if estimate.words and estimate.source == "stated" else ()
-        models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau), step) for tau in unknown)]
-        late = alignment.fit[1, 0] if alignment and doubts.clock == "offset" else 0.0
-        deviations = DrawnWays(flown, _deviations(flown, models, late))
-        if plan is not None:
-            step = -(-len(flown.time) // _BANDS)
-            place = np.linalg.norm(deviations.states[:, 0, ::step], axis=3).max(axis=0).round(6)
-            flown.statistics["bands"] = {
-                "time": flown.time[::step].tolist(),
-                "place": place.tolist(),
-            }
-    facts = facts_of(flown, deviations, estimate, alignment, doubts.clock)
-    verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
-    flown.statistics["doubt"] = facts
-    return flown, verdict
+    del whole, planned  # large
+    zero = flown.statistics.get("clock", 0.0)
+    resets = [t for log, x in zip(logs, read.measured, strict=False) for t in log.time[x.resets]]
+    flown.statistics |= {
+        "names": list(read.names), "notes": list(read.notes), "read": list(read.read),
+        "touch": _TOUCH * np.nan_to_num(noise.sigma), "resets": [round(t - zero, 6) for t in sorted(resets)],
+    }  # fmt: skip
+    if estimate.noise is None:
+        return flown, None, estimate, alignment
+    # Noise of a known size and an unknown course may be any of several; each gives ways of its own.
+    unknown = _COURSES if estimate.words and estimate.source == "stated" else ()
+    models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau), step) for tau in unknown)]
+    drawn = _deviations(flown, models, late)
+    if plan is not None:
+        few = slice(None, None, -(-len(flown.time) // _BANDS))
+        place = np.linalg.norm(drawn[:, 0, few], axis=3).max(axis=0).round(6)
+        flown.statistics["bands"] = {"time": flown.time[few].tolist(), "place": place.tolist()}
+    return flown, drawn, estimate, alignment
 
 
 def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts, step: float) -> NoiseEstimate:
@@ -204,17 +209,17 @@ def _alignment(
 
 
 def _offsets(alignment: Alignment, clock: Clock) -> Floats:
-    """By how much the stamps of each vehicle (N,) are late [s], as far as that is taken out.
+    """By how much stamps are late (2, N or 1) [s] and the error, as far as that is taken out: of each, or of all.
 
     Raises
     ------
     TrajectoryError
         The offset cannot be told.
     """
-    own, every = alignment.own[0], alignment.fit[0, 0]
+    every = alignment.fit[:, :1]
     if clock == "recorded":
-        return np.zeros(len(own))
-    offsets = np.full(len(own), every) if clock == "offset" else np.where(np.isnan(own), every, own)
+        return np.zeros((2, 1))
+    offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
         raise TrajectoryError(
             "the clock cannot be told: the plan hardly moves. Use --clock recorded."
@@ -222,21 +227,22 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
     return offsets
 
 
-def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: float) -> Any:
-    """By how much ways drawn differ from the likely one (S, 3, K, N, 3); ``late``: the error of a common clock [s]."""
+def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Floats) -> Any:
+    """By how much ways drawn differ from the likely one (S, 3, K, N, 3); ``late``: errors of clocks (N or 1,) [s]."""
     random, time = np.random.default_rng(0), flown.time + flown.statistics.get("clock", 0.0)
     count = int(np.clip(_KNOTS // sum(len(x.knots) for x in models[0]), _LEAST, _MOST))
+    shares = [len(range(k, count, len(models))) for k in range(len(models))]
     off = np.zeros((count, 3, *flown.position.shape), dtype=np.float32)
-    for i, each in enumerate(models[0]):
+    for i, likely in enumerate(models[0]):
         inside = flown.left[:, i]
-        t = time[inside]
-        ways = [(model[i], model[i].way.states(t, 3) - each.way.states(t, 3)) for model in models]
-        for s in range(count):
-            other, apart = ways[s % len(ways)]
-            off[s][:, inside, i] = apart + other.deviation(random).states(t, 3)
+        drawn = [model[i].draw(share, random) for model, share in zip(models, shares, strict=True)]
+        points = np.concatenate(drawn, axis=2) - likely.points[..., None]
+        off[:, :, inside, i] = np.moveaxis(
+            spline_states(likely.knots, points, time[inside], 3), -1, 0
+        )
     rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
-    for s, by in enumerate(late * random.standard_normal(count)):
-        off[s, :2] += by * rates
+    for s, by in enumerate(late * random.standard_normal((count, len(late)))):
+        off[s, :2] += by[:, None] * rates
     return off
 
 

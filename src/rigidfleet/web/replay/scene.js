@@ -596,7 +596,7 @@ class Area {
   constructor({ name, kind, hatched, rings, heights }, info, upload) {
     const all = rings.flat(), low = heights[0] ?? info.ground;
     const wide = [0, 1].map((a) => Math.max(...all.map((p) => p[a])) - Math.min(...all.map((p) => p[a])));
-    const high = heights[1] ?? low + 0.5 * Math.max(...wide), full = kind === "soft" ? 0.1 : 0.16;
+    const high = heights[1] ?? low + 0.5 * Math.max(...wide), full = { soft: 0.05, fence: 0.09, people: 0.13 }[kind];
     const at = ([x, y], z) => [x, y, z], mesh = new Mesh();
     const [far, near] = [heights[1] === null ? 0 : full, full];
     this.name = name;

@@ -86,16 +86,16 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
 def _areas(mission: Mission) -> list[dict[str, Any]]:
     """Fences and places with people: their rings (m, 2) [m], and their heights [m], None where they have no end."""
 
-    def described(area: Fence | People, kind: str, *, hatched: bool) -> dict[str, Any]:
+    def entry(area: Fence | People, kind: str, *, hatched: bool) -> dict[str, Any]:
         rings = [ring for rings in area.polygons(mission.geodetic_origin) for ring in rings]
         heights = [x if np.isfinite(x) else None for x in area.heights(mission.ground)]
         return {"name": area.name, "kind": kind, "hatched": hatched, "rings": rings, "heights": heights}  # fmt: skip
 
     fences = [
-        described(x, "soft" if x.soft else "fence", hatched=x.kind == "exclusion")
+        entry(x, "soft" if x.soft else "fence", hatched=x.kind == "exclusion")
         for x in mission.fences
     ]
-    return [*fences, *(described(x, "people", hatched=True) for x in mission.people)]
+    return [*fences, *(entry(x, "people", hatched=True) for x in mission.people)]
 
 
 def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
