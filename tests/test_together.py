@@ -17,7 +17,7 @@ from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.flight import Flight, simulate
-from rigidfleet.simulation.together import simulate_together
+from rigidfleet.simulation.together import MOST_VEHICLES, simulate_together
 
 
 def varied(name: str, change: Any, count: int = 8) -> list[Mission]:
@@ -147,7 +147,7 @@ def test_missions_of_other_kinds_are_flown_as_alone():
 
 def test_many_vehicles_are_flown_one_by_one(monkeypatch):
     """No code is generated for more vehicles than it is worth, and each flies bit for bit as alone."""
-    n = together.MOST_VEHICLES + 1
+    n = MOST_VEHICLES + 1
     data = {
         "schema_version": 1, "name": "row", "output_step": 0.5,
         "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 1.0] for i in range(n)]},
@@ -157,7 +157,7 @@ def test_many_vehicles_are_flown_one_by_one(monkeypatch):
     missions = [
         Mission.from_dict(data | {"disturbances": {"wind": [by, 0.0, 0.0]}}) for by in (0.0, 1.0)
     ]
-    monkeypatch.setattr(together, "_vector", lambda _: pytest.fail("code is generated"))
+    monkeypatch.setattr(batch, "Vector", lambda _: pytest.fail("code is generated"))
     for one, other in zip(simulate_together(missions), alone(missions), strict=True):
         np.testing.assert_array_equal(one.position, other.position)
 
