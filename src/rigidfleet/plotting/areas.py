@@ -75,12 +75,8 @@ def falls_of(result: Result) -> Floats:
         return np.full((*result.position.shape[:2], 2), np.nan)
     boundaries, states = Boundaries(mission), (result.position, result.velocity)
     level = mission.ground if np.isfinite(mission.ground) else 0.0
-    if mission.roofs.kind.size:
-        level = min(
-            level,
-            *(float(np.min(np.asarray(x.heights))) for x in mission.solids if x.kind == "heights"),
-            0.0,
-        )
+    terrain = [np.array(x.heights).min() for x in mission.solids if x.kind == "heights"]
+    level = min([level, *terrain])
     places = boundaries.landings(*states, level)
     for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
         height = level + share * (result.position[..., 2] - level)

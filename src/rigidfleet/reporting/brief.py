@@ -51,17 +51,18 @@ def plan(result: Result) -> list[str]:
     count = Counter(mission.vehicles[name].model for name in mission.agents.vehicle)
     what = ", ".join(f"{n} × {name}" for name, n in count.items())
     what += f"{', ' * bool(count)}{mass[0]:.4g}{f' to {mass[-1]:.4g}' * (len(mass) > 1)} kg"
-    how = f" ({what}) for {lasting}: {', '.join(dict.fromkeys(x.name for x in result.phases))}"
-    if result.interpolation is not None:
-        how = f" for {lasting}, as others planned it: {result.interpolation}"
+    phases = ", ".join(dict.fromkeys(phase.name for phase in result.phases))
+    made_by_others = result.interpolation is not None
+    how = f", as others planned it: {result.interpolation}" if made_by_others else f": {phases}"
     edges = {name: len(mission.formation_edges(name)) for name in mission.formations}
     held = ", ".join(f"{name} ({n} edges)" for name, n in edges.items() if n)
     fastest = result.extreme("speed")
-    ends = f"They reach up to {value(float(np.nanmax(result.position[..., 2])), 'm')}"
+    ends = "" if made_by_others else f"{what}. "
+    ends += f"They reach up to {value(float(np.nanmax(result.position[..., 2])), 'm')}"
     ends += "" if fastest is None else f" and {value(fastest.value, 'm/s')}"
     ends += f". Distances are held in {held}" * bool(held)
     number = "One vehicle flies" if result.n_agents == 1 else f"{result.n_agents:,} vehicles fly"
-    return [f"{number}{how}.", f"{ends}."]
+    return [f"{number} for {lasting}{how}.", f"{ends}."]
 
 
 def _proofs(result: Result, verdict: Verdict) -> list[str]:
