@@ -13,7 +13,7 @@ BUILD := $(BIN)/uv build --quiet --python $(BIN)/python --build-constraints cons
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test versions door bench peers robustness avoidance network evening exports replays docs package lint format constraints clean
+.PHONY: help setup demo test versions door bench peers robustness avoidance network day evening exports replays docs package lint format constraints clean
 
 help:  ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-12s %s\n", $$1, $$2 }' Makefile
@@ -46,6 +46,9 @@ robustness: .venv/.core  ## Fly 200 random formations under every graph and law
 
 network: .venv/.core  ## Fly formations over networks that lose and delay (half an hour)
 	@$(BIN)/python benchmarks/network.py --write docs/network.md
+
+day: .venv/.oracles .venv/.interchange .venv/.dev  ## Rehearse and abort shows of a thousand, against oracles (an hour)
+	@$(BIN)/python benchmarks/day.py --write docs/day.md
 
 evening: .venv/.core  ## Judge logs of which the truth is known (an hour)
 	@$(BIN)/python benchmarks/evening.py --write docs/logs.md

@@ -10,6 +10,8 @@ import re
 import tempfile
 from pathlib import Path
 
+from pages import markdown, splice
+
 import rigidfleet as rf
 from rigidfleet.errors import ResultError
 from rigidfleet.interchange import FORMATS, brief_number, export
@@ -42,22 +44,12 @@ def main() -> None:
         result = rf.simulate(flight)
         with tempfile.TemporaryDirectory() as folder:
             columns.append([row(result, name, Path(folder), asked.flown) for name in FORMATS])
-    head = f"| format | {' | '.join(f'`{flight}`' for flight in flights)} |\n|{' --- |' * (len(flights) + 1)}"
-    rows = [
-        f"| `{name}` | {' | '.join(cells)} |"
-        for name, *cells in zip(FORMATS, *columns, strict=True)
-    ]
-    table = "\n".join([head, *rows])
+    head = ("format", *(f"`{flight}`" for flight in flights))
+    rows = ((f"`{name}`", *cells) for name, *cells in zip(FORMATS, *columns, strict=True))
+    table = markdown(head, rows)
     print(table)
     if asked.write:
-        page = asked.write.read_text(encoding="utf-8")
-        page = re.sub(
-            r"<!-- exports -->\n.*?<!-- end -->",
-            lambda _: f"<!-- exports -->\n{table}\n<!-- end -->",
-            page,
-            flags=re.DOTALL,
-        )
-        asked.write.write_text(page, encoding="utf-8")
+        splice(asked.write, {"exports": table})
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import argparse
 import json
 import multiprocessing
 import os
-import re
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pages import markdown, splice
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
@@ -509,12 +509,6 @@ def cells(s: dict[str, Any]) -> list[str]:
     ]
 
 
-def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as Markdown."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
-
-
 def crossings(outcomes: Sequence[Outcome]) -> list[list[str]]:
     """Minimal graphs in space, by how often they lose rank on the way: flights, and right ones."""
     lines = []
@@ -603,15 +597,6 @@ def tables(
     return found
 
 
-def rewritten(page: str, found: dict[str, str]) -> str:
-    """A page with its tables, each between ``<!-- flown: NAME -->`` and ``<!-- end -->``."""
-
-    def table(match: re.Match[str]) -> str:
-        return f"<!-- flown: {match[1]} -->\n{found.get(match[1], match[2])}<!-- end -->"
-
-    return re.sub(r"<!-- flown: (\w+) -->\n(.*?)<!-- end -->", table, page, flags=re.DOTALL)
-
-
 def progress(parts: Iterable[list[Outcome]], what: str, whole: int) -> list[Outcome]:
     """All outcomes, and a word on stderr as they come: each time to a terminal, else now and then."""
     outcomes: list[Outcome] = []
@@ -657,7 +642,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         data = {"table": table, "outcomes": [asdict(o) for o in every]}
         asked.json.write_text(json.dumps(data))
     if asked.write:
-        asked.write.write_text(rewritten(asked.write.read_text("utf-8"), found), "utf-8")
+        splice(asked.write, {f"flown: {name}": table for name, table in found.items()})
     return 0
 
 

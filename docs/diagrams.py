@@ -483,7 +483,7 @@ def way_home() -> Figure:
         mission = complete_times(Mission.from_dict(data))
         aborts = Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
         abort = aborts.at(19.0)
-        before = aborts.plan.states(np.linspace(16.0, abort.begins, 20), 1)[:, 0]
+        before = aborts.plan.at(np.linspace(16.0, abort.begins, 20))
         t = abort.begins
         parts = [(before, FAINT, 1.0)]
         for k, step in enumerate(abort.steps):

@@ -86,6 +86,42 @@ def _neighbours(slots: np.ndarray) -> np.ndarray:
     return pairs[np.lexsort(pairs.T[::-1])]
 
 
+def drifting(n: int, who: int, since: float, until: float, far: float, doubt: float) -> Result:
+    """The sheet for 60 s as a log: one vehicle is some way east of its slot for a time [s], all others in theirs.
+
+    Places are in doubt [m]; forces are not known.
+    """
+    flight = swarm(n, 60.0)
+    r, t = flight.slot_position.copy(), flight.time
+    r[(t >= since) & (t <= until), who, 0] += far
+    facts = {
+        "names": [f"log{i + 1}" for i in range(n)],
+        "doubt": {"vehicles": [{"mean_off_m": 0.0} for _ in range(n)]},
+        "bands": {"time": [0.0, 60.0], "place": [[doubt] * n] * 2},
+    }
+    unknown = {
+        name: np.full_like(getattr(flight, name), np.nan)
+        for name in ("multiplier", "thrust", "input_force", "constraint_force")
+    }
+    return replace(flight, position=r, statistics=facts, **unknown)
+
+
+#: Corners of a tent that nobody may fly through, and of a place with people, beside the sheet [m].
+TENT, CROWD = [[-40, -10], [-25, -10], [-25, 10], [-40, 10]], [[25, 0], [40, 0], [40, 20], [25, 20]]
+
+
+def fenced(flight: Result) -> Result:
+    """The flight beside a tent with a roof, people, and a field without one."""
+    data = flight.mission.to_dict()
+    field = [[-60, -50], [60, -50], [60, 90], [-60, 90]]
+    data["fences"] = [
+        {"name": "tent", "kind": "exclusion", "polygon": TENT, "ceiling": 8.0},
+        {"name": "field", "kind": "inclusion", "soft": True, "polygon": field},
+    ]
+    data["people"] = [{"name": "crowd", "polygon": CROWD}]
+    return replace(flight, mission_text=Mission.from_dict(data).text)
+
+
 def quadrotors(n: int, seconds: float) -> Result:
     """The sheet of vehicles flown by quadrotors of which each points its own way and leans by 20 deg.
 

@@ -674,6 +674,20 @@ def test_a_moment_without_a_sample_is_not_passed():
     )
 
 
+@pytest.mark.parametrize("left_by", ["a loss", "the end of the flight"])
+def test_a_moment_of_a_phase_that_was_left_needs_no_sample(left_by):
+    """Nobody asks for a sample of the end of a phase that was abandoned, or that the flight did not reach."""
+    mission = a_mission(TRIANGLE, 3)
+    flight = flown(mission, slots(mission, "triangle") + HEIGHT)
+    flight.time = flight.time * 0.9
+    assert "samples" in failures(assess(flight))
+    if left_by == "a loss":
+        flight.phases[0].abandoned = True
+    else:
+        flight.complete = False
+    assert "samples" not in failures(assess(flight))
+
+
 def test_a_phase_never_sampled_has_no_numbers():
     """A phase recorded in the moment the flight stopped is there, without numbers."""
     mission = a_mission(TRIANGLE, 3)

@@ -14,7 +14,7 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import MissionError
-from rigidfleet.mission import Mission, mission_names, mission_text
+from rigidfleet.mission import Mission, load_mission, mission_names, mission_text
 from rigidfleet.plotting import figure_names
 from rigidfleet.preflight.check import check
 from rigidfleet.simulation.flight import simulate
@@ -232,6 +232,26 @@ def test_own_laws_page(capsys):
     assert sorted(listed) == sorted(View.__slots__)
     assert set(names["rewards"]) == set(names["env"].agents)
     assert names["result"].complete
+
+
+@pytest.mark.long
+def test_day_page(tmp_path, monkeypatch):
+    """The commands of the page on the day run, its drills in 20 runs, and the report has what they have shown."""
+    from rigidfleet.cli.app import main
+    from rigidfleet.interchange import export
+
+    monkeypatch.chdir(tmp_path)
+    export(simulate(load_mission("market-square")), Path("show.skyc"), "skyc")
+    commands = [
+        line.split() for block in blocks(page("day.md"), "sh") for line in block.splitlines()
+    ]
+    assert {command[1] for command in commands} == {"run", "sweep", "check", "report"}
+    for command in commands:
+        few = ["--runs", "20", "--workers", "1"] if command[1] == "sweep" else []
+        assert main([*command[1:], *few]) == 0, command
+    text = Path("flights/market-square/report.html").read_text(encoding="utf-8")
+    assert "of 20 faults are harmless" in text
+    assert "A way home is proved from" in text
 
 
 # -- sweep.md ----------------------------------------------------------------------------------------

@@ -75,7 +75,7 @@ def test_planning_reads_and_writes_no_text(mission, texts):
     """Times, ways and transitions take their places as data; the mission then has numbers, and writes as before."""
     planned = complete_times(mission)
     assert not any(phase.automatic for phase in planned.phases)
-    assert all(phase.spelled and not phase.replaced for phase in planned.phases)
+    assert all(phase.flown_as_written and not phase.replaced for phase in planned.phases)
     assert texts == {"read": 0, "written": 0}
     again = complete_times(rf.Mission.from_toml(planned.text))
     assert again.model_dump() == planned.model_dump()

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import lzma
 from pathlib import Path
 from typing import NamedTuple
 
@@ -306,6 +307,18 @@ def test_the_summary_has_the_share_of_each_fault(drilled):
     assert [row.cells[3] for row in shown.rows] == [
         f"{case['failed']['count']} of 3" for case in data
     ]
+    sentences = summary.rehearsals()
+    assert [x.partition(":")[0] for x in sentences] == ["Late", "Rotated"]
+    late = [case for case in data if case["fault"] == "late"]
+    for case in late:
+        size, failed = f"{case['magnitude']:g} s", case["failed"]["count"]
+        assert (f"{size} ({failed} of 3 runs)" in sentences[0]) == bool(failed)
+        assert size in sentences[0].partition("; failures")[2 * bool(failed)]
+    worst = summary.facts().parts[1]
+    assert isinstance(worst, FactTable)
+    assert [row.cells[3:] for row in worst.rows] == [
+        (case["worst"]["run"], case["worst"]["detail"]) for case in data if case["worst"]
+    ]
 
 
 def test_faults_that_are_flown_are_missions():
@@ -431,11 +444,82 @@ def test_trajectories_of_others_are_drilled_by_the_command(kind, tmp_path, capsy
     assert sum(case["failed"]["of"] for case in out["drill"]) == out["flown"] == 34
 
 
+def xz(name, folder):
+    """A log of the test data, unpacked into a folder."""
+    packed = Path(__file__).parent / "data" / "logs" / f"{name}.xz"
+    (folder / name).write_bytes(lzma.decompress(packed.read_bytes()))
+
+
+@pytest.mark.parametrize(
+    "name", ["show-2.csv", "folder", "copter.tlog", "plane.bin", "odometry.mcap", "transforms.db3"]
+)
+def test_what_assess_reads_is_drilled_or_refused_with_the_reason(
+    name, tmp_path, capsys, monkeypatch
+):
+    """What `assess` passes is drilled, what it does not read or pass is refused for the same reason; .nc: mission."""
+    monkeypatch.chdir(tmp_path)
+    day(tmp_path, 2)
+    if name == "folder":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a.csv").write_text("time,x,y,z\n0,0,0,1\n1,0,0,2\n2,1,0,2\n")
+        (tmp_path / name / "b.csv").write_text("time,x,y,z\n0,3,0,1\n1,3,0,2\n2,4,0,2\n")
+    elif not Path(name).exists():
+        xz(name, tmp_path)
+    passed = main(["assess", name, "--separation", "0.5"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    drill = [
+        "sweep",
+        name,
+        "--drill",
+        "--separation",
+        "0.5",
+        "--runs",
+        "3",
+        "--quiet",
+        "--no-figures",
+    ]
+    code, error = main(drill), " ".join(capsys.readouterr().err.split())
+    assert code == (0 if passed else 2), error
+    if not passed:
+        assert error.partition("any fault: ")[2].partition(". Mend")[0] in said
+
+
+def test_a_result_is_not_drilled(tmp_path, capsys, monkeypatch):
+    """The result of a flight is refused: its mission is what can be drilled; so is a folder with nothing in it."""
+    monkeypatch.chdir(tmp_path)
+    Path("flight.nc").write_bytes(b"\x89HDF")
+    Path("empty").mkdir()
+    for what, words in (("flight.nc", "Drill its mission"), ("empty", "has no .csv")):
+        assert main(["sweep", what, "--drill", "--separation", "1", "--quiet"]) == 2
+        assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stale", "words"),
+    [("no.csv", "no such file"), ("two-agents", "has 2 agents, and the show 12")],
+)
+def test_an_earlier_version_that_is_none_is_refused(stale, words, tmp_path, capsys, monkeypatch):
+    """An earlier version that is not there, or is of another show, is one error before anything is judged."""
+    monkeypatch.chdir(tmp_path)
+    Path("drill.toml").write_text(f'mission = "change-of-picture"\n[drill]\nstale = ["{stale}"]\n')
+    assert main(["sweep", "drill.toml", "--quiet"]) == 2
+    err = " ".join(capsys.readouterr().err.split())
+    assert words in err
+    assert err.count("error: ") == 1
+    assert "no run has" not in err
+
+
 WRONG = {
     "nothing": ({"late": []}, "has no magnitude"),
     "unknown": ({"later": [1.0]}, "later"),
     "negative": ({"late": [-1.0]}, "late"),
     "flown": ({"files": ["x.csv"], "wind": [1.0]}, "needs a mission that is flown"),
+    "zero": ({"shifted": [0.0]}, "drill.shifted.*must be > 0"),
+    "no number": ({"rotated": ["north"]}, "drill.rotated.*must be a number"),
+    "no trial": ({"trials": 0}, "drill.trials.*must be >= 1"),
+    "all lost": ({"lost": [12]}, "drill.lost.*too much for 12 vehicles"),
+    "its own file": ({"another": [1, 12]}, "drill.another.*too much for 12 vehicles"),
+    "too many": ({"late": [1.0], "vehicles": [13]}, "drill.vehicles.*too much for 12 vehicles"),
 }
 
 
@@ -443,8 +527,9 @@ WRONG = {
 def test_what_cannot_be_drilled_is_refused(name):
     """A drill without magnitudes, of unknown faults, or with wind on others' files is refused before it is flown."""
     table, words = WRONG[name]
-    with pytest.raises(rf.SweepError, match=words):
+    with pytest.raises(rf.SweepError, match=words) as error:
         Sweep.of("change-of-picture", [], drill=table)
+    assert len(error.value.findings) == 1
     with pytest.raises(rf.SweepError, match="no effect on a drill"):
         Sweep.of("change-of-picture", ["agents.mass = grid(1.0, 2.0)"], drill={})
 
@@ -467,12 +552,9 @@ def market_square(tmp_path_factory):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("fault", sorted(faults.UNITS.keys() - {"stale", "links"}))
+@pytest.mark.parametrize("fault", sorted(faults.UNITS.keys() - {"links"}))
 def test_the_shipped_drill_has_a_danger_of_each_kind(fault, market_square):
-    """Of each fault one magnitude is harmless in all trials, and another is not.
-
-    No earlier version ships that could be stale, and lights that fly files have no links.
-    """
+    """Of each fault but lost links, which lights have not, a magnitude is harmless in all trials, another is not."""
     own = [x for x in market_square.values() if x.fault == fault]
     failed = {
         size: sum(x.failed.count for x in own if x.magnitude == size)
@@ -491,3 +573,12 @@ def test_the_shipped_show_as_a_whole_fails_by_its_fences(market_square):
     words = [x.worst.detail for x in whole if x.worst]
     assert len(words) == 3
     assert all("fence 'outer'" in each or "'crowd'" in each for each in words)
+
+
+@pytest.mark.long
+def test_lost_links_are_a_danger_to_those_who_fly_by_their_neighbours():
+    """In the shipped cube by neighbours, any one link is lost without harm, and six that are lost end the cube."""
+    sweep = Sweep.of("cube-by-neighbours", [], drill={"links": [1, 6], "trials": 4}, seed=2)
+    rows = fly_runs(sweep, range(sweep.runs))
+    assert [row.passed for row in rows] == [True, False] * 4
+    assert all(row.reason in ("shape", "shape, handedness") for row in rows[1::2])

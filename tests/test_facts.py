@@ -273,6 +273,9 @@ def test_what_applies_to_no_row_is_not_shown():
     facts = [Fact("speed", 3.0, "m/s"), Fact("height", 12345.0, "m")]
     assert worst_values("what", facts).texts == [["speed", "3 m/s"], ["height", "12345 m"]]
     assert [name for name, *_ in worst_values("what", facts).columns] == ["what", "worst"]
+    measured = worst_values("what", [*facts, Fact("tilt", 9.0, "deg", interval=(8.5, 9.25))])
+    assert [name for name, *_ in measured.columns] == ["what", "worst", "true value"]
+    assert measured.texts[2] == ["tilt", "9 deg", "8.5 to 9.25"]
     judged = worst_values("what", [*facts, Fact("tilt", 9.0, "deg", 5.0, level="fails")])
     assert judged.texts[-1] == ["tilt", "9 deg", "<= 5 deg", "FAILED"]
 

@@ -18,9 +18,11 @@ from rigidfleet.math.bernstein import greatest_of
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
+from rigidfleet.mission.schema import GeodeticOrigin
+from rigidfleet.plotting.areas import falls_of
 from rigidfleet.reporting import html_page
 from rigidfleet.simulation.together import simulate_together
-from rigidfleet.solids.polygons import Region, crossing
+from rigidfleet.solids.polygons import Region, some_cross
 
 L_SHAPE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], dtype=float)
 HOLE = np.array([[1, 1], [1, 3], [3, 3], [3, 1]], dtype=float)
@@ -47,6 +49,11 @@ def curves(n, spread=6.0):
     return RNG.uniform(-2, 12, (n, 3, 1)) + RNG.normal(0, spread, (n, 3, 5))
 
 
+def signed(region, points):
+    """Signed distances of points (M, 3), which are curves of one control point."""
+    return region.most(points[:, :, None], outside=True)[0]
+
+
 def along(points, t):
     """Values (T, C) of one curve (C, P) at places (T,)."""
     p = points.shape[1] - 1
@@ -60,7 +67,7 @@ def test_a_signed_distance_is_that_of_the_nearest_edge(turned):
     rings = [ring[::-1] for ring in RINGS] if turned else RINGS
     points = RNG.uniform(-3, 13, (400, 3))
     expected = [distance(p, RINGS, 2.0, 7.0) for p in points]
-    assert Region.of_rings(rings, 2.0, 7.0).beyond(points) == pytest.approx(expected, abs=1e-12)
+    assert signed(Region.of_rings(rings, 2.0, 7.0), points) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("outside", [True, False])
@@ -68,7 +75,7 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
     """It is the greatest of 20,001 places, to a millimetre, and no bound along the way is below it."""
     region, sign = Region.of_rings(RINGS, 2.0, 7.0), 1.0 if outside else -1.0
     for points in curves(30):
-        dense = (sign * region.beyond(along(points, np.linspace(0, 1, 20_001)))).max()
+        dense = (sign * signed(region, along(points, np.linspace(0, 1, 20_001)))).max()
         value, bound = (x[0] for x in region.most(points[None], outside=outside))
         assert value <= dense + 1e-9
         assert bound >= dense - 1e-9
@@ -80,14 +87,14 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
         worst = greatest_of(points[None], measure, lambda _: 1e-3)
         assert dense - 1e-3 <= worst.value <= dense + 1e-3
         place = along(points, np.array([worst.place]))
-        assert sign * region.beyond(place)[0] == pytest.approx(worst.value, abs=1e-9)
+        assert sign * signed(region, place)[0] == pytest.approx(worst.value, abs=1e-9)
 
 
 def test_edges_that_cross_are_known():
     """Of a bow tie, not of a triangle, and of edges that lie on each other."""
-    assert crossing(Region.of_rings([np.array([[0, 0], [4, 4], [4, 0], [0, 4.0]])]).edges)
-    assert crossing(Region.of_rings([np.array([[0, 0], [4, 0], [0, 4.0]])]).edges) is None
-    assert crossing(Region.of_rings([np.array([[0, 0], [4, 0], [1, 0], [1, 4.0]])]).edges)
+    assert some_cross(Region.of_rings([np.array([[0, 0], [4, 4], [4, 0], [0, 4.0]])]).edges)
+    assert not some_cross(Region.of_rings([np.array([[0, 0], [4, 0], [0, 4.0]])]).edges)
+    assert some_cross(Region.of_rings([np.array([[0, 0], [4, 0], [1, 0], [1, 4.0]])]).edges)
 
 
 def test_a_fall_without_drag_is_a_parabola():
@@ -119,6 +126,44 @@ def test_a_fall_with_drag_solves_its_differential_equation(k):
         assert tau == pytest.approx(solved.t_events[0][0], rel=1e-9)
         place = falls.landing(np.array(start[:3]), np.array(v), tau, np.array(k), wind)
         assert place == pytest.approx(solved.y_events[0][0][:2], abs=1e-6)
+
+
+def test_a_fall_ends_on_terrain_where_that_is_hit():
+    """On a slope, and on a roof: where SciPy's integration hits them, to the step between the heights looked at."""
+    slope = {
+        "kind": "heights",
+        "corner": [-40, -40],
+        "spacing": 80.0,
+        "heights": [[-8, -8], [8, 8]],
+    }
+    roof = {"kind": "box", "min": [2.0, -30.0, -40.0], "max": [30.0, 30.0, 2.5]}
+    wind = [3.0, -1.0, 0.0]
+    mission = rf.Mission.from_dict(
+        beside(obstacles=[slope, roof], disturbances={"wind": wind, "drag": 0.3})
+    )
+    result = rf.simulate(mission)
+    places, k = falls_of(result), mission.drag / mission.true_mass
+
+    def surface(x, y):
+        return (
+            max(0.2 * x, 2.5 if 2.0 < x < 30.0 and abs(y) < 30.0 else -math.inf)
+            if abs(x) < 40
+            else -math.inf
+        )
+
+    for row in range(0, len(result.time), max(1, len(result.time) // 12)):
+        for i in range(3):
+
+            def rates(_, y, k=k[i]):
+                return [*y[3:], *(k * (np.array(wind) - y[3:]) - [0, 0, mission.gravity])]
+
+            def above(_, y):
+                return y[2] - surface(y[0], y[1])
+
+            vars(above).update(terminal=True, direction=-1)
+            start = [*result.position[row, i], *result.velocity[row, i]]
+            solved = solve_ivp(rates, [0, 50], start, rtol=1e-9, max_step=0.01, events=above)
+            assert places[row, i] == pytest.approx(solved.y_events[0][0][:2], abs=0.1)
 
 
 def beside(**more):
@@ -315,6 +360,14 @@ def test_the_first_page_is_for_those_who_decide():
 
 def test_degrees_are_metres_on_the_ellipsoid():
     """Within a kilometre, they are those of the radii of curvature in the meridian and across it, to 1 cm."""
+
+    def metres(corner, *place):
+        origin = GeodeticOrigin(
+            **dict(zip(("latitude_deg", "longitude_deg", "altitude"), place, strict=True))
+        )
+        fence = fences.Fence(kind="inclusion", coordinates=[[[corner, [0, 0], [1, 1]]]])
+        return fence.rings(origin)[0][0]
+
     lat, lon, h = 47.4979, 19.0402, 120.0
     a, e2 = 6_378_137.0, 0.00669437999014
     s2 = math.sin(math.radians(lat)) ** 2
@@ -323,9 +376,9 @@ def test_degrees_are_metres_on_the_ellipsoid():
     for east, north in ((300.0, 0.0), (0.0, -250.0), (120.0, 90.0)):
         dlat = math.degrees(north / (along + h))
         dlon = math.degrees(east / ((across + h) * math.cos(math.radians(lat))))
-        place = fences.metres(np.array([[lon + dlon, lat + dlat]]), lat, lon, h)[0]
+        place = metres([lon + dlon, lat + dlat], lat, lon, h)
         assert place == pytest.approx([east, north], abs=0.01)
-    west = fences.metres(np.array([[-179.999, 0.0]]), 0.0, 179.999, 0.0)[0]
+    west = metres([-179.999, 0.0], 0.0, 179.999, 0.0)
     assert west[0] == pytest.approx(222.6, abs=0.1)  # across the date line
 
 
@@ -339,6 +392,7 @@ CLOSED = [*RING, RING[0]]
         ({"type": "Polygon", "coordinates": [CLOSED]}, [[RING]], None),
         ({"type": "Polygon", "coordinates": [CLOSED[::-1]]}, [[CLOSED[::-1][:-1]]], None),
         ({"type": "Polygon", "coordinates": [RING]}, [[RING]], "not closed"),
+        ({"type": "Polygon", "coordinates": [[RING[0], *CLOSED]]}, [[RING]], None),
         ({"type": "Polygon", "coordinates": [[[*p, 99.0] for p in CLOSED]]}, [[RING]], "altitudes"),
         ({"type": "MultiPolygon", "coordinates": [[CLOSED, CLOSED], [CLOSED]]}, [[RING, RING], [RING]], None),
         (
@@ -370,6 +424,12 @@ def test_polygons_of_geojson(data, polygons, note):
         ('{"type": "Point", "coordinates": [0, 0]}', "has no polygon"),
         ('{"type": "Polygon", "coordinates": [[[0], [1], [2]]]}', "no polygons"),
         ('{"type": "Polygon", "coordinates": []}', "has no polygon"),
+        ('{"type": "Polygon", "coordinates": [[]]}', "no polygons"),
+        (
+            '{"type": "Polygon", "coordinates": [[[500000, 5e6], [500100, 5e6], [500000, 6e6]]]}',
+            "in degrees",
+        ),
+        ('{"type": "Polygon", "coordinates": [[[NaN, 1], [2, 3], [3, 4]]]}', "in degrees"),
         (
             '{"type": "Polygon", "coordinates": [], "crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}}',
             "coordinate reference system",

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
+from sample_flights import drifting, swarm
 
 from rigidfleet import plotting, simulate
 from rigidfleet.errors import ResultError
@@ -711,7 +712,7 @@ def test_everything_in_space_is_in_the_picture(flight):
     view = space.scene(result)
     spatial, above = figure.axes
     points = np.concatenate(
-        [result.position.reshape(-1, 3), *([low, high] for _, low, high in view.boxes)]
+        [result.position.reshape(-1, 3), *(shape.ends for shape in view.shapes)]
     )
     inside = space._on_screen(spatial, points) / figure.bbox.size
     assert (inside > [0, 0.05]).all()
@@ -742,11 +743,27 @@ def test_a_flight_without_edges_still_draws_its_agents():
     assert "no edges" in texts(plotting.distances(a_flight(n=4, formation=None)))
 
 
+def test_a_log_beside_its_plan_shows_who_drifted_when():
+    """The vehicle that was off its slot is in bold then, and named with how far; of other flights there is a note."""
+    figure = plotting.plan_and_flight(drifting(4, 2, 20.0, 30.0, 1.5, 0.2))
+    above, below = figure.axes
+    assert len(by_gid(figure, "drift")) == 2
+    (bold,) = [line for line in below.lines if line.get_gid() == "drift"]
+    ends = np.asarray(bold.get_xdata())[[0, -1]]
+    assert ends == pytest.approx([20.0, 30.0], abs=0.051)
+    assert bold.get_color() == plotting.agent_colours(4)[2]
+    low, high = below.collections[2].get_paths()[0].get_extents().get_points()[:, 1]
+    assert (low, high) == pytest.approx((0.0, 1700.0))
+    assert any(words.startswith("log3: 1500 mm at 2") for words in texts(figure))
+    assert above.lines
+    assert "no log against a plan" in texts(plotting.plan_and_flight(swarm(3, 4.0)))
+
+
 def test_a_huge_obstacle_does_not_shrink_the_flight():
     """Of a wall a hundred kilometres long only what stands near the flight is shown."""
     wall = {"kind": "box", "name": "wall", "min": [-1e5, 20.0, 0.0], "max": [1e5, 21.0, 50.0]}
     near = space.scene(a_flight(mission={"obstacles": [wall]}))
-    assert near.boxes
+    assert near.shapes
     assert np.ptp([near.low, near.high], axis=0).max() < 100
 
 

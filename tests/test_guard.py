@@ -719,9 +719,10 @@ def test_the_tilt_of_a_quadrotor_is_limited_and_its_lift_kept():
     assert crowd.a.requested[0] == pytest.approx([0.8 * up, -0.6 * up, -1.0])
 
 
-def test_quadrotors_that_fly_apart_are_still_where_they_are():
-    """The points led are farther apart than the vehicles, whose places count."""
-    crowd = quadrotors(2, filtered=False)
+@pytest.mark.parametrize("lag", [0.2, 0.04])
+def test_quadrotors_that_fly_apart_are_still_where_they_are(lag):
+    """The points led are farther apart than the vehicles, whose places count, however short their lag is."""
+    crowd = quadrotors(2, filtered=False, lag=lag)
     crowd([[0.0, 0, 0], [0.8, 0, 0]], [[-1.0, 0, 0], [1.0, 0, 0]], np.zeros((2, 3)))
     assert crowd.a.margin[PAIR, 0] == pytest.approx(0.8 - 2 * RADIUS, abs=1e-6)
 

@@ -34,15 +34,15 @@ def test_arithmetic_acts_on_each_lane():
     def formula(a, c, out):
         for k in range(a.shape[0]):
             x, b = a[k], c[0]
-            y = 2 * x - b / 3.0 + x * b
-            y += max(x, 0.25) / max(b, x) - abs(x)
+            y = 2 * x - b + x * b
+            y += max(x, 0.25) * max(b, x) - abs(x)
             y *= 0.5
             out[k] = y
 
     a, b = VALUES, VALUES[0] + 3.0
     out = pack(np.zeros_like(a))
     formula(pack(a), pack(b[None]), out)
-    expected = 0.5 * (2 * a - b / 3 + a * b + np.maximum(a, 0.25) / np.maximum(b, a) - abs(a))
+    expected = 0.5 * (2 * a - b + a * b + np.maximum(a, 0.25) * np.maximum(b, a) - abs(a))
     np.testing.assert_allclose(unpack(out), expected, rtol=1e-14, atol=1e-14)
 
 

@@ -271,7 +271,7 @@ def test_two_hundred_drawn_missions_follow_the_legs_that_their_checks_plan():
     assert min(written.values()) > 10
     assert set(written) == set(KINDS)
     assert sum(bool(p.automatic) for mission in missions for p in mission.phases) > 100
-    assert sum(not p.spelled for mission in missions for p in mission.phases) > 20
+    assert sum(not p.flown_as_written for mission in missions for p in mission.phases) > 20
     assert sum(mission.on_loss != "continue" for mission in missions) > 40
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError, TrajectoryError
 from rigidfleet.foreign.files import read_trajectories
-from rigidfleet.foreign.logs import enu_of
+from rigidfleet.math.geodesy import enu_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.trajectories import of_curves
 

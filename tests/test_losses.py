@@ -258,6 +258,72 @@ def test_a_stack_spreads_and_levels_before_it_lands():
     assert assess(result).passed
 
 
+# -- near the ground ----------------------------------------------------------------------------------
+
+
+def lowest(result: Result) -> float:
+    """How high above what is below it the surface of a vehicle that is left comes at the least, by samples [m]."""
+    r = np.where(result.left[..., None], result.position, 99.0)
+    m = result.mission
+    return float((r[..., 2] - m.height_at(*np.moveaxis(r[..., :2], 2, 0)) - RADIUS).min())
+
+
+PADS = [[x, y, RADIUS] for x, y, _ in START]
+RISE: dict[str, Any] = {"kind": "takeoff", "height": 8.0, "duration": 6.0}
+
+
+@pytest.mark.parametrize("on_loss", ["hold", "land", "abort"])
+@pytest.mark.parametrize(("rotors_", "times"), [(False, [11.9, 12.5]), (True, [12.2])])
+def test_a_brake_from_a_fast_descent_stays_above_the_ground(on_loss, rotors_, times):
+    """A descent of 7 m in 3.5 s, which 2 m/s^2 cannot stop, is slowed down along the plan: nobody comes lower."""
+    down = {"kind": "fly", "position": [2.0, 2.0, 0.8], "duration": 3.5}
+    phases = [RISE, PHASES[0], down, {"kind": "hold", "duration": 3.0}]
+    agents = {"position": PADS} | ({"vehicle": "drone"} if rotors_ else {"mass": 1.0})
+    make = rotors if rotors_ else mission
+    whole = lowest(simulate(make({}, agents=agents, phases=phases)))
+    for t in times:
+        lost = {"lost": [{"agent": 2, "time": t}], "on_loss": on_loss}
+        result = simulate(make(lost, agents=agents, phases=phases))
+        assert result.complete
+        assert lowest(result) > min(whole, 0.05) - 2e-3
+        assert assess(result).passed
+
+
+@pytest.mark.parametrize("on_loss", ["hold", "land"])
+@pytest.mark.parametrize("t", [0.5, 3.0, 4.5])
+def test_who_stands_stays_where_others_take_off(on_loss, t):
+    """Of two that take off and two that stand, a loss stops the first and leaves the others on the ground."""
+    phases = [RISE | {"agents": [1, 2]}, {"kind": "hold", "duration": 2.0}]
+    lost = {"lost": [{"agent": 2, "time": t}], "on_loss": on_loss}
+    result = simulate(mission(lost, agents={"mass": 1.0, "position": PADS}, phases=phases))
+    assert lowest(result) > -1e-6
+    standing = result.position[:, [2, 3]]
+    assert np.abs(standing - standing[0]).max() < 1e-6
+    assert result.position[-1, 0, 2] - RADIUS < (0.05 + 1e-6 if on_loss == "land" else 8.0)
+    assert assess(result).passed
+
+
+@pytest.mark.parametrize("on_loss", ["hold", "land"])
+@pytest.mark.parametrize("t", [0.5, 12.0, 16.5])
+def test_stops_above_a_roof_and_the_ground(on_loss, t):
+    """Two start on a roof of 2 m, all fly level and land each where it is: nobody sinks into roof or ground."""
+    roof = {"kind": "box", "name": "roof", "min": [-50, 2.0, 0], "max": [50, 50, 2.0]}
+    pads = [[x, y, z + (2.0 if y > 2.0 else 0.0)] for x, y, z in PADS]
+    land = {"kind": "land", "duration": 7.0, "agents": [1, 2, 3, 4]}
+    lost = {"lost": [{"agent": 2, "time": t}], "on_loss": on_loss, "landing_formation": "square"}
+    if on_loss == "hold":
+        del lost["landing_formation"]
+    result = simulate(
+        mission(
+            lost,
+            agents={"mass": 1.0, "position": pads},
+            obstacles=[{"kind": "ground"}, roof],
+            phases=[RISE, PHASES[0], land],
+        )
+    )
+    assert lowest(result) > -1e-6
+
+
 # -- when ---------------------------------------------------------------------------------------------
 
 
@@ -499,7 +565,7 @@ def test_the_loss_of_a_link_is_answered(on_loss):
 
 
 def test_check_follows_the_way_after_the_loss():
-    """It tells where the others stop and when they land, and finds a box below them."""
+    """It tells where the others stop and when they land, and finds a box that one would scrape."""
     m = mission(LOST | {"on_loss": "land"})
     found, flown = check(m, search=False), simulate(m)
     (told,) = [r.text for r in found.remarks if r.topic == "loss"]
@@ -507,7 +573,7 @@ def test_check_follows_the_way_after_the_loss():
     assert f"by {stop:.1f} s, and land by {down:.1f} s" in told
     assert found.passed
     x, y, _ = flown.position[-1, 0]
-    box = {"kind": "box", "min": [x - 0.2, y - 0.2, 0.0], "max": [x + 0.2, y + 0.2, 1.0]}
+    box = {"kind": "box", "min": [x + 0.05, y - 0.2, 0.0], "max": [x + 0.4, y + 0.2, 1.0]}
     blocked = mission(LOST | {"on_loss": "land"}, obstacles=[{"kind": "ground"}, box])
     found = check(blocked, search=False)
     assert any(r.level == "fails" and "land (loss)" in r.text for r in found.remarks)

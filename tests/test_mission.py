@@ -19,7 +19,6 @@ from rigidfleet.mission import (
     Box,
     Fly,
     Mission,
-    goal,
     json_schema,
     load_mission,
     mission_names,
@@ -256,7 +255,7 @@ def test_an_orbit_tracks_slots_in_both_architectures():
 def test_an_orbit_is_told_in_words():
     """Where it leads to is told as of any phase."""
     phase = Mission.from_dict(changed(("phases/1", ORBIT))).phases[1]
-    assert goal(phase) == "round (5, 5, 8) m at 4 m, 30°/s"
+    assert phase.leads_to == "round (5, 5, 8) m at 4 m, 30°/s"
 
 
 def test_names_default_to_kind_and_number():

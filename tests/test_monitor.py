@@ -51,7 +51,6 @@ class Watched:
             "who": np.full((records.QUANTITIES, 2), -1), "sign": np.zeros(1), "left": np.ones(self.n, dtype=np.bool_),
             "standing": np.zeros(self.n, dtype=np.int64), "low": np.full((self.n, 3), np.inf), "pad": 0.0,
             "altitude": math.inf, "pairs": pairs, "columns": pairs, "struck": np.zeros((0, 2), dtype=np.int64),
-            "listed": np.zeros((2, 0), dtype=np.int64),
         } | changes  # fmt: skip
         self.watch = native.Watch(
             records.monitor(
@@ -171,6 +170,20 @@ def test_of_many_agents_the_one_that_comes_nearest_to_a_box_is_not_passed_over(s
     inside = np.minimum(x - BOX[0, :3], BOX[0, 3:] - x).min(axis=3)
     clearance = np.where(beyond > 0.0, beyond, -inside) - 0.1
     agrees(outcome, {records.CLEARANCE: clearance}, clock, 1e-4)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_one_that_hurries_away_from_a_box_is_not_passed_over(axis, side):
+    """It is nearest at the beginning of a step whose middle is far away: 0.3 m from a face, where others were 0.5."""
+    face = np.where(side > 0.0, BOX[0, 3:], BOX[0, :3])
+    middle = 0.5 * (BOX[0, :3] + BOX[0, 3:])
+    ways = np.array([np.full(5, 0.5), 0.3 + 0.6 * np.arange(5.0)])
+    r = np.tile(middle, (2, 5, 1))
+    r[:, :, axis] = face[axis] + side * ways
+    clock = np.array([[0.0, 0.5], [0.5, 0.5]])
+    outcome = Watched(r, 0 * r, clock, radius=0.1, boxes=BOX).take()
+    assert outcome.worst(records.CLEARANCE) == (pytest.approx(0.2), 0.5, [0, 0])
 
 
 def test_speeds_by_direction_are_not_searched_for_where_they_have_no_limit():

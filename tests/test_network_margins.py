@@ -50,7 +50,8 @@ def disturbed(m: rf.Mission, seed: int = 0, **changes: Any) -> tuple[Any, ...]:
     loss_free = flight._replace(network=flight.network._replace(worsens=0.0))
     fly(problem, work, loss_free, state, 2 * (flight.network.delay + flight.network.silence) + 60)
     assert (state.mail.grip == 1.0).all()
-    flight = flight._replace(network=flight.network._replace(silence=10**9, **changes))
+    changes = {"silence": 10**9} | changes
+    flight = flight._replace(network=flight.network._replace(**changes))
     state.S[:, :3] += SMALL * np.random.default_rng(seed).normal(size=(len(state.S), 3))
     return problem, work, flight, state
 
@@ -70,7 +71,7 @@ def errors(state: Any, m: rf.Mission) -> Floats:
 def kick(flight: LinearFlight, x0: Floats, depth: int) -> tuple[Floats, Floats]:
     """State of a linear flight x0 (N, 3) [m] off, and the messages of `depth` ticks before."""
     x = np.zeros((flight.size, 1))
-    x[flight.slices["order 0"], 0] = x0.ravel()
+    x[: x0.size, 0] = x0.ravel()
     return x, np.zeros((depth, *flight.shape, 1))
 
 
@@ -87,36 +88,40 @@ UNEQUAL = {
 
 
 @pytest.mark.parametrize(
-    "tables",
+    ("tables", "loss", "changes"),
     [
-        {},
-        {"tracking": {"integral": 0.3}},
-        {"constraint": {"solver": "exact"}},
-        UNEQUAL,
-        {"disturbances": {"noise": {"delay": 0.02, "rate": 50.0}}},
+        ({}, 0.4, {}),
+        ({"tracking": {"integral": 0.3}}, 0.4, {}),
+        ({"constraint": {"solver": "exact"}}, 0.4, {}),
+        (UNEQUAL, 0.4, {}),
+        ({"disturbances": {"noise": {"delay": 0.02, "rate": 50.0}}}, 0.4, {}),
+        ({}, 0.7, {"silence": 5}),
+        (UNEQUAL | {"constraint": {"solver": "exact"}}, 0.7, {"silence": 5}),
     ],
-    ids=["default", "integral", "exact", "unequal", "late"],
+    ids=["default", "integral", "exact", "unequal", "late", "slipping", "slipping-exact"],
 )
-def test_the_linear_flight_is_the_flight(tables):
-    """Of places 1e-6 m off, both keep five digits over 4 s, with 40 % of the messages lost, the same in both."""
-    m = still({"delay": 0.06, "loss": 0.4}, **tables)
-    problem, work, flight, state = disturbed(m)
+def test_the_linear_flight_is_the_flight(tables, loss, changes):
+    """Of places 1e-6 m off, both keep five digits over 4 s, with the same messages lost and the same edges let go."""
+    m = still({"delay": 0.06, "loss": loss}, **tables)
+    problem, work, flight, state = disturbed(m, **changes)
     linear, delay = linear_flight(m), flight.network.delay
     x, sent = kick(linear, off(state, m), delay)
-    most = 0.0
+    most, least_grip = 0.0, 1.0
     for _ in range(200):
         fly(problem, work, flight, state, 1)
         # Messages of the next tick are under way, since delays are at least one tick.
         k, due = state.count[fleet.TICKS], state.mail.due
-        arriving = due[:, k % due.shape[1]] == k - delay
+        arriving, grip = due[:, k % due.shape[1]] == k - delay, state.mail.grip[:, None]
+        least_grip = min(least_grip, grip.min())
         _, x = linear.fly(
-            x, sent, 1, delay, lambda _, change, now=arriving: now[:, None] * change(0)
+            x, sent, 1, delay, lambda _, news, now=arriving: now[:, None] * news(0), grip
         )
         sent = np.roll(sent, -1, axis=0)
         most = max(most, np.abs(off(state, m)).max())
-        here = x[linear.slices["order 0"], 0].reshape(-1, 3)
+        here = linear.parts(x).orders[0].reshape(-1, 3)
         np.testing.assert_allclose(here, off(state, m), rtol=0, atol=1e-5 * most)
-    assert 0.2 < state.mail.count[LOST].sum() / state.mail.count[SENT].sum() < 0.5
+    assert state.mail.count[LOST].sum() / state.mail.count[SENT].sum() > 0.2
+    assert (least_grip == 0.0) == bool(changes)
 
 
 def random_formation(seed: int) -> dict[str, Any]:
@@ -160,7 +165,8 @@ def grows(tables: dict[str, Any], delay: int, seconds: float) -> bool:
 def wrong_delays(count: int, least: float, seconds: float) -> list[tuple[int, int]]:
     """Seeds of random formations whose last stable or first unstable delay flies otherwise, and the delay in ticks.
 
-    Beyond the limit they are to grow by a share of at least ``least`` a second.
+    Beyond the limit they are to grow by a share of at least ``least`` a second. What grows may have a twentieth of the
+    deviation at the start.
     """
     wrong, seed, seen = [], 0, 0
     while seen < count:
@@ -168,22 +174,37 @@ def wrong_delays(count: int, least: float, seconds: float) -> list[tuple[int, in
         tables = random_formation(seed)
         linear = linear_flight(still({}, **tables))
         last = last_stable_delay(linear)
-        if growth_at(linear, last + 1) < least:
+        if (growth := growth_at(linear, last + 1)) < least:
             continue
         seen += 1
         wrong += [(seed, last)] if last and grows(tables, last, seconds) else []
-        wrong += [] if grows(tables, last + 1, seconds) else [(seed, last + 1)]
+        beyond = max(seconds, float(np.log(20.0 * 100.0)) / growth)
+        wrong += [] if grows(tables, last + 1, beyond) else [(seed, last + 1)]
     return wrong
 
 
+@pytest.mark.parametrize(("seed", "delay"), [(44, 2), (48, 7), (73, 2)])
+def test_the_greatest_growth_is_that_of_the_whole_map(seed, delay):
+    """Of formations with redundant edges, too, whose stresses neither grow nor decay: within 1e-4 a second."""
+    linear = linear_flight(still({}, **random_formation(seed)))
+    shape = (delay, *linear.shape)
+    whole = linear.size + int(np.prod(shape))
+    sent = np.eye(whole)[linear.size :].reshape(*shape, whole).copy()
+    start = np.eye(whole)[: linear.size]
+    _, x = linear.fly(start, sent, 1, delay, lambda k, news: news(0))
+    tick = np.concatenate([x, np.roll(sent, -1, axis=0).reshape(-1, whole)])
+    radius = np.abs(np.linalg.eigvals(tick)).max()
+    assert growth_at(linear, delay) == pytest.approx(np.log(radius) / linear.radio.tick, abs=1e-4)
+
+
 def test_the_last_stable_delay_flies():
-    """Random formations fly stable at the last stable delay and grow 100 times in 100 s at one tick more."""
+    """Random formations fly stable for 100 s at the last stable delay and grow 100 times at one tick more."""
     assert wrong_delays(2, 0.1, 100.0) == []
 
 
 @pytest.mark.long
 def test_the_last_stable_delays_of_many_formations():
-    """So do 99 % of 200 (a tenth of them in CI) whose growth beyond is as low as 1 % a second, in 500 s."""
+    """So do 99 % of 200 (a tenth of them in CI) whose growth beyond is as low as 1 % a second, over 500 s."""
     count = 200 if FULL else 20
     assert len(wrong_delays(count, 0.01, 500.0)) <= count // 100
 
@@ -209,7 +230,7 @@ def exact_growth(linear: LinearFlight, delay: int, loss: float, ticks: int) -> f
     # Each link changes some rows only.
     rows = [np.flatnonzero(np.abs(B).max(axis=1)) for B in change]
     parts = [B[own] for B, own in zip(change, rows, strict=True)]
-    place = linear.slices["order 0"]
+    place = slice(0, 3 * linear.n)
     P, watch, squares = np.zeros((whole, whole)), np.zeros((len(linear.r), whole)), []
     P[place, place] = np.eye(place.stop - place.start)
     watch = linear.edges.toarray()

@@ -9,7 +9,8 @@ from rigidfleet._common.renamed import RENAMED, successor
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes
 from rigidfleet.errors import MissionError, ResultError, SweepError
-from rigidfleet.mission import Mission, load_mission
+from rigidfleet.math import lqr
+from rigidfleet.mission import Mission, draft, load_mission
 from rigidfleet.sweep import Sweep, store
 from rigidfleet.sweep.runner import fly
 
@@ -100,3 +101,22 @@ def test_stores_of_other_formats(tmp_path, version, words):
             use()
         assert words in str(caught.value)
     assert fly(sweep, tmp_path, workers=1, replace=True).complete
+
+
+def test_earlier_names_of_members_and_functions_work_and_warn():
+    """A phase, a mission and modules give by their earlier names what they give by those of now."""
+    mission = load_mission("narrow-passage")
+    phase = mission.phases[0]
+    assert phase.shaping is not None
+    for thing, old, new in (
+        (phase, "led", phase.follows_curves),
+        (phase, "spelled", phase.flown_as_written),
+        (phase.shaping, "aligned", phase.shaping.fits_slots),
+        (phase, "ended", phase.keys_if_ended),
+        (mission, "linked", mission.has_link),
+        (lqr, "led", lqr.trajectory_of_response),
+        (draft, "aligned", draft.align_comments),
+    ):
+        with pytest.warns(DeprecationWarning, match=f"{old} is now"):
+            assert getattr(thing, old) == new
+    assert not hasattr(lqr, "no_such_function")

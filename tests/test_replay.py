@@ -10,11 +10,13 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from sample_flights import quadrotors, swarm
+from sample_flights import CROWD, TENT, drifting, fenced, quadrotors, swarm
+from test_doubt import logged
 
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import agent_colours
+from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.web.replay import html_page, replay
 from rigidfleet.web.replay.pack import PackedColumn, pack
@@ -285,6 +287,71 @@ def test_incomplete():
         parts(html_page(swarm(2, 4.0, complete=False, ending="too steep")))[0]["ending"]
         == "too steep"
     )
+
+
+# -- beside fences, and logs
+
+
+def test_fences_people_and_falls_are_on_the_page():
+    """The page has rings and heights; without drag, vehicles fall by the parabola. Other pages have none of it."""
+    info, columns = parts(html_page(fenced(EIGHT)))
+    kinds = {area["name"]: (area["kind"], area["hatched"]) for area in info["areas"]}
+    expected = {"tent": ("fence", True), "field": ("soft", False), "crowd": ("people", True)}
+    assert kinds == expected
+    rings = {area["name"]: area["rings"] for area in info["areas"]}
+    assert (rings["tent"], rings["crowd"]) == ([TENT], [CROWD])
+    assert [area["heights"] for area in info["areas"]] == [[None, 8.0], [None, None], [0.0, 2.0]]
+    r, v, g = EIGHT.position, EIGHT.velocity, EIGHT.mission.gravity
+    tau = (v[..., 2] + np.sqrt(v[..., 2] ** 2 + 2.0 * g * r[..., 2])) / g
+    lands = (r + tau[..., None] * v)[..., :2]
+    time = info["start"] + info["step"] * np.arange(info["count"])
+    k = np.abs(EIGHT.time - time[400]).argmin()
+    np.testing.assert_allclose(columns["fall"][400].reshape(-1, 2), lands[k], atol=0.05)
+    plain, none = parts(html_page(EIGHT))
+    assert plain["areas"] == []
+    assert not {"fall", "doubt"} & {*none}
+
+
+def test_the_overview_shows_people_near_the_flight():
+    """A crowd that is beside the flight is in sight, and not what is kilometres away."""
+    sight = np.array(parts(html_page(fenced(EIGHT)))[0]["sight"])
+    assert sight[:, 0].max() >= 40.0
+    assert np.abs(sight).max() < 500.0
+
+
+def test_drifts_of_a_log_are_on_the_page():
+    """Who is off its slot from when to when, what is in doubt and what is surely off are on a log's page; no thrust."""
+    info, columns = parts(html_page(drifting(4, 2, 20.0, 30.0, 1.5, 0.2)))
+    (drift,) = info["drifts"]
+    assert drift["who"] == 2
+    assert [drift["start"], drift["end"]] == pytest.approx([20.0, 30.0], abs=0.051)
+    assert drift["worst"] == pytest.approx(1.5)
+    np.testing.assert_allclose(columns["doubt"], 0.2, atol=1e-3)
+    assert info["plots"][0]["column"] == "off plot"
+    k = round(25.0 / info["step"])
+    np.testing.assert_allclose(columns["off plot"][k], [1.5, 1.3, 1.7], atol=1e-3)
+    assert np.isfinite(columns["tension"]).all()  # edges are drawn, without a force
+    assert not info["forces"]
+    hidden = parts(html_page(drifting(4, 2, 20.0, 30.0, 0.1, 0.2)))[0]
+    assert hidden["drifts"] == []  # it may be in its slot
+
+
+def test_a_log_that_is_judged_has_its_plan_on_the_page():
+    """The result of a log against a plan, as it is judged, has its drift on the page."""
+    plan = simulate(load_mission("two-agents"))
+    t = np.arange(0.0, plan.time[-1], 0.04)
+    places = [
+        np.stack([np.interp(t, plan.time, plan.position[:, i, a]) for a in range(3)], axis=1)
+        for i in range(2)
+    ]
+    places[1][:, 2] += np.where((t > 5.0) & (t < 10.0), 0.8 * np.sin(0.2 * np.pi * t) ** 2, 0.0)
+    noise = 0.003 * np.random.default_rng(0).standard_normal((2, len(t), 3))
+    result, _ = judge_log(logged([t, t], [*(places + noise)]), plan, Doubts(0.003, 0.0))
+    info = parts(html_page(result))[0]
+    assert {drift["who"] for drift in info["drifts"]} == {1}
+    longest = max(info["drifts"], key=lambda drift: drift["end"] - drift["start"])
+    assert [longest["start"], longest["end"]] == pytest.approx([5.0, 10.0], abs=0.6)
+    assert [longest["worst"], longest["at"]] == pytest.approx([0.8, 7.5], abs=0.1)
 
 
 # -- the file

@@ -1,6 +1,8 @@
 """The report of a flight, and of several side by side."""
 
+import hashlib
 import html.parser
+import json
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -13,12 +15,14 @@ from sample_flights import quadrotors
 
 from rigidfleet import plotting
 from rigidfleet.assessment import Extreme, Safety, assess, safety
+from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission
 from rigidfleet.reporting import gains, html_page, report
 from rigidfleet.reporting.contents import contents
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import simulate
+from rigidfleet.sweep.store import read as load
 
 TOML = """
 schema_version = 1
@@ -302,3 +306,59 @@ def test_what_cannot_be_reported(calm, tmp_path, quick):
         html_page([calm], labels=["a", "b"])
     with pytest.raises(ResultError, match="no folder"):
         report(calm, tmp_path / "none" / "report.html")
+
+
+def first_page(path):
+    """The words before the safety table."""
+    return Page(path.read_text(encoding="utf-8")).text.split("Safety")[0]
+
+
+def test_the_first_page_says_what_drill_and_aborts_have_shown(calm, tmp_path, capsys):
+    """Counts, magnitudes and the first failure are those of the rows; times and distances those of the file."""
+    calm.save(tmp_path / "pair.nc")
+    mission = tmp_path / "pair.toml"
+    mission.write_text(calm.mission_text)
+    (tmp_path / "day.toml").write_text(
+        'mission = "pair.toml"\n[drill]\nshifted = [0.1, 20.0]\nrotated = [0.5]\nvehicles = [1]\ntrials = 2\n'
+    )
+    drill, home, page = tmp_path / "drill", tmp_path / "home", tmp_path / "report.html"
+    more = ["--out", str(drill), "--no-figures", "--quiet", "--workers", "1"]
+    assert main(["sweep", str(tmp_path / "day.toml"), *more]) == 0
+    assert main(["check", str(mission), "--abort", "--out", str(home)]) == 0
+    data = json.loads((home / "aborts.json").read_text())
+    for x in data["aborts"][3:5]:
+        x.update(way="", reason="'roof' stands in the way")
+    (home / "aborts.json").write_text(json.dumps(data))
+    flight = ["report", str(tmp_path / "pair.nc"), "--no-figures", "--quiet", "--force"]
+    assert main([*flight, "--drill", str(drill), "--abort", str(home)]) == 0
+    text, table = first_page(page), load(drill)
+    assert f"{int(table.passed.sum())} of {len(table.run)} faults are harmless." in text
+    assert "Shifted: none fails by 0.1; 4 of 4 fail by 20 m:" in text
+    rows = [k for k in range(len(table.run)) if table.sweep.values(k)[:2] == ["shifted", 20.0]]
+    assert any(str(table.detail[k]) in text for k in rows)
+    ways = [x for x in data["aborts"] if x["way"]]
+    assert f"proved from {len(ways)} of {len(ways) + 2} times, 1 s apart" in text
+    assert f"come nearer than {min(x['separation']['least_m'] for x in ways):.2f} m." in text
+    assert "None from 3 to 4 s: 'roof' stands in the way." in text
+    for file in (drill / "sweep.db", home / "aborts.json"):
+        assert f"{file.name}, SHA-256 {hashlib.sha256(file.read_bytes()).hexdigest()}" in text
+    mission.write_text(calm.mission_text.replace("speed = 9.0", "speed = 9.5"))
+    more[1] = str(tmp_path / "other")
+    assert main(["sweep", str(tmp_path / "day.toml"), *more]) == 0
+    assert main(["check", str(mission), "--abort", "--out", str(home), "--force"]) == 0
+    digest = hashlib.sha256(calm.mission_text.encode()).hexdigest()[:16]
+    capsys.readouterr()
+    for option, folder in (
+        ("--drill", tmp_path / "other"),
+        ("--abort", home),
+        ("--abort", drill),
+        ("--drill", home),
+    ):
+        assert main([*flight, option, str(folder)]) == 2
+        words = " ".join(capsys.readouterr().err.split())
+        same = (option == "--drill") == folder.name.startswith(("drill", "other"))
+        assert (
+            ("is of another mission" in words and digest in words) if same else str(folder) in words
+        )
+    assert main([*flight, str(tmp_path / "pair.nc"), "--drill", str(drill)]) == 2
+    assert "of one flight" in capsys.readouterr().err

@@ -1,6 +1,6 @@
 """The goals of `make robustness`, on fewer formations; docs/robustness.md has them all."""
 
-import importlib.util
+import importlib
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,19 +12,9 @@ import pytest
 from rigidfleet.formation import shapes
 from rigidfleet.rigidity import RigidityClass, analyse
 
-
-def _benchmark() -> Any:
-    """The script as a module."""
-    path = Path(__file__).parents[1] / "benchmarks" / "robustness.py"
-    spec = importlib.util.spec_from_file_location("robustness", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules["robustness"] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-table = _benchmark()
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+table: Any = importlib.import_module("robustness")
+sys.path.pop(0)
 
 
 def rows(*names: str) -> list[Any]:

@@ -500,8 +500,8 @@ def test_figures_draw_every_kind(tmp_path):
 
 def test_the_replay_has_surfaces_and_ways():
     """Corners of triangles lie on the solids; the way of what moves is that of the mission."""
-    mission = every_kind()
-    described = scene.describe(mission, mission.edges, 1.0)
+    result = simulate(every_kind())
+    described = scene.describe(result, np.arange(len(result.edges)), 1.0)
     assert described["boxes"] == []
     names = [s["name"] for s in described["solids"]]
     assert names == ["box 2", "moving", "cylinder 4", "hull 5", "heights 6"]

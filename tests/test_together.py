@@ -8,17 +8,16 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.kernel.compiler.simd import empty, pack, unpack
-from rigidfleet.kernel.engine import batch, codegen, lane_bounds, lane_steps, native
+from rigidfleet.kernel.engine import batch, codegen, lane_steps, native
 from rigidfleet.kernel.engine.tracer import Code, FlightTrace, UnfitError, numbers
 from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.problem import Problem, workspace
-from rigidfleet.kernel.records import ANY_STEP, LISTED_DISTANCES
+from rigidfleet.kernel.records import FIRST_ROW, TRAILED
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.result import Result
-from rigidfleet.simulation import together
+from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.flight import Flight, simulate
-from rigidfleet.simulation.point_phase import PointPhase
-from rigidfleet.simulation.together import simulate_together
+from rigidfleet.simulation.together import MOST_VEHICLES, simulate_together
 
 
 def varied(name: str, change: Any, count: int = 8) -> list[Mission]:
@@ -146,6 +145,23 @@ def test_missions_of_other_kinds_are_flown_as_alone():
         np.testing.assert_array_equal(one.position, other.position)
 
 
+def test_many_vehicles_are_flown_one_by_one(monkeypatch):
+    """No code is generated for more vehicles than it is worth, and each flies bit for bit as alone."""
+    n = MOST_VEHICLES + 1
+    data = {
+        "schema_version": 1, "name": "row", "output_step": 0.5,
+        "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 1.0] for i in range(n)]},
+        "formations": {"row": {"slots": [[2.0 * i, 0.0, 0.0] for i in range(n)], "edges": []}},
+        "phases": [{"kind": "establish", "formation": "row", "control": "tracking", "duration": 2.0}],
+    }  # fmt: skip
+    missions = [
+        Mission.from_dict(data | {"disturbances": {"wind": [by, 0.0, 0.0]}}) for by in (0.0, 1.0)
+    ]
+    monkeypatch.setattr(batch, "Vector", lambda _: pytest.fail("code is generated"))
+    for one, other in zip(simulate_together(missions), alone(missions), strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+
+
 def test_a_flight_that_fails_takes_nobody_along():
     """Where the law is singular for one, all are flown alone, bit for bit."""
     missions = [load_mission("line-singular")] + [
@@ -247,71 +263,39 @@ def test_problems_that_branch_differently_share_no_code():
 def test_arrays_of_eight_flights_become_lanes():
     """Lane k holds the numbers of array k."""
     parts = [np.arange(6.0).reshape(2, 3) + 10 * k for k in range(8)]
-    made = codegen.interleaved(parts, (6,))
+    made = codegen.packed(parts)
     for k, part in enumerate(parts):
-        np.testing.assert_array_equal(unpack(made)[:, k], part.ravel())
+        np.testing.assert_array_equal(unpack(made)[..., k], part)
     assert empty((3, 2)).ctypes.data % 64 == 0
 
 
-def test_lists_of_a_phase_side_by_side_do_not_outlast_it():
-    """A phase that is flown alone later searches all of its steps."""
-    flights = [Flight(mission) for mission in varied("narrow-passage", folding, 2)]
-    for _ in range(3):
-        for flight in flights:
-            flight.begin()
-        phases = [flight.under_way() for flight in flights]
-        vector = together._vector(phases)
-        steppers = [x for phase in phases if isinstance(x := phase.stepper, PointPhase)]
-        assert together._fly(steppers, vector)
-        for flight in flights:
-            flight.arrive()
-        for phase in phases:
-            monitor = phase.extremes.monitor.monitor
-            assert monitor.listed.shape == (2, len(phase.state.trail.clock))
-            assert monitor.count[LISTED_DISTANCES:].tolist() == [ANY_STEP, ANY_STEP]
-
-
-def all_listed(search: Any, first: int, steps: range, monitors: Any) -> None:
-    """Hand all steps over to the monitors."""
-    before = lane_bounds.unpack(search.bounds).copy()
-    lane_bounds.unpack(search.bounds)[:, : lane_bounds.FIRST_FORCE] = -1e50
-    lane_bounds.unpack(search.bounds)[:, lane_bounds.FIRST_FORCE :] = 1e50
-    list_steps(search, first, steps, monitors)
-    lane_bounds.unpack(search.bounds)[:] = before
-
-
-list_steps = lane_bounds.list_steps
-
-
-def test_steps_that_are_left_out_hold_nothing_worse(monkeypatch):
-    """Extremes of all phases are those of a search of every step: distances to 1e-9 m, forces to 1e-3 in noise."""
+def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
+    """The steps of a trail join, and end where its flight is when it flies alone, in wind and noise."""
     missions = varied("windy-passage", windy)
-    few = simulate_together(missions)
-    monkeypatch.setattr(lane_bounds, "list_steps", all_listed)
-    for one, other in zip(few, simulate_together(missions), strict=True):
-        for phase, whole in zip(one.phases, other.phases, strict=True):
-            assert phase.extremes.keys() == whole.extremes.keys()
-            for name, found in phase.extremes.items():
-                distance = name in ("separation", "clearance", "lowest", "highest", "speed")
-                expected = whole.extremes[name].value
-                close = 1e-9 if distance else 1e-3 * abs(expected)
-                assert found.value == pytest.approx(expected, abs=close)
+    ends: dict[int, list[np.ndarray]] = {}
+    take = Extremes.take
 
+    def kept(self: Extremes, problem: Any, work: Any, state: Any, *, last: bool) -> None:
+        rows = (state.count[FIRST_ROW] + np.arange(state.count[TRAILED])) % len(state.trail.clock)
+        clock, points = state.trail.clock[rows], state.trail.points[rows]
+        if len(rows):
+            np.testing.assert_allclose(clock[1:, 0], clock[:-1].sum(axis=1), atol=1e-12)
+            np.testing.assert_array_equal(points[1:, 0], points[:-1, 4])
+            here = np.column_stack([clock.sum(axis=1), points[:, 4, :9]])
+            ends.setdefault(id(self), []).append(here)
+        take(self, problem, work, state, last=last)
 
-def test_few_steps_are_searched(monkeypatch):
-    """In wind and noise few steps are listed, or the search would take as long as the flight."""
-    steps, listed = 0, np.zeros(2)
-
-    def counted(search: Any, first: int, new: range, monitors: Any) -> None:
-        nonlocal steps, listed
-        list_steps(search, first, new, monitors)
-        steps += len(new) * len(monitors)
-        listed += sum(m.count[LISTED_DISTANCES:] for m in monitors)
-
-    monkeypatch.setattr(lane_bounds, "list_steps", counted)
-    simulate_together(varied("windy-passage", windy))
-    assert (listed > 0).all()
-    assert (listed < 0.1 * steps).all()
+    monkeypatch.setattr(Extremes, "take", kept)
+    simulate_together(missions)
+    monkeypatch.undo()
+    assert len(ends) == 8
+    for rows, mission in zip(ends.values(), missions, strict=True):
+        whole = np.concatenate(rows)
+        t, r = whole[:, 0], whole[:, 1:]
+        flown = simulate(mission, times=np.unique(t))
+        where = np.searchsorted(flown.time, t - 1e-12).clip(max=len(flown.time) - 1)
+        assert len(t) > 500
+        np.testing.assert_allclose(r, flown.position[where].reshape(-1, 9), atol=4e-6)
 
 
 def test_components_that_do_not_move_are_left_out():

@@ -13,8 +13,6 @@ TREES = {
 }
 #: A dialect: reported, requested, input and result are what others say.
 DIALECT = {"found", "told", "given", "asked", "led"}
-#: A public property of kinds of phases.
-PUBLIC = ("rigidfleet/mission/kinds.py", "led")
 PARTICIPLE = re.compile(r"_*[a-z]+(ed|led|told|found|given|shown|drawn|known|kept|sent|made|taken)")
 
 
@@ -46,13 +44,12 @@ def test_nothing_has_a_name_of_the_dialect():
         for path, tree in TREES.items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in DIALECT
-        if (str(path), node.id) != PUBLIC
     ]
     assert names == []
 
 
 def test_functions_are_things_or_acts():
-    """At most twenty functions are named by a bare participle."""
+    """At most ten functions are named by a bare participle."""
     names = [
         f"{path}:{node.lineno} {node.name}"
         for path, tree in TREES.items()
@@ -60,7 +57,7 @@ def test_functions_are_things_or_acts():
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         if "_" not in node.name.strip("_") and PARTICIPLE.fullmatch(node.name)
     ]
-    assert len(names) <= 20, names
+    assert len(names) <= 10, names
 
 
 def test_codes_have_names():

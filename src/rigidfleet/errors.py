@@ -33,7 +33,8 @@ class Finding:
 
     def __str__(self) -> str:
         where = ": ".join(part for part in (self.file, self.key) if part)
-        value = "" if self.value is None else f" = {_short(self.value)}"
+        text = str(self.value).lower() if isinstance(self.value, bool) else repr(self.value)
+        value = "" if self.value is None else f" = {_short(text)}"
         head = f"{where}{value}: {self.problem}" if where else self.problem
         return f"{head}\n    {self.remedy}" if self.remedy else head
 
@@ -87,11 +88,9 @@ class FlightError(RigidfleetError):
 
 def wrong_type(expected: str, value: object) -> TypeError:
     """Return a TypeError that names what was expected and what was given."""
-    text = " ".join(repr(value).split())
-    shown = text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."
+    shown = _short(" ".join(repr(value).split()))
     return TypeError(f"expected {expected}, got {shown} ({type(value).__name__})")
 
 
-def _short(value: object, width: int = _WIDTH) -> str:
-    text = str(value).lower() if isinstance(value, bool) else repr(value)
-    return text if len(text) <= width else text[: width - 3] + "..."
+def _short(text: str) -> str:
+    return text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import started
-from sample_flights import WORD, bitmap, quadrotors, swarm, word
+from sample_flights import WORD, bitmap, drifting, fenced, quadrotors, swarm, word
 from test_policy import HOSTILE, flight
 
 from rigidfleet.math import attitude as att
@@ -854,3 +854,67 @@ def test_a_word_is_read_at_night(show):
     assert max(sky[:3]) < 40
     assert page.run("return document.documentElement.classList.contains('night')")
     assert page.heard() == []
+
+
+# -- beside fences, and logs
+
+
+def test_fences_people_and_falls_are_drawn(show, eight):
+    """A border of people is purple, a wall of a tent reddish, and where a vehicle falls there is an amber cross."""
+    flight = fenced(eight)
+    page = show(flight)
+    r, v = at(flight, "position", 20.0)[0], at(flight, "velocity", 20.0)[0]
+    tau = (v[2] + np.sqrt(v[2] ** 2 + 2.0 * 9.81 * r[2])) / 9.81
+    border, cross = [25.0, 11.0, 0.0], [*(r + tau * v)[:2].tolist(), 0.0]
+    wall = [-25.0, 3.3, 4.7]
+    tint = {}
+    for on in (True, False):
+        page.run(f"replay.scene.show.areas = {str(on).lower()}")
+        red, green, blue, _ = page.run(PIXEL, 20.0, border)
+        assert (blue - green > 50) == on
+        red, _, blue, _ = page.run(PIXEL, 20.0, cross)
+        assert (red - blue > 80) == on
+        red, _, blue, _ = page.run(PIXEL, 20.0, wall)
+        tint[on] = red - blue
+    assert tint[True] > tint[False] + 5
+    assert page.run("return document.querySelector('[data-show=areas]').checked")
+    assert "where vehicles fall" in page.text("#notes")
+
+
+def test_a_log_is_drawn_over_its_plan(show):
+    """Who is surely off its slot has a red disc, its plan is a dark line beside its trail, and its halo may be seen."""
+    flight = drifting(4, 2, 20.0, 40.0, 1.5, 0.4)
+    page = show(flight, "t=30&camera=top")
+    count = "replay.scene.draw(arguments[0], 10); return replay.scene.places[arguments[1]].count"
+    assert [page.run(count, t, "discs") for t in (10.0, 30.0, 50.0)] == [0, 1, 0]
+    assert page.run(count, 30.0, "ballVeils") == 4
+    page.run(
+        "for (const name of ['slots', 'edges', 'names', 'axes']) replay.scene.show[name] = false"
+    )
+    planned = at(flight, "slot_position", 28.5)[2].tolist()
+    dark = page.run(PIXEL, 30.0, planned)
+    page.run("replay.scene.show.trails = false")
+    assert np.subtract(page.run(PIXEL, 30.0, planned), dark)[:3].min() > 30
+    beside = (at(flight, "position", 30.0)[2] + [0.0, 0.45, 0.0]).tolist()
+    halo = page.run(PIXEL, 30.0, beside)
+    page.run("replay.recording.columns.doubt.fill(0)")
+    assert np.abs(np.subtract(halo, page.run(PIXEL, 30.0, beside))).max() > 15
+
+
+def test_drifts_are_on_the_timeline(show, eight):
+    """A mark above the slider says who was off its slot and when; a click goes there. Other flights have no marks."""
+    page = show(drifting(4, 2, 20.0, 40.0, 1.5, 0.4), "t=0")
+    title = page.run("return document.querySelector('#drifts button').title")
+    assert title.startswith("Agent 3 is off its slot (20.0 to 40.0 s)")
+    mark, line = (
+        page.run(
+            f"const b = document.querySelector('{x}').getBoundingClientRect(); return [b.left, b.right]"
+        )
+        for x in ("#drifts button", "#drifts")
+    )
+    shares = np.subtract(mark, line[0]) / (line[1] - line[0])
+    np.testing.assert_allclose(shares, [1 / 3, 2 / 3], atol=0.01)
+    page.click("#drifts button")
+    page.wait("return /Agent 3 off the plan/.test(document.querySelector('#notes').textContent)")
+    assert 20.0 <= page.run("return replay.time") <= 40.0
+    assert show(eight).run("return document.querySelector('#drifts').hidden")

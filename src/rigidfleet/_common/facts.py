@@ -207,7 +207,7 @@ def _cell(content: Any) -> Cell:
 
 
 class Fact(NamedTuple):
-    """A worst value with its unit; its limit, when [s] and who, if there are any; and how it is judged."""
+    """A worst value with its unit; its limit, when [s], who and interval, if there are any; and how it is judged."""
 
     name: str
     value: float | None
@@ -217,6 +217,12 @@ class Fact(NamedTuple):
     when: float | None = None
     who: str = ""
     level: Level = ""
+    interval: tuple[float, float] | None = None
+
+    @property
+    def doubt(self) -> str:
+        """From what to what the true value is; "" if it is known."""
+        return "" if self.interval is None else " to ".join(map(value, self.interval))
 
     @property
     def bound(self) -> str:
@@ -231,13 +237,13 @@ class Fact(NamedTuple):
         """The fact as a row of a table."""
         worst = None if self.value is None else value(self.value, self.unit)
         when = None if self.when is None else f"{self.when:.2f}"
-        return Row((self.name, worst, self.bound, when, self.who), self.level)
+        return Row((self.name, worst, self.doubt, self.bound, when, self.who), self.level)
 
 
 def worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
     """Table of worst values with their limits."""
-    heads = (what, "worst", "limit", "at [s]", "who or where")
-    return FactTable(heads, [fact.row for fact in facts], heads[4:])
+    heads = (what, "worst", "true value", "limit", "at [s]", "who or where")
+    return FactTable(heads, [fact.row for fact in facts], heads[5:])
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,17 @@
-"""Keys, values and options that were renamed before the first release.
+"""What was renamed before the first release: a message about an old key gives the new one, an old name in code works.
 
-A message about an old name gives the new one.
+An old name of a member or a function works with a warning, for one release.
 """
 
 from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, TypeVar
+
+_C = TypeVar("_C", bound=type)
 
 #: Old name to new name. Keys and options are given as text, values as (key, value).
 RENAMED: dict[str | tuple[str, str], str] = {
@@ -21,3 +29,27 @@ def successor(key: object, value: object = None) -> str:
     """Return a remedy that gives the new name of a key, an option or a value of a key; '' if it was not renamed."""
     new = RENAMED.get(str(key) if value is None else (str(key), str(value)))
     return f"it is now called '{new}'" if new is not None else ""
+
+
+def with_earlier_names(**new: str) -> Callable[[_C], _C]:
+    """Give a class its members by earlier names, too: each with the name of now."""
+
+    def give(kind: _C) -> _C:
+        for old in new:
+            setattr(kind, old, property(partial(_member_of_now, new=new, old=old)))
+        return kind
+
+    return give
+
+
+def earlier_names(module: str, **new: str) -> Callable[[str], Any]:
+    """The `__getattr__` of a module that has functions by earlier names, too: each with the name of now."""
+    return partial(_member_of_now, sys.modules[module], new)
+
+
+def _member_of_now(owner: Any, new: Mapping[str, str], old: str) -> Any:
+    """A member of a class or a module by its earlier name, with a warning."""
+    if old not in new:
+        raise AttributeError(f"module {owner.__name__!r} has no attribute {old!r}")
+    warnings.warn(f"{old} is now {new[old]}", DeprecationWarning, stacklevel=2)
+    return getattr(owner, new[old])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Mapping
 from typing import Any
 
@@ -24,6 +25,14 @@ def to_toml(data: Mapping[str, Any]) -> str:
     """
     text = tomli_w.dumps(plain_data(data))
     return _NUMBERS.sub(lambda match: f"[{' '.join(match[1].split())[:-1]}]", text)
+
+
+def text_says(text: str, data: Mapping[str, Any]) -> bool:
+    """Whether a text is TOML, and says what data say."""
+    try:
+        return tomllib.loads(text) == data
+    except tomllib.TOMLDecodeError:
+        return False
 
 
 def toml_key(key: str) -> str:

@@ -333,7 +333,7 @@ class Measurements:
         if self._same_edges:
             return edges, intended
         kept = self.left[k][edges].all(axis=1)
-        kept &= self.mission.linked(edges, float(self.result.time[k]))
+        kept &= self.mission.has_link(edges, float(self.result.time[k]))
         return edges[kept], intended[kept]
 
     def formation(self, name: str) -> tuple[Floats | None, Ints, Floats]:

@@ -83,7 +83,17 @@ class CheckResult:
             when, who = self.first.when, f"first {self.first.who}"
         level = "fails" if not self.passed else "ok" if self.judged else ""
         level = "undecided" if self.undecided else level
-        return Fact(self.name, self.worst, self.unit, self.limit, self.at_least, when, who, level)
+        return Fact(
+            self.name,
+            self.worst,
+            self.unit,
+            self.limit,
+            self.at_least,
+            when,
+            who,
+            level,
+            self.interval,
+        )
 
     def fill(self, words: str) -> str:
         """Words with {worst}, {limit} and {who} put in."""

@@ -28,6 +28,7 @@ class Safety:
     worst : None if there is nothing to measure
     passed : whether the limit is kept; True if there is none
     undecided : whether it may be kept or not, as far as was measured
+    interval : of what was measured, from what to what the true value is
     """
 
     quantity: str
@@ -38,6 +39,7 @@ class Safety:
     worst: Extreme | None
     passed: bool
     undecided: bool = False
+    interval: tuple[float, float] | None = None
 
     @property
     def margin(self) -> float | None:
@@ -51,7 +53,8 @@ class Safety:
     def fact(self) -> Fact:
         """The quantity to show."""
         worst = None if self.worst is None else self.worst.value
-        return Fact(self.quantity, worst, self.unit, self.limit, self.at_least)
+        bound = self.limit, self.at_least
+        return Fact(self.quantity, worst, self.unit, *bound, interval=self.interval)
 
     @property
     def used(self) -> float | None:
@@ -85,5 +88,7 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
             beyond = check is None and worst is not None and limit is not None
             beyond = beyond and not keeps_limit(q, worst.value, limit)
             unsure = check is not None and check.undecided
-            rows.append(replace(row, passed=passed and not beyond, undecided=unsure))
+            interval = None if check is None else check.interval
+            passed = passed and not beyond
+            rows.append(replace(row, passed=passed, undecided=unsure, interval=interval))
     return rows

@@ -113,8 +113,6 @@ def check(
 
 def facts(mission: Mission) -> dict[str, object]:
     """Describe a mission as plain data."""
-    from rigidfleet.mission import ending, goal
-
     return {
         "name": mission.name,
         "title": mission.title,
@@ -122,7 +120,7 @@ def facts(mission: Mission) -> dict[str, object]:
         "agents": mission.n_agents,
         "formations": list(mission.formations),
         "phases": [
-            {"name": p.name, "kind": p.kind, "to": goal(p), "ends": ending(p), "control": p.control}
+            {"name": p.name, "kind": p.kind, "to": p.leads_to, "ends": p.ends, "control": p.control}
             for p in mission.phases
         ],
         "latest_end_s": mission.latest_end,

@@ -77,7 +77,7 @@ def design(
 
     from rigidfleet._common.facts import FactTable, Row
     from rigidfleet._common.files import write_file
-    from rigidfleet.formation.graphs import CUBE_EDGES, REACH, complete_graph
+    from rigidfleet.formation.graphs import CUBE_EDGES, GRAPHS, REACH, complete_graph
     from rigidfleet.formation.point_files import csv_of_points
     from rigidfleet.rigidity import design as designs
 
@@ -90,7 +90,7 @@ def design(
                 edges, reach, searched=extra != "0" or sensing_range is not None
             )
             if edges != "none":
-                kinds[edges] = designs.GRAPHS[edges](slots, REACH if reach is None else reach)
+                kinds[edges] = GRAPHS[edges](slots, REACH if reach is None else reach)
         else:
             if reach is not None:
                 raise ValueError("--reach has no effect without --edges neighbours; remove it")
@@ -146,7 +146,7 @@ def _refuse_options_that_clash(edges: str, reach: float | None, *, searched: boo
         The graph is unknown, or --extra, --range or --reach cannot be combined with it.
     """
     from rigidfleet._common.renamed import successor
-    from rigidfleet.rigidity.design import GRAPHS
+    from rigidfleet.formation.graphs import GRAPHS
 
     if edges not in GRAPHS and edges != "none":
         remedy = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"

@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 from contextlib import nullcontext
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from rigidfleet.cli import console
+from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.outputs import Files, keep_existing
+from rigidfleet.cli.run import Format, check_width, of_formats, write_figures, write_replay
+from rigidfleet.errors import ResultError, RigidfleetError
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
+    from rigidfleet.mission import Mission
     from rigidfleet.result import Result
-from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.run import (
-    Format,
-    check_width,
-    of_formats,
-    write_figures,
-    write_replay,
-)
 
 
 def report(
     result: Path,
     /,
     *others: Path,
+    drill: Path | None = None,
+    abort: Path | None = None,
     out: Path | None = None,
     force: bool = False,
     figures: Literal["few", "all"] = "few",
@@ -46,6 +47,10 @@ def report(
         Result of a flight, NAME.nc.
     others : Path
         Results of further flights to compare.
+    drill : Path
+        Folder of "sweep --drill": its first page says what the flight bears.
+    abort : Path
+        Folder of "check --abort --out": its first page says how the flight is aborted.
     out : Path
         Folder for report.html, verdict.json and figures/. Default: the folder of the result, or for
         comparison.html the current folder.
@@ -71,8 +76,14 @@ def report(
     from rigidfleet.result import Result
 
     check_width(width)
+    if others and (drill or abort):
+        raise RigidfleetError("--drill and --abort are of one flight. Give one result.")
     paths = [result, *others]
     records = [Result.load(path) for path in paths]
+    beside = {
+        "rehearsed": _rehearsal(drill, records[0].mission) if drill else [],
+        "abort": _aborts(abort, records[0].mission) if abort else [],
+    }
     if others:
         page = (out or Path()) / "comparison.html"
         keep_existing(page, force=force)
@@ -88,7 +99,7 @@ def report(
         if not (json or quiet):
             for label, verdict in zip(labels, verdicts, strict=True):
                 console.out().print(f"{label}: {verdict.summary}", soft_wrap=True)
-        write_report(records, verdicts, page, labels=labels, quiet=quiet)
+        write_report(records, verdicts, page, quiet=quiet, labels=labels)
         if not (json or quiet):
             console.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
@@ -100,7 +111,7 @@ def report(
             files.write_verdict(verdicts[0])
         left = [path for path in drawn if path not in kept]
         if files.report not in kept:
-            write_report(records, verdicts, files.report, quiet=quiet)
+            write_report(records, verdicts, files.report, quiet=quiet, **beside)
         write_figures(records[0], left, quiet=quiet, titles=not no_titles, width=width)
         if not (json or quiet):
             files.show()
@@ -134,19 +145,111 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
 
 
 def write_report(
-    records: list[Result],
-    verdicts: list[Verdict],
-    path: Path,
-    *,
-    labels: list[str] | None = None,
-    quiet: bool = False,
-) -> None:
-    """Write the report of one or several flights."""
+    records: list[Result], verdicts: list[Verdict], path: Path, *, quiet: bool = False, **beside: list[str]
+) -> None:  # fmt: skip
+    """Write the report of one or several flights, with what stands ``beside`` them."""
     from rigidfleet.reporting import report as write
 
     shown = console.err().is_interactive and not quiet
     with console.err().status("Writing the report") if shown else nullcontext():
-        write(records, path, labels=labels, verdicts=verdicts)
+        write(records, path, verdicts=verdicts, **beside)
+
+
+def _rehearsal(folder: Path, mission: Mission) -> list[str]:
+    """What a mission bears by its drill, fault by fault.
+
+    Raises
+    ------
+    ResultError
+        The folder has no drill, or that of another mission.
+    """
+    from rigidfleet._common.quantities import display_unit
+    from rigidfleet.planning.timing import expand_mission
+    from rigidfleet.sweep import store
+    from rigidfleet.sweep.faults import UNITS
+    from rigidfleet.sweep.summary import summarise
+
+    table = store.read(folder)
+    outcome, path, own = summarise(table), folder / store.FILE, table.sweep.mission
+    if not outcome.drill:
+        raise ResultError(
+            f"{path}: has no faults of the day. `rigidfleet sweep --drill` flies them."
+        )
+    if own.digest != mission.digest:  # a result has the ways that were planned for its mission
+        _refuse_other(path, expand_mission(own).digest, mission)
+    lines = [f"{outcome.success.count:,} of {outcome.flown:,} faults are harmless."]
+    if more := outcome.runs - outcome.flown:
+        lines.append(f"{more:,} more are planned and were not tried.")
+    for fault, cases in itertools.groupby(outcome.drill, lambda x: x.fault):
+        borne, parts, why = [], [], ""
+        for size, some in itertools.groupby(cases, lambda x: x.magnitude):
+            each = [*some]
+            if failed := sum(x.failed.count for x in each):
+                parts.append(f"{failed} of {sum(x.failed.of for x in each)} fail by {size:g}")
+                why = why or next(x.worst.detail for x in each if x.worst)
+            else:
+                borne.append(f"{size:g}")
+        parts = [f"none fails by {', '.join(borne)}"] * bool(borne) + parts
+        words = f"{'; '.join(parts)} {display_unit(UNITS[fault])}".rstrip()
+        lines.append(f"{fault.capitalize()}: {words}{': ' * bool(why)}{why}.")
+    return [*lines, _digest_of(path)]
+
+
+def _aborts(folder: Path, mission: Mission) -> list[str]:
+    """How a mission is aborted, from when and when not, and what follows if a vehicle does not hear the order.
+
+    Raises
+    ------
+    ResultError
+        The folder has no aborts, or those of another mission.
+    """
+    path = folder / "aborts.json"
+    try:
+        data = json.loads(path.read_bytes())
+        digest, every = data["mission_sha256"], data["aborts"]
+    except (OSError, ValueError, LookupError, TypeError):
+        raise ResultError(
+            f"{path}: is no file of aborts of this version. `rigidfleet check --abort --out {folder}` writes it."
+        ) from None
+    _refuse_other(path, digest, mission)
+    ways = [x for x in every if x["way"]]
+    to = {"any": "to any places where vehicles stood", "own": "each to its own place"}[data["to"]]
+    lines = [
+        f"Within {data['reaction_s']:g} s of an order, all slow down along the plan, then go home, {to}."
+    ]
+    text = (
+        f"A way home is proved from {len(ways)} of {len(every)} times, {data['step_s']:g} s apart"
+    )
+    if ways:
+        text += f"; it takes {max(x['ends_s'] - x['ordered_s'] for x in ways):.1f} s at most"
+    if near := [x["separation"]["least_m"] for x in ways if x["separation"]]:
+        text += f", and no two vehicles come nearer than {min(near):.2f} m"
+    lines.append(f"{text}.")
+    for way, group in itertools.groupby(every, lambda x: bool(x["way"])):
+        run = [*group]
+        if not way:
+            first, last = run[0]["ordered_s"], run[-1]["ordered_s"]
+            lines.append(f"None from {first:g} to {last:g} s: {run[0]['reason']}.")
+    if unheard := [x["unheard"] for x in ways if x["unheard"]]:
+        worst = min(unheard, key=lambda x: x["least_m"])
+        i, j = worst["agents"]
+        near = f"comes within {worst['least_m']:.2f} m of" if worst["least_m"] > 0.0 else "hits"
+        lines.append(
+            f"If one does not hear: agent {i} flies on and {near} agent {j} at {worst['time_s']:.1f} s."
+        )
+    return [*lines, _digest_of(path)]
+
+
+def _refuse_other(path: Path, digest: str, mission: Mission) -> None:
+    if digest != mission.digest:
+        raise ResultError(
+            f"{path}: is of another mission, SHA-256 {digest[:16]}, and the flight of {mission.digest[:16]}. Make it"
+            " again with the mission of the flight."
+        )
+
+
+def _digest_of(path: Path) -> str:
+    return f"{path.name}, SHA-256 {sha256(path.read_bytes()).hexdigest()}"
 
 
 def labels_of(paths: list[Path], records: list[Result]) -> list[str]:

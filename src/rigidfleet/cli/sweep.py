@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from rigidfleet.mission import Mission
     from rigidfleet.sweep import Sweep
 
-#: Suffixes of files of trajectories.
-_TRAJECTORIES = {".csv", ".skyc", ".mcap"}
-
 
 def sweep(
     mission: str,
@@ -192,7 +189,8 @@ def _sweep_and_folder(
         definition = store.read_sweep(stored[0])
         definition.runs = definition.runs if runs is None else runs
         return definition, here
-    others = keys["drill"] is not None and (here.is_dir() or here.suffix in _TRAJECTORIES)
+    named = what in mission_names()
+    others = keys["drill"] is not None and not named and here.suffix != ".toml" and here.exists()
     if chosen := [key for key, value in limits.items() if value is not None and not others]:
         raise RigidfleetError(
             f"--{chosen[0]}: is of others' trajectories, by --drill; a mission has its own. Remove it."
@@ -201,7 +199,7 @@ def _sweep_and_folder(
         mission = _judging_mission(here, **limits)
         keys["drill"] = {"files": [str(here.resolve())]}
         definition = Sweep.of(mission, vary, runs=runs, origin="rigidfleet sweep", **keys)
-    elif what not in mission_names() and is_sweep_file(what):
+    elif not named and is_sweep_file(what):
         definition = Sweep.load(what, more=vary, runs=runs, **keys)
     else:
         definition = Sweep.of(what, vary, runs=runs, origin="rigidfleet sweep", **keys)
@@ -220,6 +218,8 @@ def _judging_mission(path: Path, separation: float | None, radius: float | None)
     from rigidfleet.foreign.files import read_trajectories
     from rigidfleet.simulation.trajectories import of_curves
 
+    if path.suffix == ".nc":
+        raise RigidfleetError(f"{path}: is the result of a flight. Drill its mission instead.")
     if separation is None:
         raise RigidfleetError(
             f"{path}: is no mission, and has no limits. Give --separation, the least distance [m]."

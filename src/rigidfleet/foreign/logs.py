@@ -24,12 +24,9 @@ import numpy as np
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.curves import LoggedStates, Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.math.geodesy import Geodetic, enu_of
 from rigidfleet.typing import Floats, Ints
 
-#: Latitude, longitude [deg] and height above mean sea level [m] of a place on the Earth.
-Geodetic = tuple[float, float, float]
-#: Equatorial radius [m] and square of the eccentricity of WGS 84.
-_RADIUS, _ECCENTRICITY = 6_378_137.0, 6.694_379_990_14e-3
 #: Nanoseconds since 1970 from which on a stamp is a date; by how much a stamp goes back if a clock begins anew.
 _DATES, _ANEW = 10**15, 10**9
 #: A step of a position that its velocities do not explain: the least [m], and in usual ones.
@@ -339,18 +336,6 @@ def _fields(columns: dict[str, Any], names: str) -> Floats:
 def _turn(x: Floats, frame: str) -> Floats:
     """Vectors (K, 3) in east, north, up."""
     return x if frame == "enu" else x[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
-
-
-def enu_of(geodetic: Floats, origin: Geodetic) -> Floats:
-    """Places (K, 3) of latitude, longitude [deg] and height [m], in east, north, up about an origin [m]."""
-    lat, lon, height = np.vstack([geodetic, origin]).T
-    lat, lon = np.radians(lat), np.radians(lon)
-    n = _RADIUS / np.sqrt(1.0 - _ECCENTRICITY * np.sin(lat) ** 2)
-    flat, up = (n + height) * np.cos(lat), ((1.0 - _ECCENTRICITY) * n + height) * np.sin(lat)
-    x, y, z = (q[:-1] - q[-1] for q in (flat * np.cos(lon), flat * np.sin(lon), up))
-    (sin, cos), (sine, cosine) = ((np.sin(q[-1]), np.cos(q[-1])) for q in (lat, lon))
-    out = cosine * x + sine * y
-    return np.stack([cosine * y - sine * x, cos * z - sin * out, sin * z + cos * out], axis=1)
 
 
 def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:

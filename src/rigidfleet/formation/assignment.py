@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from itertools import combinations, permutations, product
+from itertools import permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -17,9 +16,6 @@ from rigidfleet.typing import Floats, Ints
 #: Greatest number of points whose distances are all compared, and of orders of slots that are all tried. This is
 #: faster than importing a better algorithm.
 _TRIED = 6
-#: Number of agents whose ways are compared in plain numbers: 25 times as fast as arrays so small, which halves searches
-#: of ways and saves a fifth of short flights in sweeps.
-_FEW = 6
 
 
 class AssignedSlots(NamedTuple):
@@ -42,31 +38,12 @@ def closest_approach(
     pair : the two agents, from 0
     share : share of the path at which they are nearest, in [0, 1]
     """
-    start, end = (np.asarray(x, dtype=np.float64) for x in (start, end))
-    radius = None if radius is None else np.asarray(radius, dtype=np.float64)
     best = np.inf, (0, 0), 0.0
-    if len(start) <= _FEW:
-        return min(_approaches_of_few(start, end, radius), default=best)
     for i, separation, s in _approaches(start, end, radius):
         k, j = np.unravel_index(int(separation.argmin()), separation.shape)
         if separation[k, j] < best[0]:
             best = float(separation[k, j]), (int(i[k]), int(i[0] + 1 + j)), float(s[k, j])
     return best
-
-
-def _approaches_of_few(
-    start: Floats, end: Floats, radius: Floats | None
-) -> Iterator[tuple[float, tuple[int, int], float]]:
-    """Least separation of each two agents, the two, and the share of the way there, in plain numbers."""
-    p, q = start.tolist(), end.tolist()
-    r = [0.0] * len(p) if radius is None else radius.tolist()
-    for i, j in combinations(range(len(p)), 2):
-        x, y, z = (a - b for a, b in zip(p[i], p[j], strict=True))
-        u, v, w = (a - b - c for a, b, c in zip(q[i], q[j], (x, y, z), strict=True))
-        s = -(x * u + y * v + z * w) / max(u * u + v * v + w * w, 1e-300)
-        s = min(max(s, 0.0), 1.0)
-        x, y, z = x + s * u, y + s * v, z + s * w
-        yield math.sqrt(x * x + y * y + z * z) - (r[i] + r[j]), (i, j), s
 
 
 def pairs_nearer_than(distance: float, start: ArrayLike, end: ArrayLike) -> Ints:

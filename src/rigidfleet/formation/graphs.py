@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import combinations
 
 import numpy as np
@@ -227,3 +228,12 @@ def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
             raise ValueError(f"{flat}; they need slots")
         chosen.append(int(fits[0]))
     return np.concatenate([order[chosen], np.delete(order, chosen)])
+
+
+#: Graphs with a name in missions, made from slots (N, 3) and, for neighbours, their reach in spacings.
+GRAPHS: dict[str, Callable[[Floats, float], Ints]] = {
+    "complete": lambda p, _: complete_graph(len(p)),
+    "neighbours": neighbours,
+    "henneberg": lambda p, _: henneberg(p),
+    "henneberg-multilevel": lambda p, _: henneberg_multilevel(p),
+}

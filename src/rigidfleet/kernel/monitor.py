@@ -37,7 +37,6 @@ from rigidfleet.kernel.gauge import read_gauge
 from rigidfleet.kernel.outside import call_recorder
 from rigidfleet.kernel.records import (
     ACCELERATION,
-    ANY_STEP,
     CLEARANCE,
     CONSTRAINT,
     CONSTRAINT_FORCE,
@@ -49,8 +48,6 @@ from rigidfleet.kernel.records import (
     HORIZONTAL_ACCELERATION,
     HORIZONTAL_SPEED,
     KNOTS,
-    LISTED_DISTANCES,
-    LISTED_FORCES,
     LOST,
     LOWEST,
     SEPARATION,
@@ -426,48 +423,10 @@ def watch_obstacles(i, curve, t, h, last, monitor):
 
 
 @jit
-def unremarkable(points, i, angle, p, monitor):
-    """Whether agent i is surely neither faster nor lower nor higher, over a step, than others have been.
-
-    By its control points in body axes, for a piece of the step over which these turn by ``angle`` [rad] at most. The
-    curves in world axes, of which few agents are worth it, take ten times as long.
-    """
-    n, worst, T = p.vehicles.m.shape[0], monitor.worst, monitor.attitudes[2]
-    centre = 6 * n + p.graph.edges.shape[0] + 4
-    far = fastest = carried = 0.0
-    low = centre_low = math.inf
-    high = centre_high = -math.inf
-    for k in range(5):
-        x, y, z = points[k, 3 * i], points[k, 3 * i + 1], points[k, 3 * i + 2]
-        up = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
-        low, high, far = min(low, up), max(high, up), max(far, x * x + y * y + z * z)
-        x, y, z = points[k, 3 * (n + i)], points[k, 3 * (n + i) + 1], points[k, 3 * (n + i) + 2]
-        fastest = max(fastest, x * x + y * y + z * z)
-        centre_low = min(centre_low, points[k, centre + 2])
-        centre_high = max(centre_high, points[k, centre + 2])
-        x, y, z = points[k, centre + 3], points[k, centre + 4], points[k, centre + 5]
-        carried = max(carried, x * x + y * y + z * z)
-    # An agent in the world is at most as fast as it is in the axes, and as their centre. It is at most as high as with
-    # the axes of the middle knot, and what they turn by moves it by that angle times its distance.
-    slowest = max(worst[SPEED], worst[HORIZONTAL_SPEED], worst[VERTICAL_SPEED])
-    room = -slowest - math.sqrt(carried) - CLOSE
-    off = angle * math.sqrt(far) + CLOSE
-    return (
-        room > 0.0 and fastest <= room * room
-        and centre_low + low - off >= worst[LOWEST] and -(centre_high + high + off) >= worst[HIGHEST]
-    )  # fmt: skip
-
-
-@jit
 def watch_distances(first, end, p, state, monitor):
-    """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``.
-
-    If steps are listed, they alone can hold worse ones.
-    """
-    listed = monitor.count[LISTED_DISTANCES]
-    for k in range(end - first if listed == ANY_STEP else listed):
-        watch_step(first + k if listed == ANY_STEP else monitor.listed[0, k], p, state, monitor)
-    monitor.count[LISTED_DISTANCES] = ANY_STEP
+    """Take the extremes of distances and speeds over the steps of a trail from ``first`` to before ``end``."""
+    for step in range(first, end):
+        watch_step(step, p, state, monitor)
 
 
 @jit
@@ -481,17 +440,12 @@ def watch_step(step, p, state, monitor):
     angle = angle_of(points, p)
     parts = pieces_over(angle)
     h /= parts
-    # Obstacles, pairs one below the other and fences need the curve of each agent.
-    curves = monitor.boxes.shape[0] + monitor.columns.shape[0] + monitor.fence.shape[0] > 0
-    curves = curves or monitor.altitude < math.inf or not p.body_formulation
     for part in range(parts):
         start = t + part * h
         if p.body_formulation:
             find_attitudes(points, part, parts, p, monitor)
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
-                continue
-            if not curves and unremarkable(points, i, angle / parts, p, monitor):
                 continue
             curve = monitor.curve
             in_world(points, i, 1, p, monitor, curve)
@@ -685,9 +639,8 @@ def watch_forces(last, p, w, state, monitor):
     Otherwise the last step stays in the trail: a peak at its end shows only once the next step is known.
     """
     trail, before, steps = state.trail, monitor.gauge[0], state.count[TRAILED]
-    listed, stayed = monitor.count[LISTED_FORCES], monitor.count[STAYED] == 1
-    for k in range(steps if listed == ANY_STEP else listed):
-        step = k if listed == ANY_STEP else monitor.listed[1, k]
+    stayed = monitor.count[STAYED] == 1
+    for step in range(steps):
         new = step > 0 or not stayed
         row = row_of(step, state)
         start, end = trail.clock[row, 0], end_time(step, state)
@@ -706,7 +659,6 @@ def watch_forces(last, p, w, state, monitor):
             look_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
             watch_middle(step, earlier, after, p, w, state, monitor)
-    monitor.count[LISTED_FORCES] = ANY_STEP
     if last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:

@@ -39,10 +39,8 @@ LEAST_ERROR = math.log(1e-4)
     HORIZONTAL_ACCELERATION, VERTICAL_ACCELERATION,
 ) = range(21)  # fmt: skip
 QUANTITIES = VERTICAL_ACCELERATION + 1
-#: Places in `Monitor.count`: 1 if the first step of the trail has been searched, and stays as a neighbour of the next;
-#: steps listed in `Monitor.listed` that alone can hold worse distances, and worse forces, or `ANY_STEP`.
-STAYED, LISTED_DISTANCES, LISTED_FORCES = range(3)
-ANY_STEP = -1
+#: Place in `Monitor.count`: 1 if the first step of the trail has been searched, and stays as a neighbour of the next.
+STAYED = 0
 #: Triple product of three unit vectors below which a pivot counts as lost.
 LOST_PIVOT = 1e-6
 #: Approximate size of a trail in bytes; the integrator pauses when it is full. With more, flights wait for memory.
@@ -109,10 +107,7 @@ class Monitor(NamedTuple):
     pairs: Pairs  # whose separation is monitored
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
-    count: Ints  # (3,) see `STAYED`
-    # (2, S) steps of the trail to search, for distances and for forces; lists count once. That of forces has the first
-    # and the last step of the trail.
-    listed: Ints
+    count: Ints  # (1,) see `STAYED`
     moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_moves`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
@@ -146,7 +141,7 @@ def monitor(
     """A monitor with work arrays of its own. Without the fields that are ``watched``, it has no values and no pairs."""
     n, none = len(radius), np.zeros((0, 2), dtype=np.int64)
     return Monitor(
-        radius=radius, boxes=boxes, fence=fence, count=np.array([0, ANY_STEP, ANY_STEP]), moves=np.zeros(2),
+        radius=radius, boxes=boxes, fence=fence, count=np.zeros(1, dtype=np.int64), moves=np.zeros(2),
         recorder=0, segment=0, record=0, time=np.zeros(1),
         states=np.zeros((1, states)), gauge=np.zeros((2, gauge)),
         nodes=np.empty((_NODES, gauge)), instants=np.zeros(_NODES), rank=np.zeros(_NODES, dtype=np.int64),
@@ -158,7 +153,7 @@ def monitor(
             "worst": np.full(QUANTITIES, np.inf), "when": np.zeros(QUANTITIES), "sign": np.zeros(1),
             "who": np.full((QUANTITIES, 2), -1), "left": np.ones(n, dtype=np.bool_),
             "standing": np.zeros(n, dtype=np.int64), "low": np.full((n, 3), np.inf), "pad": 0.0, "altitude": np.inf,
-            "pairs": none, "struck": none, "columns": none, "listed": np.zeros((2, 0), dtype=np.int64),
+            "pairs": none, "struck": none, "columns": none,
         },
     )  # fmt: skip
 

@@ -20,23 +20,16 @@ x v and v^2/2, so N has the same effect as Q22 - 2 n1, S12 + n1 and S22 + n2.
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import earlier_names
 from rigidfleet.math import riccati
 from rigidfleet.typing import Floats
 
-# Cache key of an array: its shape and contents.
-Key = tuple[tuple[int, ...], bytes]
 # States (K, n, n) and inputs (K, m, n) of a regulated system, from each state alone.
 Response = tuple[Floats, Floats]
-
-# Number of cached results that depend on weights and times alone: they are the same in every run of a
-# sweep, and often from phase to phase.
-_KEPT = 512
-
 
 # The double integrator.
 _A = np.array([[0.0, 1.0], [0.0, 0.0]])
@@ -130,7 +123,7 @@ def closed_loop_response(
     N = np.zeros(np.shape(B)) if N is None else N
     if x0.shape[:1] != A.shape[:1]:
         raise ValueError(f"x0 must have {len(A)} rows, one per state, not the shape {x0.shape}")
-    x, u = _responses(*map(_key, (A, B, Q, R, N, S, T, times)))
+    x, u = _responses(A, B, Q, R, N, S, T, times)
     return np.tensordot(x, x0, axes=1), np.tensordot(u, x0, axes=1)
 
 
@@ -140,12 +133,7 @@ def double_integrator_gains(Q: ArrayLike, R: ArrayLike) -> tuple[float, float]:
     In closed form: k1 = sqrt(q1/r), k2 = sqrt(q2/r + 2 k1), for any coupling in Q. Raises ValueError
     unless q1 and q2/r + 2 k1 are positive.
     """
-    return _gains(_key(Q), _key(R))
-
-
-@lru_cache(_KEPT)
-def _gains(Q_key: Key, R_key: Key) -> tuple[float, float]:
-    _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
+    _, _, Q, R, _ = _system(_A, _B, Q, R)
     if not Q[0, 0] > 0.0:
         raise ValueError(
             "an infinite horizon needs a weight on the position, Q[0] > 0: without one, a vehicle"
@@ -177,7 +165,7 @@ def finite_horizon_trajectory(
     the regulator follows this moving target, not a fixed point.
     """
     t = _times("times", times)
-    return led(double_integrator_response(t, T, Q, R, S), t, start, target, T)
+    return trajectory_of_response(double_integrator_response(t, T, Q, R, S), t, start, target, T)
 
 
 def double_integrator_response(
@@ -185,15 +173,15 @@ def double_integrator_response(
 ) -> Response:
     """How a regulated double integrator responds at times (K,) [s] in [0, T]; S = None means an infinite horizon.
 
-    States (K, 2, 2) and inputs (K, 1, 2) from an error in position, and in velocity, of 1; see `led`.
+    States (K, 2, 2) and inputs (K, 1, 2) from an error of 1 in position, and in velocity; see `trajectory_of_response`.
     """
     if S is None:
         # With the cost of an infinite horizon as final weight, the Riccati equation is stationary.
-        S = _cost_at_rest(_key(Q), _key(R))
-    return _responses(*map(_key, (_A, _B, Q, R, np.zeros(_B.shape), S, T, times)))
+        S = _cost_at_rest(Q, R)
+    return _responses(_A, _B, Q, R, np.zeros(_B.shape), S, T, times)
 
 
-def led(
+def trajectory_of_response(
     response: Response,
     times: Floats,
     start: Sequence[ArrayLike] | Floats,
@@ -226,7 +214,7 @@ def infinite_horizon_trajectory(
     The target position is that at t = T; for a target at rest, T is only the end of ``times``.
     """
     t = _times("times", times)
-    return led(double_integrator_response(t, T, Q, R, None), t, start, target, T)
+    return trajectory_of_response(double_integrator_response(t, T, Q, R, None), t, start, target, T)
 
 
 def knots(
@@ -241,14 +229,8 @@ def knots(
     if not (math.isfinite(T) and T > 0):
         raise ValueError(f"the horizon T must be positive [s], not {T}")
     if S is None:
-        S = _cost_at_rest(_key(Q), _key(R))
-    return _knots(T, _key(Q), _key(R), _key(S), tolerance).copy()
-
-
-@lru_cache(_KEPT)
-def _knots(T: float, Q_key: Key, R_key: Key, S_key: Key, tolerance: float) -> Floats:
-    S = _array(S_key)
-    _, _, Q, R, _ = _system(_A, _B, _array(Q_key), _array(R_key))
+        S = _cost_at_rest(Q, R)
+    _, _, Q, R, _ = _system(_A, _B, Q, R)
     fastest = np.abs(
         np.linalg.eigvals(riccati.hamiltonian(_A, _B @ riccati.solve(R, _B.T), Q))
     ).max()
@@ -314,11 +296,11 @@ def _quintics(h: Floats, x: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
     return np.stack([*c, (6 * x - 3 * v + 0.5 * a) / h**2], axis=-1)
 
 
-@lru_cache(_KEPT)
-def _responses(*keys: Key) -> tuple[Floats, Floats]:
-    """States (K, n, n) and inputs (K, m, n) from each state alone; of A, B, Q, R, N, S, T and times."""
-    *system, S, T, times = map(_array, keys)
-    A, B, Q, R, N = _system(*system)
+def _responses(
+    A: ArrayLike, B: ArrayLike, Q: ArrayLike, R: ArrayLike, N: ArrayLike, S: ArrayLike, T: float, times: ArrayLike
+) -> Response:  # fmt: skip
+    """States (K, n, n) and inputs (K, m, n) from each state alone."""
+    A, B, Q, R, N = _system(A, B, Q, R, N)
     S = _weight("S", S, len(A))
     t, T = _times("times", times), float(_times("T", T))
     if t.ndim != 1 or np.any(t > T * (1.0 + 1e-12)):
@@ -327,28 +309,17 @@ def _responses(*keys: Key) -> tuple[Floats, Floats]:
     return x, -riccati.solve(R, (B.T @ P + N.T) @ x)
 
 
-@lru_cache(_KEPT)
-def _cost_at_rest(Q: Key, R: Key) -> Floats:
+def _cost_at_rest(Q: ArrayLike, R: ArrayLike) -> Floats:
     """P (2, 2) of the double integrator's infinite horizon, as `infinite_horizon` has it.
 
     Its Riccati equation has a closed-form solution, which is exact for any weights.
     """
-    _, _, weights, effort, _ = _system(_A, _B, _array(Q), _array(R))
+    _, _, weights, effort, _ = _system(_A, _B, Q, R)
     (a, b), (_, d), r = *weights.tolist(), float(effort[0, 0])
-    _gains(Q, R)  # raises an error if the weights are invalid
+    double_integrator_gains(Q, R)  # raises an error if the weights are invalid
     cross = math.sqrt(a) * math.sqrt(r)
     last = math.sqrt(r) * math.sqrt(d + 2.0 * cross)
     return np.array([[cross * last / r - b, cross], [cross, last]])
-
-
-def _key(value: ArrayLike) -> Key:
-    array = np.asarray(value, dtype=float)
-    return array.shape, array.tobytes()
-
-
-def _array(key: Key) -> Floats:
-    shape, data = key
-    return np.frombuffer(data).reshape(shape)
 
 
 def _without_cross_weight(
@@ -406,3 +377,6 @@ def _times(name: str, value: ArrayLike) -> Floats:
     if not np.all(np.isfinite(t)) or np.any(t < 0.0):
         raise ValueError(f"{name} must be finite and not negative [s]")
     return t
+
+
+__getattr__ = earlier_names(__name__, led="trajectory_of_response")

@@ -271,42 +271,16 @@ class Closeness(NamedTuple):
     obstacle: Ints  # (K,)
 
 
-#: The last arguments of `closeness`, and what was found; greatest size of a flight that is kept [bytes].
-_last: list[tuple[Sequence[Obstacle], list[Floats | Bools], Closeness]] = []
-_KEPT = 4_000_000
-
-
 def closeness(
     r: Floats, radius: ArrayLike, obstacles: Sequence[Obstacle], time: Floats, left: Bools
 ) -> Closeness:
-    """Distances of the agents ``left`` (K, N) at r (K, N, 3), with radius (N,), to each other and to obstacles.
-
-    The verdict asks for what the flight has asked for: the last answer is kept, and given to the same numbers alone.
-    Its arrays are read-only.
-    """
-    radius = np.asarray(radius, dtype=float)
-    arguments = [r, radius, time, left]
-    for things, before, answer in _last[-1:]:
-        if things is obstacles and all(map(_same, arguments, before)):
-            return answer
+    """Distances of the agents ``left`` (K, N) at r (K, N, 3), with radius (N,), to each other and to obstacles."""
     each, nearest = obstacle_clearances(r, radius, obstacles, time)
     if not left.all():
         each[~left] = np.inf
-    answer = Closeness(
+    return Closeness(
         *separation_of_left(r, radius, left), each, nearest, *least_clearance(each, nearest)
     )
-    for values in answer:
-        values.flags.writeable = False
-    if r.nbytes <= _KEPT:
-        _last[:] = [(obstacles, [x.copy() for x in arguments], answer)]
-    return answer
-
-
-def _same(a: Floats | Bools, b: Floats | Bools) -> bool:
-    """Whether two arrays have the same bits; NaN equals NaN."""
-    if a.shape != b.shape or a.dtype != b.dtype or not a.flags.c_contiguous:
-        return False
-    return bool((a.reshape(-1).view(np.uint8) == b.reshape(-1).view(np.uint8)).all())
 
 
 def obstacle_clearances(

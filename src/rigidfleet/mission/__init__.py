@@ -5,26 +5,18 @@ key, the value and the remedy. Everything that a user sees counts from 1, as in 
 the entries in a key such as `phases[3].until`. Arrays that `Mission` returns count agents from 0.
 """
 
-from rigidfleet.mission.describe import ending, goal, size_in_words
-from rigidfleet.mission.kinds import KINDS, Establish, Fly, Hold, Phase, Reshape, Settle, Turn
+from rigidfleet.mission.kinds import KINDS, Establish, Fly, Hold, Phase, Reshape, Settle
 from rigidfleet.mission.loading import as_mission, json_schema, load_mission
 from rigidfleet.mission.model import Mission
 from rigidfleet.mission.obstacles import (
     Box,
-    Cylinder,
     Ground,
-    Heights,
-    Hull,
     Obstacle,
-    Sphere,
 )
 from rigidfleet.mission.schema import (
-    Disturbances,
-    Formation,
     Geofence,
     Gusts,
     Limits,
-    Lqr,
     Regulator,
 )
 from rigidfleet.mission.text import mission_names, mission_text
@@ -32,33 +24,22 @@ from rigidfleet.mission.text import mission_names, mission_text
 __all__ = [
     "KINDS",
     "Box",
-    "Cylinder",
-    "Disturbances",
     "Establish",
     "Fly",
-    "Formation",
     "Geofence",
     "Ground",
     "Gusts",
-    "Heights",
     "Hold",
-    "Hull",
     "Limits",
-    "Lqr",
     "Mission",
     "Obstacle",
     "Phase",
     "Regulator",
     "Reshape",
     "Settle",
-    "Sphere",
-    "Turn",
     "as_mission",
-    "ending",
-    "goal",
     "json_schema",
     "load_mission",
     "mission_names",
     "mission_text",
-    "size_in_words",
 ]

@@ -100,8 +100,8 @@ class Boundaries:
         ranks, number = np.reshape(values, (len(own), *r.shape[:2])), [x.number for x in own]
         return QUANTITIES[quantity].rank(ranks.max(axis=0)), np.array(number)[ranks.argmax(axis=0)]
 
-    def landings(self, r: Floats, v: Floats, level: float) -> Floats:
-        """Where vehicles fall to a level [m] that fail at states (K, N, 3): places (K, N, 2) [m]."""
+    def landings(self, r: Floats, v: Floats, level: Floats | float) -> Floats:
+        """Where vehicles fall to levels [m] that fail at states (K, N, 3): places (K, N, 2) [m]."""
         k = np.broadcast_to(self.k, r.shape[:2])
         tau = falls.fall_time(r[..., 2] - level, v[..., 2], k, self.wind[2], self.g)
         return falls.landing(r, v, tau, k, self.wind)
@@ -148,19 +148,23 @@ class BoundaryWatch:
         self.every = Boundaries(mission).every
         #: By quantity, since it was last asked for.
         self.worst: dict[str, Worst] = {}
-        self._waiting: list[tuple[Floats, Floats, Bools]] = []
-        self._count = 0
+        #: Starts, lengths and control points that are not searched yet, and whose of the agents count.
+        self._waiting: list[tuple[Floats, Floats]] = []
+        self._left: Bools | None = None
 
     def take(self, clock: Floats, points: Floats, left: Bools) -> None:
         """Take steps with starts and lengths (S, 2) [s], and control points (S, N, 6, P) of positions and velocities.
 
         Agents ``left`` (N,) count.
         """
-        if self.every and len(clock):
-            self._waiting.append((clock, points, left.copy()))
-            self._count += points.shape[0] * points.shape[1]
-            if self._count > _TOGETHER:
-                self.search()
+        if not (self.every and len(clock)):
+            return
+        if self._left is None or (self._left != left).any():
+            self.search()
+            self._left = left.copy()
+        self._waiting.append((clock, points))
+        if sum(len(steps) for steps, _ in self._waiting) * len(left) > _TOGETHER:
+            self.search()
 
     def take_way(self, way: Piecewise, left: Bools | None = None) -> None:
         """Take ways (K, N, 3, P) of agents, of whom those ``left`` (N,) count, by default all."""
@@ -176,21 +180,14 @@ class BoundaryWatch:
 
     def search(self) -> dict[str, Worst]:
         """The worst values of all steps so far, by quantity."""
-        waiting, self._waiting, self._count = self._waiting, [], 0
-        groups: list[list[tuple[Floats, Floats, Bools]]] = []
-        for steps in waiting:
-            if not groups or (groups[-1][0][2] != steps[2]).any():
-                groups.append([])
-            groups[-1].append(steps)
-        for group in groups:
-            clock, points = (np.concatenate([steps[k] for steps in group]) for k in (0, 1))
-            self._search(clock, points, np.flatnonzero(group[0][2]))
+        if self._waiting and self._left is not None and self._left.any():
+            clock, points = map(np.concatenate, zip(*self._waiting, strict=True))
+            self._search(clock, points, np.flatnonzero(self._left))
+        self._waiting = []
         return self.worst
 
     def _search(self, clock: Floats, points: Floats, agents: Ints) -> None:
         """Search the curves (S, N, 6, P) of some agents (n,): the steps of which a box may have a worse value."""
-        if not len(agents):
-            return
         points, starts = points[:, agents], np.arange(0, len(clock), _BOXED)
         # Of few numbers beside each other, `min` takes five times as long.
         low, high = (

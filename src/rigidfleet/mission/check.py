@@ -31,7 +31,7 @@ from rigidfleet.mission import (
 )
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, look_up, model_of, suggest_shape
-from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
 #: Models of the single tables. Obstacles, phases, fences and people are arrays of tables.
@@ -54,7 +54,7 @@ def defaults() -> dict[str, Any]:
     }
 
 
-def check(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
+def checked_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     """Check the data of a mission and return its parts, by the fields of `Contents`.
 
     Raises
@@ -134,7 +134,7 @@ def _tables(m: Draft) -> None:
     own = {key: value for key, value in m.data.items() if key in MissionHeader.model_fields}
     if header := m.validate(MissionHeader, own, ()):
         m.parts |= {key: getattr(header, key) for key in MissionHeader.model_fields}
-    vehicles.check(m)
+    vehicles.validate_vehicles(m)
     for key, kind in _TABLES.items():
         if key in m.data:
             data = m.data[key]
@@ -187,12 +187,8 @@ def _agents(m: Draft) -> Breaches:
     agents: Agents | None = m.agents
     if agents is None:
         return
-    n = len(agents.position)
     for key in ("mass", "velocity", "radius", "thrust_limit"):
-        entries = len(getattr(agents, key))
-        if entries != n:
-            problem = f"has {entries} entries for {n} agents"
-            yield Breach(key, problem, f"give one entry per agent, {n} in all")
+        yield from m.one_each(agents, key)
     # Without a formation, nothing divides by distances: the start may be one that others flew.
     shaped = look_up(m.data, ("formations",))
     for i, j in formations.coincident(agents.position) if shaped else ():
@@ -316,11 +312,8 @@ def _tracking(m: Draft) -> Breaches:
 
 def _allocation(m: Draft) -> Breaches:
     """The torque is divided by the method that divides it."""
-    a = m.allocation
-    idle = a.method == "rigid" and "torque_split" in a.model_fields_set
-    if idle and m.right(("allocation",), "method"):
-        problem = "has no effect with method 'rigid'"
-        yield Breach("torque_split", problem, "remove it or use method = 'pinv'")
+    if m.right(("allocation",), "method"):
+        yield from idle(m.allocation, "torque_split", "method", "pinv")
 
 
 def _limits(m: Draft) -> Breaches:
@@ -348,9 +341,7 @@ def _yaw(m: Draft) -> Breaches:
         remedy = "add point: the point to look at, [x, y, z] [m]"
         yield Breach("point", "is missing", remedy)
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
-        if key in yaw.model_fields_set and yaw.kind != kind:
-            problem = f"has no effect with kind '{yaw.kind}'"
-            yield Breach(key, problem, f"remove it or use kind = '{kind}'")
+        yield from idle(yaw, key, "kind", kind)
 
 
 def _corners(box: Any, below: Keys) -> Breaches:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rigidfleet.mission.rules import Breach, Breaches, Draft
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle
 from rigidfleet.mission.schema import Disturbances, Gusts
 from rigidfleet.mission.vehicles import NOT_SAMPLED
 from rigidfleet.typing import Floats
@@ -48,12 +48,7 @@ def rules(m: Draft) -> Breaches:
     if d is None:
         return
     for key in ("drag", "mass_error"):
-        entries = getattr(d, key)
-        if m.n is not None and isinstance(entries, tuple) and len(entries) != m.n:
-            problem = f"has {len(entries)} entries for {m.n} agents"
-            yield Breach(
-                key, problem, f"give one entry per agent, {m.n} in all, or a single number"
-            )
+        yield from m.one_each(d, key, alone=", or a single number")
     drag = d.drag if isinstance(d.drag, tuple) else (d.drag,)
     if (any(d.wind) or d.gusts is not None) and not any(c is None or c > 0 for c in drag):
         problem = "without drag, wind and gusts have no effect"
@@ -81,9 +76,7 @@ def _gusts(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         if gusts.time_scale is None:
             yield Breach("time_scale", "is missing", "add the correlation time of the gusts [s]")
         for key in ("length", "altitude", "airspeed"):
-            if getattr(gusts, key) is not None:
-                remedy = "remove it or use model = 'dryden'"
-                yield Breach(key, "has no effect with model 'first-order'", remedy)
+            yield from idle(gusts, key, "model", "dryden")
         if gusts.intensity is None:
             yield Breach("intensity", "is missing", spread)
     else:

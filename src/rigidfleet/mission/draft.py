@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import math
 import re
-import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from rigidfleet._common.renamed import earlier_names
 from rigidfleet._common.templates import templates
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity
@@ -204,11 +203,7 @@ def align_comments(text: str) -> str:
     return beside.sub(lambda m: f"{m[1]:<{_COLUMN - 1}} # {m[2]}", text)
 
 
-def __getattr__(name: str) -> Any:
-    if name == "aligned":
-        warnings.warn("aligned is now align_comments", DeprecationWarning, stacklevel=2)
-        return align_comments
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = earlier_names(__name__, aligned="align_comments")
 
 
 def _row(values: Sequence[float] | Floats) -> str:

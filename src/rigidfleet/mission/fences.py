@@ -7,16 +7,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict
 
+from rigidfleet.math.geodesy import enu_of
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.rules import Breach, Breaches, Draft
-from rigidfleet.mission.values import Coordinate, Flag, Part, key
-from rigidfleet.solids.polygons import Region, crossing
+from rigidfleet.mission.values import Coordinate, Flag, Part, key, required_key
+from rigidfleet.solids.polygons import Region, some_cross
 from rigidfleet.typing import Floats
 
-#: Semi-major axis [m] and flattening of the WGS 84 ellipsoid.
-_AXIS, _FLAT = 6_378_137.0, 1.0 / 298.257223563
 #: Farthest corner from the origin [m]: beyond, longitude and latitude are taken to be swapped, or the origin wrong.
 _FAR = 100_000.0
 #: Height up to which people reach [m].
@@ -54,17 +53,28 @@ class Area(Part):
     ceiling: Coordinate | None = key("height of the upper side [m]", None)
 
     def polygons(self, origin: Any) -> list[list[Floats]]:
-        """Polygons, each its border and its holes, as corners (m, 2) [m]; ``origin`` is the mission's geodetic one."""
+        """Polygons, each its border and its holes, as corners (m, 2) [m]; ``origin`` is the mission's geodetic one.
+
+        Degrees are places on the plane that touches the Earth there.
+        """
         if self.coordinates is None:
             return [[np.array(ring) for ring in (self.polygon or (), *self.holes)]]
         place = origin.latitude_deg, origin.longitude_deg, origin.altitude
-        return [[metres(np.array(ring), *place) for ring in rings] for rings in self.coordinates]
+
+        def metres(ring: Any) -> Floats:
+            longitude, latitude = np.array(ring).T
+            level = np.full(len(ring), origin.altitude)
+            return enu_of(np.column_stack([latitude, longitude, level]), place)[:, :2]
+
+        return [[metres(ring) for ring in rings] for rings in self.coordinates]
+
+    def rings(self, origin: Any) -> list[Floats]:
+        """Borders and holes of all polygons."""
+        return [ring for polygon in self.polygons(origin) for ring in polygon]
 
     def region(self, origin: Any, ground: float) -> Region:
         """The area between its heights; ``ground`` [m] is where people stand."""
-        floor, ceiling = self.heights(ground)
-        rings = [ring for polygon in self.polygons(origin) for ring in polygon]
-        return Region.of_rings(rings, floor, ceiling)
+        return Region.of_rings(self.rings(origin), *self.heights(ground))
 
     def heights(self, ground: float) -> tuple[float, float]:
         """Floor and ceiling [m]."""
@@ -76,7 +86,7 @@ class Area(Part):
 class Fence(Area):
     """A fence, which holds for the centres of vehicles, at all heights unless it has a floor or a ceiling."""
 
-    kind: Literal["inclusion", "exclusion"] = key(
+    kind: Literal["inclusion", "exclusion"] = required_key(
         "inclusion: vehicles stay inside; exclusion: they stay outside. Each fence holds by itself"
     )
     soft: Flag = key(
@@ -102,27 +112,6 @@ TABLES: dict[str, tuple[type[Area], str]] = {
 }
 
 
-def metres(degrees: Floats, latitude: float, longitude: float, altitude: float) -> Floats:
-    """Places (m, 2) [m] east and north of an origin [deg, deg, m], of longitudes and latitudes (m, 2) [deg].
-
-    They lie on the plane that touches the WGS 84 ellipsoid there.
-    """
-
-    def geocentric(x: Floats) -> Floats:
-        lon, lat = np.moveaxis(np.deg2rad(x), -1, 0)
-        squared = _FLAT * (2.0 - _FLAT)
-        n = _AXIS / np.sqrt(1.0 - squared * np.sin(lat) ** 2)
-        flat = (n + altitude) * np.cos(lat)
-        up = ((1.0 - squared) * n + altitude) * np.sin(lat)
-        return np.stack([flat * np.cos(lon), flat * np.sin(lon), up], axis=-1)
-
-    here = np.array([longitude, latitude])
-    (a, b), off = np.deg2rad(here), geocentric(degrees) - geocentric(here)
-    east = [-math.sin(a), math.cos(a), 0.0]
-    north = [-math.sin(b) * math.cos(a), -math.sin(b) * math.sin(a), math.cos(b)]
-    return off @ np.array([east, north]).T
-
-
 def rules(m: Draft, area: Area, path: Keys) -> Breaches:
     """An area is given once, by corners that bound one, and has heights in order."""
     ways = [name for name in ("polygon", "coordinates", "file") if getattr(area, name) is not None]
@@ -140,6 +129,13 @@ def rules(m: Draft, area: Area, path: Keys) -> Breaches:
             yield Breach("holes", "has no effect without polygon", "put holes into coordinates")
         if why := flaw(area.polygons(m.geodetic_origin)):
             yield Breach(ways[0], *why, None)
+    if (
+        isinstance(area, People)
+        and area.floor is None
+        and any(x.kind == "heights" for x in m.obstacles)
+    ):
+        remedy = "give the floor and the ceiling of the terrain there, and two metres more"
+        yield Breach("floor", "is missing: people stand on terrain", remedy, None)
     floor, ceiling = area.heights(-math.inf)
     if floor > ceiling:
         yield Breach("ceiling", f"is below the floor, {floor:g} m", "give a greater height")
@@ -160,7 +156,7 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     edges = Region.of_rings(rings).edges
     if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
         return "has two corners in a row at one place", "give each corner once"
-    if crossing(edges) is not None:
+    if some_cross(edges):
         return "has edges that cross", "give the corners in their order; polygons may not overlap"
     for border, *holes in polygons:
         inside = Region.of_rings([border])

@@ -11,7 +11,6 @@ import hashlib
 import io
 import json
 import re
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.toml import to_toml
+from rigidfleet._common.toml import text_says, to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
 from rigidfleet.mission import bounds
 from rigidfleet.mission.text import unread
@@ -91,17 +90,9 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"
         text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
-    if digests and not _text_has(text, data):  # where a file is named within a line
+    if digests and not text_says(text, data):  # where a file is named within a line
         text = "".join(digests) + to_toml(data)
     return data, text
-
-
-def _text_has(text: str, data: dict[str, Any]) -> bool:
-    """Whether TOML text says what data say."""
-    try:
-        return tomllib.loads(text) == data
-    except tomllib.TOMLDecodeError:
-        return False
 
 
 def digest_lines(text: str) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Generator, Sequence
-from itertools import combinations, islice
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,16 +31,10 @@ def sound(m: FindingCollector, name: str) -> bool:
     return m.right(("formations",), name)
 
 
-#: Number of points whose distances are all compared one by one.
-_FEW = 16
-
-
 def coincident(points: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
-    if len(p) <= _FEW and all(
-        math.dist(*pair) > 2.0 * apart for pair in combinations(p.tolist(), 2)
-    ):
+    if len(p) < 2:
         return []
     # Cells first: a search tree of many equal points degenerates and compares all pairs.
     cell = np.round(p / apart)
@@ -50,7 +43,7 @@ def coincident(points: ArrayLike) -> list[tuple[int, int]]:
     first = np.empty(len(p), dtype=np.int64)
     first[order] = order[np.flatnonzero(new)[np.cumsum(new) - 1]]
     later = np.flatnonzero(first != np.arange(len(p)))
-    if not len(later) and len(p) > 1:
+    if not len(later):
         later = np.flatnonzero(proximity.nearest(p) < apart)[1:]
         for j in later:
             away = np.linalg.norm(p - p[j], axis=1)

@@ -31,8 +31,8 @@ def read_geojson(data: bytes, name: str) -> tuple[list[list[list[list[float]]]],
         raise unread(name, f"has the coordinate reference system {crs!r}", remedy)
     try:
         polygons = [[_ring(ring, notes) for ring in rings] for rings in _polygons(root, notes)]
-    except (ValueError, TypeError, AttributeError, KeyError, RecursionError):
-        remedy = "give polygons as lists of rings of [longitude, latitude]"
+    except (ValueError, TypeError, AttributeError, LookupError, RecursionError):
+        remedy = "give polygons as lists of rings of [longitude, latitude], in degrees"
         raise unread(name, "has coordinates that are no polygons", remedy) from None
     if not all(polygons) or not polygons:
         raise unread(name, "has no polygon", "give a file with a Polygon or a MultiPolygon")
@@ -58,7 +58,10 @@ def _ring(ring: list[Any], notes: list[str]) -> list[list[float]]:
     if any(len(corner) > 2 for corner in corners):
         notes.append("altitudes are left out: floor and ceiling have the heights")
     flat = [[lon, lat] for lon, lat, *_ in corners]
+    if not all(abs(lon) <= 180.0 and abs(lat) <= 90.0 for lon, lat in flat):
+        raise ValueError
     if flat[0] != flat[-1]:
         notes.append("a ring that was not closed is closed")
-        return flat
-    return flat[:-1]
+    return [
+        corner for corner, after in zip(flat, [*flat[1:], flat[0]], strict=True) if corner != after
+    ]

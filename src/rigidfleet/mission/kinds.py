@@ -1,35 +1,17 @@
 """The kinds of phases: their keys with unit and meaning, and the properties by which other modules tell them apart."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.foreign.curves import rows_to_curve
 from rigidfleet.math.piecewise import Piecewise, join
-from rigidfleet.mission.values import (
-    AUTO,
-    AgentNumber,
-    Angle,
-    Duration,
-    Dwell,
-    Force,
-    Length,
-    LengthOrZero,
-    Part,
-    Rates,
-    Scale,
-    Time,
-    Tolerance,
-    Trajectories,
-    Vector,
-    Velocity,
-    VelocityOrFree,
-    key,
-)
+from rigidfleet.mission import values
+from rigidfleet.mission.values import AUTO, Part, key, models_by_kind, required_key
 
 #: Keys of a phase that may be automatic, and the word for it.
 TIMES = ("duration", "travel", "blend")
@@ -42,11 +24,12 @@ ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 class Settle(Part):
     """The phase ends when its error has stayed within a tolerance for some time."""
 
-    tolerance: Tolerance = key("maximum error [m]", 1e-3)
-    dwell: Dwell = key("time that the error must stay within tolerance [s]", 1.0)
-    timeout: Time = key("time after which the mission fails [s]", 60.0)
+    tolerance: values.Tolerance = key("maximum error [m]", 1e-3)
+    dwell: values.Dwell = key("time that the error must stay within tolerance [s]", 1.0)
+    timeout: values.Time = key("time after which the mission fails [s]", 60.0)
 
 
+@with_earlier_names(led="follows_curves", spelled="flown_as_written", ended="keys_if_ended")
 class AnyPhase(Part):
     """Keys of every phase. Exactly one of until, duration and settle ends it."""
 
@@ -69,28 +52,21 @@ class AnyPhase(Part):
     body_control: ClassVar[str] = "body"
 
     name: str = key("unique name; default: its kind and number", "")
-    until: Time | None = key("the phase ends at this mission time [s]", None)
-    duration: Duration | None = key(
-        "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)",
-        None,
+    until: values.Time | None = key("the phase ends at this mission time [s]")
+    duration: values.Duration | None = key(
+        "the phase ends after this time [s]; auto: as soon as the limits allow (smooth missions)"
     )
-    settle: Settle | None = key("the phase ends when its error has settled", None)
+    settle: Settle | None = key("the phase ends when its error has settled")
     control: Literal["open", "tracking", "body"] = key(
         "open: weight compensation and input_force; tracking: each agent tracks its slot; body: "
         "wrench on the virtual body. With architecture 'body' the default is open for establish, tracking for "
         "orbit and body for other phases",
         "tracking",
     )
-    input_force: Force = key(
+    input_force: values.Force = key(
         "force on each agent in addition to weight compensation [N]; only with control 'open'",
         (0.0, 0.0, 0.0),
     )
-
-    @property
-    def led(self) -> bool:
-        """The earlier name of `follows_curves`."""
-        warnings.warn("led is now follows_curves", DeprecationWarning, stacklevel=2)
-        return self.follows_curves
 
     @property
     def shaping(self) -> "Shaping | None":
@@ -137,7 +113,7 @@ class AnyPhase(Part):
         return False
 
     @property
-    def place(self) -> Vector | None:
+    def place(self) -> values.Vector | None:
         """Centre of mass to rest at [m], of a phase that comes to rest; None for where it is."""
         return None
 
@@ -152,7 +128,7 @@ class AnyPhase(Part):
         return self if isinstance(self, Vertical) else None
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether the phase is flown as written; others take its place before the flight (`planning.transitions`)."""
         return True
 
@@ -183,7 +159,16 @@ class AnyPhase(Part):
         """Target of the phase in words; "" if it stays."""
         return ""
 
-    def ended(self, length: float) -> dict[str, Any]:
+    @property
+    def ends(self) -> str:
+        """When the phase ends, in words: at a time, after a duration, or as it settles."""
+        if self.settle is not None:
+            return f"settled, within {self.settle.timeout:g} s"
+        if self.duration == AUTO:
+            return "as soon as the limits allow"
+        return f"at {self.until:g} s" if self.until is not None else f"after {self.duration:g} s"
+
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """Keys that change if the pilot ends the phase after another duration [s]: no motion is longer than it."""
         own = ((key, self.__dict__.get(key)) for key in ("travel", "blend"))
         return {key: min(seconds(time), length) for key, time in own if time is not None}
@@ -192,10 +177,10 @@ class AnyPhase(Part):
 class Attitude(Part):
     """Angles of an attitude; if one is given, the default of the others is 0."""
 
-    roll_deg: Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles", None)
-    pitch_deg: Angle | None = key("pitch at arrival [deg]", None)
-    yaw_deg: Angle | None = key(
-        "yaw at arrival [deg]; if one angle is given, the default of the others is 0", None
+    roll_deg: values.Angle | None = key("roll at arrival [deg], 3-2-1 Euler angles")
+    pitch_deg: values.Angle | None = key("pitch at arrival [deg]")
+    yaw_deg: values.Angle | None = key(
+        "yaw at arrival [deg]; if one angle is given, the default of the others is 0"
     )
 
     @model_validator(mode="before")
@@ -213,24 +198,25 @@ class Attitude(Part):
         return self.roll_deg, self.pitch_deg, self.yaw_deg
 
 
+@with_earlier_names(aligned="fits_slots")
 class Shaping(AnyPhase):
     """A phase that changes the formation."""
 
     shapes: ClassVar[bool] = True
 
-    formation: str = key("name of the formation to take")
+    formation: str = required_key("name of the formation to take")
     reference: Literal["shape", "distances", "squares", "step"] = key(
         "how the distances change: shape: slots blend; squares: squared distances blend; distances: as "
         "squares if that leads to the slots or there are none, else as shape; step: at once, as in the paper",
         "shape",
     )
-    blend: Duration = key(
+    blend: values.Duration = key(
         "duration of the blend from the start of the phase [s]; auto: the least that keeps the limits",
         4.0,
     )
 
-    position: Vector | None = key(
-        "centre of mass at the end, at rest [x, y, z] [m]; default: as before", None
+    position: values.Vector | None = key(
+        "centre of mass at the end, at rest [x, y, z] [m]; default: as before"
     )
 
     @property
@@ -239,12 +225,12 @@ class Shaping(AnyPhase):
         return () if self.position is None else ("position", "velocity")
 
     @property
-    def place(self) -> Vector | None:
+    def place(self) -> values.Vector | None:
         """The position, if it is commanded."""
         return self.position
 
     @property
-    def aligned(self) -> bool:
+    def fits_slots(self) -> bool:
         """Whether the slots are rotated during the blend, so that they move least: unless `alignment` is none."""
         return self.__dict__.get("alignment") != "none"
 
@@ -254,10 +240,10 @@ class Shaping(AnyPhase):
         place = [] if self.position is None else [_vector(self.position, "m")]
         return ", ".join([self.formation, *place, *self.angles])
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The formation, and a blend that is not longer than the phase; a step has none."""
         return {"formation": self.formation} | (
-            {} if self.reference == "step" else super().ended(length)
+            {} if self.reference == "step" else super().keys_if_ended(length)
         )
 
 
@@ -266,7 +252,7 @@ class Establish(Attitude, Shaping):
 
     body_control: ClassVar[str] = "open"
 
-    kind: Literal["establish"] = key("take a formation")
+    kind: Literal["establish"] = required_key("take a formation")
     attitude: Literal["drawn", "free"] = key(
         "drawn: tracked slots have the attitude commanded here or in an earlier phase, else that of the "
         "world axes or [body_frame]; free: slots have the attitude nearest to the agents. The attitude is always "
@@ -278,17 +264,16 @@ class Establish(Attitude, Shaping):
 class Reshape(Shaping):
     """Change from one formation to another."""
 
-    kind: Literal["reshape"] = key("change the formation")
+    kind: Literal["reshape"] = required_key("change the formation")
     transition: Literal["straight", "layers", "ways", "auto"] = key(
         "ways to the new slots: straight: all at once; layers: apart to levels one above the other, "
         "across, and together again, as three phases, with every pair proved; ways: bent ways for all together, found "
         "within limits.speed and acceleration, and proved; auto: straight if that keeps limits.separation, else layers",
         "straight",
     )
-    control_points: tuple[tuple[Vector, ...], ...] | None = key(
+    control_points: tuple[tuple[values.Vector, ...], ...] | None = key(
         "bent ways to the new slots over `blend`: control points of uniform cubic B-splines, a row of "
-        "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'",
-        None,
+        "slots [m] for each. `check --expand` and results have them in place of transition = 'ways'"
     )
     alignment: Literal["fit", "none"] = key(
         "fit: the new slots are rotated onto the old ones during the blend, and turn back meanwhile; none: "
@@ -297,7 +282,7 @@ class Reshape(Shaping):
     )
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether the ways are straight, or given."""
         return self.transition == "straight"
 
@@ -312,12 +297,11 @@ class Steering(Attitude, AnyPhase):
 
     moves: ClassVar[bool] = True
 
-    travel: Duration | None = key(
+    travel: values.Duration | None = key(
         "time from the start to the arrival [s]; default: the whole phase; auto: the least that keeps the "
-        "limits",
-        None,
+        "limits"
     )
-    rates_deg_s: Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
+    rates_deg_s: values.Rates = key("body rates [p, q, r] at arrival [deg/s]", (0.0, 0.0, 0.0))
 
     @property
     def meets(self) -> tuple[str, ...]:
@@ -334,21 +318,21 @@ class Steering(Attitude, AnyPhase):
 class Through(Part):
     """A point that a `fly` phase passes without a stop."""
 
-    position: Vector = key("centre of mass [x, y, z] [m]")
-    time: Time | None = key(
-        "time from the start of the phase [s]; default: the times with the least snap", None
+    position: values.Vector = required_key("centre of mass [x, y, z] [m]")
+    time: values.Time | None = key(
+        "time from the start of the phase [s]; default: the times with the least snap"
     )
-    velocity: Velocity | None = key(
-        "its velocity then [m/s]; default: the one with the least snap", None
+    velocity: values.Velocity | None = key(
+        "its velocity then [m/s]; default: the one with the least snap"
     )
 
 
 class Fly(Steering):
     """Fly the centre of mass to a waypoint, with arrival after `travel` or at the end of the phase."""
 
-    kind: Literal["fly"] = key("fly to a waypoint")
-    position: Vector = key("centre of mass at arrival [x, y, z] [m]")
-    velocity: VelocityOrFree = key(
+    kind: Literal["fly"] = required_key("fly to a waypoint")
+    position: values.Vector = required_key("centre of mass at arrival [x, y, z] [m]")
+    velocity: values.VelocityOrFree = key(
         "its velocity at arrival [m/s]; free: any, not judged", (0.0, 0.0, 0.0)
     )
     through: tuple[Through, ...] = key(
@@ -384,17 +368,16 @@ class Go(Attitude, AnyPhase):
     replaced: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    kind: Literal["go"] = key("fly to a pose, on a way that is found round obstacles")
-    position: Vector = key("centre of mass at arrival [x, y, z] [m]")
-    clearance: LengthOrZero = key(
+    kind: Literal["go"] = required_key("fly to a pose, on a way that is found round obstacles")
+    position: values.Vector = required_key("centre of mass at arrival [x, y, z] [m]")
+    clearance: values.LengthOrZero = key(
         "least distance of vehicles from obstacles on the planned way [m]", 0.2
     )
     formations: tuple[str, ...] | None = key(
         "formations that may be taken on the way; default: all that have slots. The phase ends in the "
-        "formation in which it begins",
-        None,
+        "formation in which it begins"
     )
-    scales: tuple[Scale, ...] = key(
+    scales: tuple[values.Scale, ...] = key(
         "factors by which formations may shrink on the way, below 1; default: none", ()
     )
 
@@ -407,13 +390,13 @@ class Go(Attitude, AnyPhase):
 class Turn(Steering):
     """Turn on the spot to an attitude. At least one angle is required."""
 
-    kind: Literal["turn"] = key("turn on the spot")
+    kind: Literal["turn"] = required_key("turn on the spot")
 
 
 class Hold(AnyPhase):
     """Stay at the commanded position and attitude."""
 
-    kind: Literal["hold"] = key("stay at the commanded position and attitude")
+    kind: Literal["hold"] = required_key("stay at the commanded position and attitude")
 
 
 class Arriving(AnyPhase):
@@ -422,15 +405,15 @@ class Arriving(AnyPhase):
     moves: ClassVar[bool] = True
     body_control: ClassVar[str] = "tracking"
 
-    travel: Time | None = key(
-        "time from the start to the arrival [s]; default: the whole phase", None
+    travel: values.Time | None = key(
+        "time from the start to the arrival [s]; default: the whole phase"
     )
 
 
 class Brake(Arriving):
     """Come to rest where braking leads, in position and attitude, with the least snap."""
 
-    kind: Literal["brake"] = key("come to rest where braking leads")
+    kind: Literal["brake"] = required_key("come to rest where braking leads")
 
 
 class Vertical(Arriving):
@@ -438,13 +421,12 @@ class Vertical(Arriving):
 
     grounded: ClassVar[bool] = True
 
-    agents: tuple[AgentNumber, ...] = key(
+    agents: tuple[values.AgentNumber, ...] = key(
         "numbers of the vehicles that move; the others stay. Default: all", ()
     )
-    stagger: Time | None = key(
+    stagger: values.Time | None = key(
         "time [s] from one group's start to the next's; all arrive by the end of the phase, each before "
-        "the next starts. Default: all start together",
-        None,
+        "the next starts. Default: all start together"
     )
     by: Literal["rows", "vehicles"] = key(
         "groups of stagger: rows: vehicles with the same y, the southernmost first; vehicles: one by one, "
@@ -453,7 +435,7 @@ class Vertical(Arriving):
     )
 
     @property
-    def spelled(self) -> bool:
+    def flown_as_written(self) -> bool:
         """Whether there is one group, which does not land elsewhere."""
         return self.stagger is None and self.__dict__.get("places") != "own"
 
@@ -476,8 +458,10 @@ class Vertical(Arriving):
 class Takeoff(Vertical):
     """Climb straight up from the ground, until all vehicles are at one height."""
 
-    kind: Literal["takeoff"] = key("climb straight up to a level height")
-    height: Length = key("height of the vehicles' centres above the ground on arrival [m]")
+    kind: Literal["takeoff"] = required_key("climb straight up to a level height")
+    height: values.Length = required_key(
+        "height of the vehicles' centres above the ground on arrival [m]"
+    )
 
     @property
     def level(self) -> float | None:
@@ -500,7 +484,7 @@ class Land(Vertical):
 
     lands: ClassVar[bool] = True
 
-    kind: Literal["land"] = key("descend straight down to the ground")
+    kind: Literal["land"] = required_key("descend straight down to the ground")
     places: Literal["below", "own"] = key(
         "below: each vehicle lands where it is, often where another one stood; own: each goes to where it stood at the "
         "start, straight or by levels, on ways that are proved, and then down",
@@ -526,35 +510,30 @@ class Follow(Cruising):
 
     follows_curves: ClassVar[bool] = True
 
-    kind: Literal["follow"] = key("follow trajectories of a file")
+    kind: Literal["follow"] = required_key("follow trajectories of a file")
     file: str | None = key(
         "file of the trajectories, relative to the mission file: one for the virtual body, or one for each "
-        "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place",
-        None,
+        "vehicle; or a folder with a file for each vehicle. A result holds `trajectories` in its place"
     )
     units: str | None = key(
-        "units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'",
-        None,
+        "units of the file's columns that do not say theirs, of time, length and angle: 'ms,mm,deg'"
     )
     axes: str | None = key(
-        "where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d",
-        None,
+        "where x, y and z of the file point: enu (east, north, up), ned, or others of e, n, u, w, s, d"
     )
-    trajectories: Trajectories | None = key(
+    trajectories: values.Trajectories | None = key(
         "of each vehicle, or of the virtual body alone: a list of pieces, each with its duration [s] and "
         "the coefficients of x, y, z [m] and yaw [rad], in ascending powers of the time since its beginning, equally "
-        "many of each (at most 8)",
-        None,
+        "many of each (at most 8)"
     )
     yaw: Literal["fixed", "file"] = key(
         "fixed: keeps the attitude commanded before; file: the virtual body is level and has the yaw of "
         "the file. The yaw of single vehicles follows [yaw]",
         "fixed",
     )
-    travel: Time | None = key(
+    travel: values.Time | None = key(
         "time from the start to the end of the trajectories [s]; default: the whole phase, whose default "
-        "is the time in the file. With another time, all speeds scale",
-        None,
+        "is the time in the file. With another time, all speeds scale"
     )
 
     @model_validator(mode="before")
@@ -586,7 +565,7 @@ class Follow(Cruising):
         n = len(self.trajectories or ())
         return "along a trajectory" if n == 1 else f"along {n} trajectories"
 
-    def ended(self, length: float) -> dict[str, Any]:
+    def keys_if_ended(self, length: float) -> dict[str, Any]:
         """The time of the whole trajectories, so that they are flown as fast up to the new end."""
         whole = self.travel or self.duration
         return {"travel": length if whole is None else seconds(whole)}
@@ -604,10 +583,10 @@ def _time_of(trajectories: Any) -> float:
 class Orbit(Cruising):
     """Circle a point on a horizontal circle at a constant rate, and leave the circle with the velocity there."""
 
-    kind: Literal["orbit"] = key("circle a point")
-    centre: Vector = key("centre of the horizontal circle [x, y, z] [m]")
-    radius: Length = key("radius of the circle [m]")
-    rate_deg_s: Angle = key(
+    kind: Literal["orbit"] = required_key("circle a point")
+    centre: values.Vector = required_key("centre of the horizontal circle [x, y, z] [m]")
+    radius: values.Length = required_key("radius of the circle [m]")
+    rate_deg_s: values.Angle = required_key(
         "angular rate [deg/s], not 0; seen from above, > 0 is counter-clockwise and < 0 clockwise"
     )
     yaw: Literal["fixed", "along"] = key(
@@ -615,7 +594,7 @@ class Orbit(Cruising):
         "side towards the centre as at the start",
         "fixed",
     )
-    blend: Duration = key(
+    blend: values.Duration = key(
         "duration of the entry from the current position onto the circle [s]; auto: the least that keeps "
         "the limits",
         4.0,
@@ -637,8 +616,8 @@ def seconds(time: float | Literal["auto"]) -> float:
     return math.nan if isinstance(time, str) else time
 
 
-def _vector(values: Sequence[float], unit: str) -> str:
-    return f"({', '.join(f'{value:g}' for value in values)}) {unit}"
+def _vector(numbers: Sequence[float], unit: str) -> str:
+    return f"({', '.join(f'{value:g}' for value in numbers)}) {unit}"
 
 
 Phase = Annotated[
@@ -646,7 +625,4 @@ Phase = Annotated[
     Field(discriminator="kind"),
 ]
 #: Models of all phases by `kind`.
-KINDS: dict[str, type[AnyPhase]] = {
-    get_args(model.model_fields["kind"].annotation)[0]: model
-    for model in get_args(get_args(Phase)[0])
-}
+KINDS: dict[str, type[AnyPhase]] = models_by_kind(Phase)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property, wraps
+from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike
 from pydantic import PrivateAttr
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
-from rigidfleet._common.kept import kept
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet._common.text import agent_names
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
@@ -23,12 +24,11 @@ from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.math.lqr import double_integrator_gains
 from rigidfleet.math.rigid_body import about_cm
 from rigidfleet.mission.changes import with_own_names, with_scales
-from rigidfleet.mission.check import check, defaults
-from rigidfleet.mission.describe import ending, goal, size_in_words
+from rigidfleet.mission.check import checked_parts, defaults
 from rigidfleet.mission.files import digest_lines
 from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
-from rigidfleet.mission.phases import latest_end
+from rigidfleet.mission.phases import end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents
 from rigidfleet.mission.text import parse_toml, unread
 from rigidfleet.mission.vehicles import VehicleModel, resolve
@@ -84,6 +84,7 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 _STANDING = 0.5
 
 
+@with_earlier_names(linked="has_link")
 class Mission(Contents, Shown):
     """A checked mission. Create one by `load_mission`, `Mission.from_toml` or `Mission.from_dict`.
 
@@ -132,7 +133,7 @@ class Mission(Contents, Shown):
         MissionError
             With a finding for each error.
         """
-        parts = check(data, origin)
+        parts = checked_parts(data, origin)
         if parts["assignment"] == "each":
             parts["formations"], parts["phases"] = with_own_names(
                 parts["formations"], parts["phases"]
@@ -197,7 +198,16 @@ class Mission(Contents, Shown):
     @property
     def size_in_words(self) -> str:
         """Size of the mission: 3 agents, 2 formations, 12 phases, 90 s."""
-        return size_in_words(self.n_agents, len(self.formations), self.phases)
+        counts = {
+            "agent": self.n_agents,
+            "formation": len(self.formations),
+            "phase": len(self.phases),
+        }
+        words = [f"{n} {thing}{'s' * (n != 1)}" for thing, n in counts.items()]
+        most = "at most " if any(phase.settle for phase in self.phases) else ""
+        end = self.latest_end
+        lasts = "as long as its limits ask" if math.isnan(end) else f"{most}{end:g} s"
+        return ", ".join([*words, lasts])
 
     def __repr__(self) -> str:
         return f"<Mission {self.name}: {self.size_in_words}>"
@@ -212,7 +222,7 @@ class Mission(Contents, Shown):
     def phase_table(self) -> FactTable:
         """Each phase: where it leads, when it ends, and how it is controlled."""
         rows = [
-            Row((n, p.name, p.kind, goal(p), ending(p), p.control))
+            Row((n, p.name, p.kind, p.leads_to, p.ends, p.control))
             for n, p in enumerate(self.phases, start=1)
         ]
         heads = ("#", "phase", "kind", "to", "ends", "control")
@@ -228,6 +238,11 @@ class Mission(Contents, Shown):
         if not self._text:
             self._text = self._about + to_toml(self._data)
         return self._text
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of its text."""
+        return sha256(self.text.encode()).hexdigest()
 
     @property
     def about(self) -> str:
@@ -452,7 +467,7 @@ class Mission(Contents, Shown):
 
         It is nan while a duration before it is automatic (`rigidfleet.planning.timing.complete_times`).
         """
-        return latest_end(self.phases)
+        return end_of_phases(self.phases)
 
     @cached_property
     def fleet(self) -> Fleet:
@@ -554,7 +569,7 @@ class Mission(Contents, Shown):
         pairs = np.array([sorted(link.between) for link in lost], dtype=np.int64).reshape(-1, 2)
         return pairs - 1, np.array([link.time for link in lost], dtype=np.float64)
 
-    def linked(self, edges: Ints, t: float) -> Bools:
+    def has_link(self, edges: Ints, t: float) -> Bools:
         """Mask (m,) of the edges (m, 2), i < j, whose link is not lost at a time [s]."""
         pairs, times = self.links_lost
         n = self.n_agents
@@ -576,7 +591,7 @@ class Mission(Contents, Shown):
         words += [f"the link {i + 1}-{j + 1}" for i, j in pairs[times == when]]
         return " and ".join(words)
 
-    @property
+    @cached_property
     def aborting(self) -> Aborting:
         """How the flight is aborted: [abort], or its defaults."""
         return self.abort or Aborting.model_construct()
@@ -584,16 +599,16 @@ class Mission(Contents, Shown):
     @property
     def abandons_at(self) -> float:
         """Time [s] at which the flight leaves its plan, for a loss that is answered or an abort; infinity if never."""
-        return min(self._answers)
+        return min(self._loss_and_order)
 
     @property
     def aborts(self) -> bool:
         """Whether it then aborts, by [abort]."""
-        loss, abort = self._answers
+        loss, abort = self._loss_and_order
         return abort < loss
 
     @property
-    def _answers(self) -> tuple[float, float]:
+    def _loss_and_order(self) -> tuple[float, float]:
         """Times [s] at which the others brake after a loss, and at which the flight aborts; infinity if never."""
         options, loss = self.aborting, math.inf if self.on_loss == "continue" else self.first_loss
         order = math.inf if options.at is None else options.at
@@ -610,17 +625,6 @@ class Mission(Contents, Shown):
 def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
     """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
     least, most = _DAMPING
-    m = masses.tolist()
-    # J M^-1 J^T is at least J J^T / max m: with enough of this, no mass of a sweep needs its own decomposition.
-    w = sum(m) / len(m) / max(m) * _smallest_eigenvalue(slots, edges, None)
-    if not w > 4 * most:
-        w = _smallest_eigenvalue(slots, edges, masses)
-    return min(max(w / 4, least), most)
-
-
-# Saves a twentieth of a short flight, such as narrow-passage.
-@kept
-def _smallest_eigenvalue(slots: Floats, edges: Ints, masses: Floats | None) -> float:
-    """The smallest non-zero eigenvalue w of mbar J M^-1 J^T, or of J J^T without masses."""
     J = constraint_jacobian.jacobian(slots[None], edges)
-    return float(constraint_jacobian.smallest_of(J, masses)[0]) ** 2
+    w = float(constraint_jacobian.smallest_of(J, masses)[0]) ** 2  # of mbar J M^-1 J^T
+    return min(max(w / 4, least), most)

@@ -21,11 +21,7 @@ def rules(m: Draft) -> Breaches:
         problem = f"leaves each of {m.n:,} vehicles less than one broadcast a second"
         yield Breach("budget", problem, f"give at least {m.n} Hz, or remove it")
     for key in ("late", "drift") if net.clocks else ():
-        entries = getattr(net.clocks, key)
-        if m.n is not None and isinstance(entries, tuple) and len(entries) != m.n:
-            problem = f"has {len(entries)} entries for {m.n} agents"
-            remedy = f"give one entry per agent, {m.n} in all, or a single number"
-            yield Breach(("clocks", key), problem, remedy)
+        yield from m.one_each(net.clocks, key, "clocks", alone=", or a single number")
     for k, one in enumerate(net.outages):
         yield from agents_exist(m, ("outages", k, "between"), one.between)
         if one.end <= one.start:

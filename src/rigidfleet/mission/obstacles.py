@@ -10,21 +10,11 @@ import numpy as np
 from pydantic import Field
 
 from rigidfleet.math.attitude import dcm_from_euler
-from rigidfleet.mission import bounds
+from rigidfleet.mission import bounds, values
 from rigidfleet.mission.files import FILL, NOT_A_FILE, without_data
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.rules import Breach, Breaches
-from rigidfleet.mission.values import (
-    Angle,
-    Coordinate,
-    Flag,
-    Length,
-    Part,
-    Seconds,
-    Vector,
-    Velocity,
-    key,
-)
+from rigidfleet.mission.values import Part, key, models_by_kind, required_key
 from rigidfleet.solids import records
 from rigidfleet.solids.records import Form, Solids
 
@@ -36,7 +26,9 @@ class Solid(Part):
     """An obstacle, which is a solid shape; distances to it are those of `rigidfleet.solids`."""
 
     name: str = key("name; default: the kind and a number", "")
-    zone: Flag = key("true: a no-fly zone; judged as an obstacle, and drawn as a zone", False)
+    zone: values.Flag = key(
+        "true: a no-fly zone; judged as an obstacle, and drawn as a zone", False
+    )
 
     @property
     @abstractmethod
@@ -74,18 +66,17 @@ class Solid(Part):
 class Moving(Solid):
     """An obstacle that may move, without turning."""
 
-    velocity: Velocity | None = key("constant velocity [m/s], from the start of the mission", None)
-    waypoints: tuple[Vector, ...] | None = key(
+    velocity: values.Velocity | None = key("constant velocity [m/s], from the start of the mission")
+    waypoints: tuple[values.Vector, ...] | None = key(
         "places of the obstacle's centre [x, y, z] [m] at `times`: straight between them at constant "
-        "speed, at rest before the first and after the last",
-        None,
+        "speed, at rest before the first and after the last"
     )
-    times: tuple[Seconds, ...] | None = key("mission times of the waypoints [s], increasing", None)
-    appears: Seconds | None = key(
-        "mission time from which the obstacle is there [s]; default: from the start", None
+    times: tuple[values.Seconds, ...] | None = key("mission times of the waypoints [s], increasing")
+    appears: values.Seconds | None = key(
+        "mission time from which the obstacle is there [s]; default: from the start"
     )
-    vanishes: Seconds | None = key(
-        "mission time until which it is there [s]; default: to the end", None
+    vanishes: values.Seconds | None = key(
+        "mission time until which it is there [s]; default: to the end"
     )
 
     @property
@@ -116,12 +107,12 @@ class Moving(Solid):
 class Box(Moving):
     """A box, parallel to the world axes or turned."""
 
-    kind: Literal["box"] = key("a box, parallel to the world axes unless turned")
-    min: Vector = key("lowest corner [x, y, z] [m], before turning")
-    max: Vector = key("highest corner [x, y, z] [m], before turning")
-    roll_deg: Angle = key("roll [deg] about the box's centre, 3-2-1 Euler angles", 0.0)
-    pitch_deg: Angle = key("pitch [deg]", 0.0)
-    yaw_deg: Angle = key("yaw [deg]", 0.0)
+    kind: Literal["box"] = required_key("a box, parallel to the world axes unless turned")
+    min: values.Vector = required_key("lowest corner [x, y, z] [m], before turning")
+    max: values.Vector = required_key("highest corner [x, y, z] [m], before turning")
+    roll_deg: values.Angle = key("roll [deg] about the box's centre, 3-2-1 Euler angles", 0.0)
+    pitch_deg: values.Angle = key("pitch [deg]", 0.0)
+    yaw_deg: values.Angle = key("yaw [deg]", 0.0)
 
     @property
     def corners(self) -> tuple[float, ...] | None:
@@ -150,9 +141,9 @@ class Box(Moving):
 class Sphere(Moving):
     """A sphere."""
 
-    kind: Literal["sphere"] = key("a sphere")
-    centre: Vector = key("centre [x, y, z] [m]", (0.0, 0.0, 0.0))
-    radius: Length = key("radius [m]")
+    kind: Literal["sphere"] = required_key("a sphere")
+    centre: values.Vector = key("centre [x, y, z] [m]", (0.0, 0.0, 0.0))
+    radius: values.Length = required_key("radius [m]")
 
     @property
     def form(self) -> Form:
@@ -163,11 +154,11 @@ class Sphere(Moving):
 class Cylinder(Moving):
     """A cylinder along any axis."""
 
-    kind: Literal["cylinder"] = key("a cylinder along any axis, with flat ends")
-    ends: Annotated[tuple[Vector, ...], Field(min_length=2, max_length=2)] = key(
+    kind: Literal["cylinder"] = required_key("a cylinder along any axis, with flat ends")
+    ends: Annotated[tuple[values.Vector, ...], Field(min_length=2, max_length=2)] = required_key(
         "centres of the two ends, [[x, y, z], [x, y, z]] [m]"
     )
-    radius: Length = key("radius [m]")
+    radius: values.Length = required_key("radius [m]")
 
     @property
     def form(self) -> Form:
@@ -178,9 +169,9 @@ class Cylinder(Moving):
 class Hull(Moving):
     """The convex hull of points."""
 
-    kind: Literal["hull"] = key("the convex hull of points; its centre is their mean")
-    points: Annotated[tuple[Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = key(
-        "points [x, y, z] [m], four or more, not all in a plane"
+    kind: Literal["hull"] = required_key("the convex hull of points; its centre is their mean")
+    points: Annotated[tuple[values.Vector, ...], Field(min_length=4, max_length=bounds.HULL)] = (
+        required_key("points [x, y, z] [m], four or more, not all in a plane")
     )
 
     @property
@@ -192,26 +183,23 @@ class Hull(Moving):
 class Heights(Solid):
     """A height map: terrain over a rectangle."""
 
-    kind: Literal["heights"] = key(
+    kind: Literal["heights"] = required_key(
         "everything between a surface of given heights and a base, over a rectangle"
     )
-    corner: Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=2)] = key(
+    corner: Annotated[tuple[values.Coordinate, ...], Field(min_length=2, max_length=2)] = key(
         "place [x, y] [m] of the first height", (0.0, 0.0)
     )
-    spacing: Length = key("distance between neighbouring heights along x and y [m]")
-    heights: tuple[tuple[Coordinate, ...], ...] | None = key(
+    spacing: values.Length = required_key("distance between neighbouring heights along x and y [m]")
+    heights: tuple[tuple[values.Coordinate, ...], ...] | None = key(
         "heights [m]: a list for each x, in which y increases; each square between four heights is two "
-        "triangles, divided from its lowest x and y to its highest",
-        None,
+        "triangles, divided from its lowest x and y to its highest"
     )
     file: str | None = key(
         "instead of heights: a CSV or NPY file with them, relative to the mission file; the result holds "
-        "the heights themselves",
-        None,
+        "the heights themselves"
     )
-    base: Coordinate | None = key(
-        "height of the underside [m]; default: as far below the lowest height as the map is wide",
-        None,
+    base: values.Coordinate | None = key(
+        "height of the underside [m]; default: as far below the lowest height as the map is wide"
     )
 
     @property
@@ -226,9 +214,9 @@ class Heights(Solid):
 class Ground(Part):
     """Everything below a height."""
 
-    kind: Literal["ground"] = key("everything below a height")
+    kind: Literal["ground"] = required_key("everything below a height")
     name: str = key("name; default: 'ground'", "")
-    height: Coordinate = key("height of the ground [m]", 0.0)
+    height: values.Coordinate = key("height of the ground [m]", 0.0)
 
     @property
     def zone(self) -> bool:
@@ -246,10 +234,8 @@ class Ground(Part):
         return records.single(records.half_space(self.height))
 
 
-Obstacle = Annotated[Box | Sphere | Cylinder | Hull | Heights | Ground, Field(discriminator="kind")]
-KINDS: dict[str, type[Part]] = {
-    "box": Box, "ground": Ground, "sphere": Sphere, "cylinder": Cylinder, "hull": Hull, "heights": Heights,
-}  # fmt: skip
+Obstacle = Annotated[Box | Ground | Sphere | Cylinder | Hull | Heights, Field(discriminator="kind")]
+KINDS: dict[str, type[Part]] = models_by_kind(Obstacle)
 
 
 def is_ground(thing: Obstacle) -> bool:

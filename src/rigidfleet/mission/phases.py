@@ -53,7 +53,7 @@ def rules(m: Draft) -> Breaches:
     phases = yield from _phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
     _check(m, phases)
-    end = latest_end(m.phases) if m.right((), "phases") else math.nan
+    end = end_of_phases(m.phases) if m.right((), "phases") else math.nan
     # With automatic durations it is not known; the mission is checked again when they are.
     m.end = None if math.isnan(end) else end
 
@@ -78,7 +78,7 @@ def _check(m: Draft, phases: Written) -> None:
                 m.keep(("phases", k), rules)
 
 
-def latest_end(phases: Sequence[AnyPhase]) -> float:
+def end_of_phases(phases: Sequence[AnyPhase]) -> float:
     """Latest mission time [s] at which the last phase ends: each phase that settles takes its full timeout.
 
     It is nan if it depends on a duration that is automatic.

@@ -34,6 +34,13 @@ class Breach(NamedTuple):
 Breaches = Iterator[Breach]
 
 
+def idle(part: Any, key: str, other: str, *acts: str) -> Breaches:
+    """A key that is written has no effect but with one of some values of another key."""
+    if key in part.model_fields_set and getattr(part, other) not in acts:
+        problem = f"has no effect with {other} '{getattr(part, other)}'"
+        yield Breach(key, problem, f"remove it or use {other} = '{acts[0]}'")
+
+
 class Draft(FindingCollector):
     """A mission under check. Its parts are attributes: those without errors, or else their defaults.
 
@@ -66,6 +73,15 @@ class Draft(FindingCollector):
     def smooth(self) -> bool:
         """Whether acceleration and jerk of the references are to be continuous."""
         return self.smoothness == "jerk"
+
+    def one_each(self, part: Any, key: str, *where: str, alone: str = "") -> Breaches:
+        """A list has one entry per agent; ``alone`` says what else may stand in its place."""
+        entries = getattr(part, key)
+        if isinstance(entries, tuple) and self.n not in (None, len(entries)):
+            problem = f"has {len(entries)} entries for {self.n} agents"
+            yield Breach(
+                (*where, key), problem, f"give one entry per agent, {self.n} in all{alone}"
+            )
 
     def keep(self, path: Keys, breaches: Breaches) -> None:
         """Record the rules that are broken in the table at a path.

@@ -16,7 +16,7 @@ from pydantic import (
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE
 from rigidfleet.formation import distance_geometry, graphs, shapes
 from rigidfleet.math import pid, rigid_body
-from rigidfleet.mission import bounds
+from rigidfleet.mission import bounds, values
 from rigidfleet.mission.bounds import (
     ACCELERATION,
     FORCE,
@@ -26,58 +26,7 @@ from rigidfleet.mission.bounds import (
 from rigidfleet.mission.fences import Fence, People
 from rigidfleet.mission.kinds import Phase
 from rigidfleet.mission.obstacles import Obstacle
-from rigidfleet.mission.values import (
-    NAME_OR_LIST,
-    Acceleration,
-    AgentNumber,
-    Angle,
-    AttitudeGains,
-    BodyDrag,
-    Coefficient,
-    Colour,
-    Coordinate,
-    Cost,
-    Damping,
-    Delay,
-    Edges,
-    Flag,
-    Gain,
-    Inertia,
-    Jerk,
-    Length,
-    LengthOrZero,
-    Limit,
-    Mass,
-    MotorTimes,
-    Part,
-    PerAgent,
-    PerAgentDelay,
-    PerAgentDrift,
-    PerAgentError,
-    PerAxis,
-    Rate,
-    Rest,
-    RotorSpeeds,
-    Seconds,
-    Seed,
-    Share,
-    Size,
-    Small,
-    Speed,
-    Spread,
-    Tilt,
-    Time,
-    Tolerance,
-    Vector,
-    Velocity,
-    Weight,
-    Weights,
-    Whole,
-    from_zero,
-    key,
-    number_or_list,
-    of_either_sign,
-)
+from rigidfleet.mission.values import Part, key, required_key
 from rigidfleet.typing import Floats, Ints
 
 #: Default drag coefficient of a vehicle per mass [1/s]. At the speeds of formation flight, rotor drag dominates, which
@@ -89,12 +38,14 @@ DRAG = 0.3
 class Start(Part):
     """Start positions of the agents on the slots of a named shape, in their order."""
 
-    shape: str = key(
+    shape: str = required_key(
         f"named shape: {', '.join(shapes.SHAPES)}", json_schema_extra={"enum": [*shapes.SHAPES]}
     )
-    size: Size = key("edge length of the shape [m], or its three sizes")
-    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = key("number of agents")
-    centre: Vector = key("centre of the shape [x, y, z] [m]", (0.0, 0.0, 0.0))
+    size: values.Size = required_key("edge length of the shape [m], or its three sizes")
+    count: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] = required_key(
+        "number of agents"
+    )
+    centre: values.Vector = key("centre of the shape [x, y, z] [m]", (0.0, 0.0, 0.0))
 
     def points(self) -> Floats:
         """Positions (count, 3) [m].
@@ -110,61 +61,66 @@ class Start(Part):
 class Vehicle(Part):
     """A model of vehicle. Keys that are not given are those of the model; `rigidfleet.mission.vehicles` has them."""
 
-    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = key(
+    model: Literal["point", "paper", "px4-sih", "hummingbird", "crazyflie", "x500"] = required_key(
         "point: a point mass that gives any force at once; the others are quadrotors: paper: the paper's, "
         "1 kg with four rotors of 5.9 N; px4-sih: PX4's simulation in hardware; hummingbird: AscTec Hummingbird; "
         "crazyflie: Crazyflie 2; x500: Holybro X500"
     )
-    mass: Mass | None = key("mass [kg]; required for a point", None)
-    inertia: Inertia | None = key(
-        "moments of inertia about the body's axes [x, y, z] [kg m^2]", None
+    mass: values.Mass | None = key("mass [kg]; required for a point")
+    inertia: values.Inertia | None = key(
+        "moments of inertia about the body's axes [x, y, z] [kg m^2]"
     )
-    arm: Length | None = key(
-        "distance of each rotor from the centre of mass [m]; rotors form an X", None
+    arm: values.Length | None = key(
+        "distance of each rotor from the centre of mass [m]; rotors form an X"
     )
-    thrust_coefficient: Small | None = key(
-        "k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed", None
+    thrust_coefficient: values.Small | None = key(
+        "k_f [N s^2/rad^2]: a rotor's thrust is k_f times the square of its speed"
     )
-    torque_coefficient: Small | None = key(
-        "k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed", None
+    torque_coefficient: values.Small | None = key(
+        "k_m [N m s^2/rad^2]: its drag torque is k_m times the square of its speed"
     )
-    rotor_speed: RotorSpeeds | None = key("[least, greatest] speed of a rotor [rad/s]", None)
-    motor_time: MotorTimes | None = key(
-        "time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down",
-        None,
+    rotor_speed: values.RotorSpeeds | None = key("[least, greatest] speed of a rotor [rad/s]")
+    motor_time: values.MotorTimes | None = key(
+        "time constants of the motors [s]: [up, down], how quickly rotors speed up and slow down"
     )
-    rotor_drag: Coefficient | None = key(
-        "k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis", None
+    rotor_drag: values.Coefficient | None = key(
+        "k_d [kg/rad]: drag of a rotor per its speed and the air's speed across its axis"
     )
-    rotor_inflow: Coefficient | None = key("k_z [kg/rad]: the same along its axis", None)
-    rotor_lift: Coefficient | None = key(
-        "k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it", None
+    rotor_inflow: values.Coefficient | None = key("k_z [kg/rad]: the same along its axis")
+    rotor_lift: values.Coefficient | None = key(
+        "k_h [kg/m]: additional thrust of a rotor per square of the air's speed across it"
     )
-    body_drag: BodyDrag | None = key(
-        "drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]", None
+    body_drag: values.BodyDrag | None = key(
+        "drag of the body per square of the air's speed [x, y, z] [N s^2/m^2]"
     )
-    rotor_radius: Length | None = key("radius of a rotor [m], for downwash and ground effect", None)
-    attitude_gains: AttitudeGains | None = key(
-        "[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]", None
+    rotor_radius: values.Length | None = key(
+        "radius of a rotor [m], for downwash and ground effect"
     )
-    tilt_limit_deg: Tilt | None = key("maximum tilt that the attitude control commands [deg]", None)
-    thrust_limit: Limit | None = key(
-        "maximum thrust [N], only for a point; default: unlimited", None
+    attitude_gains: values.AttitudeGains | None = key(
+        "[k_R, k_omega] of the attitude control per moment of inertia [1/s^2, 1/s]"
     )
-    drag: Weight | None = key(
-        "drag force per velocity relative to the air [N s/m], only for a point; default: 0", None
+    tilt_limit_deg: values.Tilt | None = key(
+        "maximum tilt that the attitude control commands [deg]"
+    )
+    thrust_limit: values.Limit | None = key(
+        "maximum thrust [N], only for a point; default: unlimited"
+    )
+    drag: values.Weight | None = key(
+        "drag force per velocity relative to the air [N s/m], only for a point; default: 0"
     )
 
 
 class Autopilot(Part):
     """Sampled control on board: how often each vehicle's computer acts. Only with [vehicles]."""
 
-    rate: Rate = key("rate of the attitude control [Hz]; commands are held in between", 500.0)
-    formation_rate: Rate = key(
+    rate: values.Rate = key(
+        "rate of the attitude control [Hz]; commands are held in between", 500.0
+    )
+    formation_rate: values.Rate = key(
         "rate of the formation's laws [Hz], which give each vehicle its force; rate is a multiple of it",
         100.0,
     )
-    delay_compensation: Flag = key(
+    delay_compensation: values.Flag = key(
         "true: measurements carry their time, and are compared with the reference of that time, while "
         "slots are tracked; false: with the reference of now",
         True,
@@ -177,33 +133,34 @@ class Autopilot(Part):
 class Avoidance(Part):
     """Avoidance in flight, at the rate of the formation's laws; see docs/avoidance.md. Only with [vehicles]."""
 
-    guard: Flag = key(
+    guard: values.Flag = key(
         "true: a vehicle does only what leaves all of them able to brake in time", True
     )
-    barrier: Flag = key(
+    barrier: values.Flag = key(
         "true: barriers change accelerations early and as little as possible, and edges of a formation let "
         "go near them",
         True,
     )
-    clock: Flag = key(
+    clock: values.Flag = key(
         "true: a formation waits on its path while an obstacle that moves passes", True
     )
     patience: Annotated[float, Strict(), Field(ge=0, le=3600)] = key(
         "time by which a phase may end later because its formation waits [s]", 30.0
     )
-    body: Flag = key(
+    body: values.Flag = key(
         "true: a formation is steered round obstacles that move as one body, before single agents give "
         "way",
         True,
     )
-    separation: LengthOrZero | None = key(
-        "separation of agents to keep [m]; default: that of [limits], or 0", None
+    separation: values.LengthOrZero | None = key(
+        "separation of agents to keep [m]; default: that of [limits], or 0"
     )
-    clearance: LengthOrZero = key("distance of an agent's surface from obstacles to keep [m]", 0.0)
-    margin: LengthOrZero | None = key(
+    clearance: values.LengthOrZero = key(
+        "distance of an agent's surface from obstacles to keep [m]", 0.0
+    )
+    margin: values.LengthOrZero | None = key(
         "by which each agent is taken to be larger [m]; default: three times the noise of positions, and "
-        "0.02 m for a quadrotor",
-        None,
+        "0.02 m for a quadrotor"
     )
     rate: Annotated[float, Strict(), Field(gt=0, le=100)] = key(
         "rate at which a barrier is approached [1/s]: lower, and vehicles give way earlier", 3.0
@@ -219,54 +176,55 @@ class Avoidance(Part):
         "flow round balls",
         "path",
     )
-    sensing_range: Length | None = key(
+    sensing_range: values.Length | None = key(
         "distance of an agent's centre from an obstacle that moves within which all see it [m]; default: "
-        "its motion is known in advance",
-        None,
+        "its motion is known in advance"
     )
-    sensing_noise: LengthOrZero = key(
+    sensing_noise: values.LengthOrZero = key(
         "standard deviation of the place of an obstacle seen, along each axis [m]", 0.0
     )
     obstacle_acceleration: Annotated[float, Strict(), Field(ge=0, le=100)] = key(
         "acceleration of obstacles that is reckoned with [m/s^2]: in the Kalman filter, and less braking",
         0.0,
     )
-    seed: Seed = key("seed of the random numbers; the same seed gives the same sensing noise", 0)
+    seed: values.Seed = key(
+        "seed of the random numbers; the same seed gives the same sensing noise", 0
+    )
 
 
 class Agents(Part):
     """The vehicles of the fleet. After the check, each field has one entry per agent."""
 
-    mass: Annotated[tuple[Mass, ...], number_or_list(MASS.least)] = key(
+    mass: Annotated[tuple[values.Mass, ...], values.number_or_list(MASS.least)] = required_key(
         "mass [kg], > 0: one number for all agents, or a list with one per agent; with vehicle, it is the "
         "vehicle's"
     )
-    vehicle: Annotated[tuple[str, ...], NAME_OR_LIST] = key(
+    vehicle: Annotated[tuple[str, ...], values.NAME_OR_LIST] = key(
         "name of a table [vehicles.NAME], or a list with one name per agent; default: point masses that "
         "give any force at once",
         (),
     )
-    position: Annotated[tuple[Vector, ...], Field(min_length=1)] = key(
+    position: Annotated[tuple[values.Vector, ...], Field(min_length=1)] = required_key(
         "initial position [x, y, z] of each agent [m], world axes ENU (z up); or a table with the "
         "shape in which the agents start, or the name of a file of points: CSV, NPY or PLY, relative to the mission "
         "file"
     )
-    velocity: tuple[Velocity, ...] = key(
+    velocity: tuple[values.Velocity, ...] = key(
         "initial velocity of each agent [m/s]; default: at rest", ()
     )
-    fixed: tuple[AgentNumber, ...] = key(
+    fixed: tuple[values.AgentNumber, ...] = key(
         "numbers of agents that never move; only with control 'open', solver 'pinv'", ()
     )
-    radius: Annotated[tuple[LengthOrZero, ...], number_or_list(0)] = key(
+    radius: Annotated[tuple[values.LengthOrZero, ...], values.number_or_list(0)] = key(
         "radius of the sphere around an agent that must not touch anything [m]: a number or a list",
         (0.25,),
     )
-    thrust_limit: Annotated[tuple[Limit, ...], number_or_list(FORCE.least)] = key(
+    thrust_limit: Annotated[tuple[values.Limit, ...], values.number_or_list(FORCE.least)] = key(
         "maximum thrust |f_u + f_C| [N], of input and constraint force together: a number or a list; "
         "default: unlimited",
         (math.inf,),
     )
-    saturate: Flag = key(
+    saturate: values.Flag = key(
         "true: thrust is clipped at thrust_limit; false: the verdict compares it with thrust_limit",
         False,
     )
@@ -288,9 +246,9 @@ class Agents(Part):
 class Constraint(Part):
     """The constraint force: feedback of the constraint c = L - d, and the solver for the multipliers."""
 
-    alpha: Gain = key("alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha", 3.0)
-    beta: Gain = key("beta [1/s], > 0; the feedback gain of c is beta^2", math.sqrt(12))
-    gamma: Annotated[float, Strict(), of_either_sign(GAIN, 3)] = key(
+    alpha: values.Gain = key("alpha [1/s], > 0; the feedback gain of dc/dt is 2 alpha", 3.0)
+    beta: values.Gain = key("beta [1/s], > 0; the feedback gain of c is beta^2", math.sqrt(12))
+    gamma: Annotated[float, Strict(), values.of_either_sign(GAIN, 3)] = key(
         "feedback gain of the integral of c [1/s^3], >= 0, < 2 alpha beta^2", 8.0
     )
     stabilisation: Literal["pid", "none"] = key(
@@ -301,7 +259,7 @@ class Constraint(Part):
         "paper's inverse; pinv: pseudo-inverse",
         "iterated",
     )
-    damping: Damping = key(
+    damping: values.Damping = key(
         "damping mu of the iterated solver [-], > 0; auto: 0.03, or in phases that start in their "
         "formation a quarter of its smallest non-zero eigenvalue w if that is less",
         "auto",
@@ -309,13 +267,13 @@ class Constraint(Part):
     iterations: Annotated[int, Strict(), Field(ge=1, le=100)] = key(
         "number of iterations k of the iterated solver, 1 to 100", 3
     )
-    threshold: Tolerance = key("threshold s0 of the spectral solver [-], > 0", 0.1)
+    threshold: values.Tolerance = key("threshold s0 of the spectral solver [-], > 0", 0.1)
     cutoff: Annotated[float, Strict(), Field(gt=0, lt=1)] = key(
         "cut-off of the pinv solver relative to the largest eigenvalue w, in (0, 1); smaller eigenvalues "
         "fade out smoothly",
         1e-3,
     )
-    deformation_damping: Annotated[float, Strict(), from_zero(GAIN)] = key(
+    deformation_damping: Annotated[float, Strict(), values.from_zero(GAIN)] = key(
         "damping of deformation velocities while no slots are tracked [1/s], >= 0", 1.0
     )
 
@@ -336,9 +294,9 @@ class Regulator(Part):
     horizon: Literal["finite", "infinite"] = key(
         "finite: arrival at a time, weighted by S; infinite: Q and R alone", "finite"
     )
-    Q: Weights = key("weights [error, rate error], >= 0", (0.0, 0.0))
-    R: Cost = key("weight of the acceleration, > 0", 1.0)
-    S: Weights = key("weights at arrival [error, rate error], >= 0", (1e3, 1e2))
+    Q: values.Weights = key("weights [error, rate error], >= 0", (0.0, 0.0))
+    R: values.Cost = key("weight of the acceleration, > 0", 1.0)
+    S: values.Weights = key("weights at arrival [error, rate error], >= 0", (1e3, 1e2))
 
 
 class Lqr(Regulator):
@@ -346,7 +304,7 @@ class Lqr(Regulator):
 
     attitude: Regulator = key(
         "regulator of the attitude; missing keys are those of lqr",
-        default_factory=Regulator.model_construct,
+        Regulator.model_construct,
     )
 
     @model_validator(mode="before")
@@ -361,14 +319,14 @@ class Lqr(Regulator):
 class Tracking(Part):
     """Infinite-horizon regulator by which each agent tracks its slot."""
 
-    Q: Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
-    R: Cost = key("weight of the acceleration, > 0", 1.0)
-    integral: Annotated[float, Strict(), from_zero(GAIN)] = key(
+    Q: values.Weights = key("weights [position error, velocity error], the first > 0", (4.0, 4.0))
+    R: values.Cost = key("weight of the acceleration, > 0", 1.0)
+    integral: Annotated[float, Strict(), values.from_zero(GAIN)] = key(
         "gain of the integral of the position error [1/s^3], >= 0; frozen while a vehicle saturates; only "
         "with [vehicles]",
         0.0,
     )
-    drag_feedforward: Flag = key(
+    drag_feedforward: values.Flag = key(
         "true: the drag expected at the desired velocity in still air is added to the force; only with "
         "[vehicles]",
         False,
@@ -391,28 +349,26 @@ class IntegratorOptions(Part):
     """Tolerances of the adaptive integrator."""
 
     rtol: Annotated[float, Strict(), Field(gt=0, le=0.1)] = key("relative tolerance [-]", 1e-8)
-    atol: Tolerance = key("absolute tolerance [m, m/s]", 1e-10)
-    atol_velocity: Tolerance | None = key(
+    atol: values.Tolerance = key("absolute tolerance [m, m/s]", 1e-10)
+    atol_velocity: values.Tolerance | None = key(
         "absolute tolerance of velocities [m/s]; default: atol, in a large formation that of positions "
-        "times beta",
-        None,
+        "times beta"
     )
-    atol_integral: Tolerance | None = key(
+    atol_integral: values.Tolerance | None = key(
         "absolute tolerance of the integrals of c [m s]; default: atol, plus rtol times the distance if "
-        "the solver is not dense",
-        None,
+        "the solver is not dense"
     )
-    atol_attitude: Tolerance | None = key(
-        "absolute tolerance of the quaternion of the body frame [-]; default: atol", None
+    atol_attitude: values.Tolerance | None = key(
+        "absolute tolerance of the quaternion of the body frame [-]; default: atol"
     )
 
 
 class BodyFrame(Part):
     """Attach the body frame at t = 0 with this attitude instead of when a formation is established."""
 
-    roll_deg: Angle = key("roll [deg], 3-2-1 Euler angles", 0.0)
-    pitch_deg: Angle = key("pitch [deg]", 0.0)
-    yaw_deg: Angle = key("yaw [deg]", 0.0)
+    roll_deg: values.Angle = key("roll [deg], 3-2-1 Euler angles", 0.0)
+    pitch_deg: values.Angle = key("pitch [deg]", 0.0)
+    yaw_deg: values.Angle = key("yaw [deg]", 0.0)
 
 
 class Formation(Part):
@@ -423,52 +379,47 @@ class Formation(Part):
 
     shape: str | None = key(
         f"named shape: {', '.join(shapes.SHAPES)}",
-        None,
         json_schema_extra={"enum": [*shapes.SHAPES]},
     )
-    size: Size | None = key("edge length of the shape [m]; for a cuboid also [x, y, z]", None)
-    slots: tuple[Vector, ...] | None = key(
+    size: values.Size | None = key("edge length of the shape [m]; for a cuboid also [x, y, z]")
+    slots: tuple[values.Vector, ...] | None = key(
         "instead of a shape: desired position of each agent in the body frame [m], or the name of a "
-        "file of points: CSV, NPY or PLY, relative to the mission file and not outside its folder",
-        None,
+        "file of points: CSV, NPY or PLY, relative to the mission file and not outside its folder"
     )
-    edges: Edges = key(
+    edges: values.Edges = key(
         "list of pairs of agents, counted from 1; 'complete': all pairs; 'neighbours': pairs within reach; "
         "'henneberg': each agent to three nearer to the centre; 'henneberg-multilevel': each agent to three before "
         "it, from coarse to fine; both have 3 N - 6 edges",
         "complete",
     )
-    reach: Length = key(
+    reach: values.Length = key(
         "maximum length of edges 'neighbours', in distances of nearest neighbours; 1.9 includes second "
         "neighbours",
         graphs.REACH,
     )
-    distances: tuple[Length, ...] | None = key(
-        "length of each edge [m]; default: those between the slots", None
+    distances: tuple[values.Length, ...] | None = key(
+        "length of each edge [m]; default: those between the slots"
     )
     dimension: Literal[2, 3] | None = key(
-        "dimension of the space in which the agents keep this formation; default: that of the mission",
-        None,
+        "dimension of the space in which the agents keep this formation; default: that of the mission"
     )
     agents: Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)] | None = key(
-        "number of vehicles in the shape, if the others rest; default: all", None
+        "number of vehicles in the shape, if the others rest; default: all"
     )
-    rest: Rest | None = key(
+    rest: values.Rest | None = key(
         "where vehicles wait for which there are no slots, in the axes of the slots: a list of points [m]; "
-        "'sides': left and right of the formation, along x, mirrored so that its middle stays the same",
-        None,
+        "'sides': left and right of the formation, along x, mirrored so that its middle stays the same"
     )
-    tolerance: Length | None = key(
-        "greatest error of a distance [m]; default: by tolerance_share", None
+    tolerance: values.Length | None = key(
+        "greatest error of a distance [m]; default: by tolerance_share"
     )
-    tolerance_share: Share = key(
+    tolerance_share: values.Share = key(
         "the same, as a share of the shortest distance [-]", SHAPE_TOLERANCE, gt=0
     )
-    colour: Colour | None = key(
+    colour: values.Colour | None = key(
         "light of the vehicles in this formation, '#rrggbb': one for all, or a list with one per slot; "
         "default: that of the file of slots if it has colours, else the light before. Vehicles that rest are dark. "
-        "Replay, figures and the exports skyc and gltf show it",
-        None,
+        "Replay, figures and the exports skyc and gltf show it"
     )
 
     def greatest_error(self, shortest: float) -> float:
@@ -482,13 +433,7 @@ class Formation(Part):
         if isinstance(self.edges, str):
             slots = self.slot_array(n)
             assert slots is not None  # checked: there is a shape or slots
-            if self.edges == "neighbours":
-                return graphs.neighbours(slots, self.reach)
-            return (
-                graphs.henneberg(slots)
-                if self.edges == "henneberg"
-                else graphs.henneberg_multilevel(slots)
-            )
+            return graphs.GRAPHS[self.edges](slots, self.reach)
         return np.sort(np.array(self.edges, dtype=np.int64).reshape(-1, 2) - 1, axis=1)
 
     @property
@@ -508,64 +453,62 @@ class Formation(Part):
 class Geofence(Part):
     """A box that no agent may leave."""
 
-    min: Vector = key("lowest corner [x, y, z] [m]")
-    max: Vector = key("highest corner [x, y, z] [m]")
+    min: values.Vector = required_key("lowest corner [x, y, z] [m]")
+    max: values.Vector = required_key("highest corner [x, y, z] [m]")
 
 
 class Limits(Part):
     """Limits for each agent: the verdict checks the flight, and `check` the plan of a smooth mission."""
 
-    speed: Speed | None = key("maximum speed [m/s]", None)
-    acceleration: Acceleration | None = key("maximum acceleration [m/s^2]", None)
-    horizontal_speed: Speed | None = key("maximum speed over the ground [m/s]", None)
-    vertical_speed: Speed | None = key("maximum speed up and down [m/s]", None)
-    horizontal_acceleration: Acceleration | None = key(
-        "maximum horizontal acceleration [m/s^2]", None
+    speed: values.Speed | None = key("maximum speed [m/s]")
+    acceleration: values.Acceleration | None = key("maximum acceleration [m/s^2]")
+    horizontal_speed: values.Speed | None = key("maximum speed over the ground [m/s]")
+    vertical_speed: values.Speed | None = key("maximum speed up and down [m/s]")
+    horizontal_acceleration: values.Acceleration | None = key(
+        "maximum horizontal acceleration [m/s^2]"
     )
-    vertical_acceleration: Acceleration | None = key(
-        "maximum acceleration up and down [m/s^2]", None
+    vertical_acceleration: values.Acceleration | None = key(
+        "maximum acceleration up and down [m/s^2]"
     )
-    jerk: Jerk | None = key(
-        "maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission", None
+    jerk: values.Jerk | None = key(
+        "maximum jerk of the reference [m/s^3]; kept by the plan of a smooth mission"
     )
-    horizontal_jerk: Jerk | None = key(
-        "maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`", None
+    horizontal_jerk: values.Jerk | None = key(
+        "maximum horizontal jerk of the reference [m/s^3]; kept like `jerk`"
     )
-    vertical_jerk: Jerk | None = key(
-        "maximum jerk of the reference up and down [m/s^3]; kept like `jerk`", None
+    vertical_jerk: values.Jerk | None = key(
+        "maximum jerk of the reference up and down [m/s^3]; kept like `jerk`"
     )
     tilt_deg: Annotated[float, Strict(), Field(gt=0, lt=90)] | None = key(
         "maximum tilt of the thrust that the reference needs, from the vertical [deg]; kept by the plan of "
-        "a smooth mission",
-        None,
+        "a smooth mission"
     )
-    separation: LengthOrZero | None = key(
-        "minimum separation of agents [m]: centre distance minus radii", None
+    separation: values.LengthOrZero | None = key(
+        "minimum separation of agents [m]: centre distance minus radii"
     )
-    separation_altitude: Coordinate | None = key(
+    separation_altitude: values.Coordinate | None = key(
         "altitude z [m] from which on `separation` holds: two agents that are both below it, as on their "
-        "pads, may be nearer, but not touch; default: it always holds",
-        None,
+        "pads, may be nearer, but not touch; default: it always holds"
     )
-    separation_allowance: LengthOrZero = key(
+    separation_allowance: values.LengthOrZero = key(
         "how much nearer to each other than planned agents may come in flight [m]; judged where the plan "
         "has a certificate",
         0.1,
     )
-    separation_below: LengthOrZero | None = key(
-        "minimum separation from an agent straight below [m]: height minus radii (downwash)", None
+    separation_below: values.LengthOrZero | None = key(
+        "minimum separation from an agent straight below [m]: height minus radii (downwash)"
     )
-    geofence: Geofence | None = key("box that no agent may leave", None)
-    people: LengthOrZero = key(
+    geofence: Geofence | None = key("box that no agent may leave")
+    people: values.LengthOrZero = key(
         "least distance, as seen from above, at which a vehicle that fails falls past people [m]: less its radius",
         0.0,
     )
-    saturation: Share = key(
+    saturation: values.Share = key(
         "maximum share of a phase in which a vehicle cannot give what is asked of it [-], 0 to 0.95",
         0.01,
     )
-    tracking_error: Length | None = key(
-        "maximum distance of a vehicle from the slot that it tracks [m]", None
+    tracking_error: values.Length | None = key(
+        "maximum distance of a vehicle from the slot that it tracks [m]"
     )
 
     @property
@@ -577,83 +520,82 @@ class Limits(Part):
 class Gusts(Part):
     """Gusts: the velocity of the air at each agent in addition to the steady wind, stationary from the start."""
 
-    model: Literal["first-order", "dryden"] = key(
+    model: Literal["first-order", "dryden"] = required_key(
         "first-order: one correlation time for all directions; dryden: spectra of MIL-F-8785C along the "
         "wind, across it and vertical"
     )
-    intensity: PerAxis | None = key(
+    intensity: values.PerAxis | None = key(
         "standard deviation [m/s]: a number, or [along the wind, across, vertical]; default: from altitude "
-        "and wind speed",
-        None,
+        "and wind speed"
     )
-    time_scale: Time | None = key("correlation time of first-order gusts [s]", None)
-    length: Size | None = key(
-        "scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]", None
+    time_scale: values.Time | None = key("correlation time of first-order gusts [s]")
+    length: values.Size | None = key(
+        "scale length of Dryden gusts [m]: a number, or [along the wind, across, vertical]"
     )
     altitude: Annotated[float, Strict(), Field(ge=3.048, le=304.8)] | None = key(
         "instead of length: height above ground [m], 3.048 to 304.8, which determines the lengths by "
-        "MIL-F-8785C",
-        None,
+        "MIL-F-8785C"
     )
-    airspeed: Speed | None = key(
-        "speed at which Dryden gusts pass by [m/s]; default: wind speed", None
+    airspeed: values.Speed | None = key(
+        "speed at which Dryden gusts pass by [m/s]; default: wind speed"
     )
     correlation: Annotated[float, Strict(), Field(ge=0, le=1)] | None = key(
-        "correlation of the gusts at any two agents [-], 0 to 1; default: 0", None
+        "correlation of the gusts at any two agents [-], 0 to 1; default: 0"
     )
-    correlation_length: Length | None = key(
+    correlation_length: values.Length | None = key(
         "instead of correlation: length [m] in correlation = exp(-distance / length), with the distances "
-        "of slots in the first established formation",
-        None,
+        "of slots in the first established formation"
     )
-    seed: Seed = key("seed of the random numbers; the same seed gives the same gusts", 0)
+    seed: values.Seed = key("seed of the random numbers; the same seed gives the same gusts", 0)
 
 
 class Noise(Part):
     """Measurement of each vehicle's own state: normal, independent noise, sampled at a fixed rate, and its delay."""
 
-    position: LengthOrZero = key(
+    position: values.LengthOrZero = key(
         "standard deviation of each component of the measured position [m]", 0.0
     )
-    velocity: Spread = key(
+    velocity: values.Spread = key(
         "standard deviation of each component of the measured velocity [m/s]", 0.0
     )
     rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
         "measurements per second [Hz], at most 1000", 50.0
     )
-    delay: Delay = key("age of a measurement when the laws use it [s]; only with [vehicles]", 0.0)
-    dropped: Share = key(
+    delay: values.Delay = key(
+        "age of a measurement when the laws use it [s]; only with [vehicles]", 0.0
+    )
+    dropped: values.Share = key(
         "share of the measurements that are lost, 0 to 0.95; only with [vehicles]", 0.0
     )
-    seed: Seed = key("seed of the random numbers; the same seed gives the same noise", 0)
+    seed: values.Seed = key("seed of the random numbers; the same seed gives the same noise", 0)
 
 
 class LostLink(Part):
     """Loss of a link: from this time on, two vehicles know nothing of each other, and no edge joins them."""
 
-    between: tuple[Whole, Whole] = key("the two agents, counted from 1")
-    time: Time = key("mission time of the loss [s], > 0")
+    between: tuple[values.Whole, values.Whole] = required_key("the two agents, counted from 1")
+    time: values.Time = required_key("mission time of the loss [s], > 0")
 
 
 class Outage(Part):
     """A time without messages: between two vehicles, from and to one, or everywhere."""
 
-    between: tuple[Whole, ...] = key(
+    between: tuple[values.Whole, ...] = key(
         "one or two agents, counted from 1; default: all", (), max_length=2
     )
-    start: Seconds = key("mission time from which no message is sent [s]")
-    end: Time = key("mission time from which messages are sent again [s]")
+    start: values.Seconds = required_key("mission time from which no message is sent [s]")
+    end: values.Time = required_key("mission time from which messages are sent again [s]")
 
 
 class Clocks(Part):
     """Clocks of the vehicles, by which each flies the plan by itself, and how they keep together."""
 
-    late: PerAgentDelay = key(
+    late: values.PerAgentDelay = key(
         "time by which clocks start late [s], at most 10: a list, or the greatest, of which each vehicle has a share "
         "drawn by the seed",
         0.0,
     )
-    drift: PerAgentDrift = key(
+    drift: values.PerAgentDrift = key(
         "drift of the clocks [ppm]: a list, or the greatest, of which each vehicle has a share from -1 to 1 drawn by "
         "the seed",
         0.0,
@@ -661,10 +603,9 @@ class Clocks(Part):
     consensus: Annotated[float, Strict(), Field(ge=0, le=100)] = key(
         "gain with which a clock follows those of its neighbours [1/s]; 0: they never meet", 0.0
     )
-    wait: Length | None = key(
+    wait: values.Length | None = key(
         "distance of a vehicle from its slot at which all clocks stand still, that hear of it [m]; from half of it on "
-        "they slow down; default: nobody waits",
-        None,
+        "they slow down; default: nobody waits"
     )
 
 
@@ -674,35 +615,35 @@ class Network(Part):
     rate: Annotated[float, Strict(), Field(gt=0, le=1000)] = key(
         "broadcasts of each vehicle a second [Hz], at most 1000", 50.0
     )
-    delay: Delay = key("time from a broadcast to its arrival [s]", 0.0)
-    jitter: Delay = key(
+    delay: values.Delay = key("time from a broadcast to its arrival [s]", 0.0)
+    jitter: values.Delay = key(
         "greatest time by which a message is later than that [s]: each is by a share of its own, so that "
         "messages may overtake each other",
         0.0,
     )
-    loss: Share = key("share of the messages that a link loses, 0 to 0.95", 0.0)
+    loss: values.Share = key("share of the messages that a link loses, 0 to 0.95", 0.0)
     burst: Annotated[float, Strict(), Field(ge=1, le=1000)] | None = key(
-        "mean number of messages lost one after the other; default: losses are independent", None
+        "mean number of messages lost one after the other; default: losses are independent"
     )
-    range: Length | None = key("distance beyond which no message is heard [m]; default: none", None)
+    range: values.Length | None = key(
+        "distance beyond which no message is heard [m]; default: none"
+    )
     budget: Annotated[float, Strict(), Field(gt=0, le=1e9)] | None = key(
         "broadcasts a second in all that the medium carries [Hz]; vehicles then send less often; default: "
-        "no limit",
-        None,
+        "no limit"
     )
-    silence: Time = key("time without a message after which a vehicle lets go of an edge [s]", 0.5)
-    event: Length | None = key(
+    silence: values.Time = key(
+        "time without a message after which a vehicle lets go of an edge [s]", 0.5
+    )
+    event: values.Length | None = key(
         "distance [m] by which neighbours guess a vehicle wrongly before it sends, or before `silence` would run out; "
-        "default: it sends each time",
-        None,
+        "default: it sends each time"
     )
-    seed: Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
+    seed: values.Seed = key("seed of the random numbers; the same seed loses the same messages", 0)
     outages: tuple[Outage, ...] = key(
         "times without messages: `outages = [{ between = [1, 2], start = 10.0, end = 12.0 }]`", ()
     )
-    clocks: Clocks | None = key(
-        "clocks of the vehicles: [network.clocks]; default: one for all", None
-    )
+    clocks: Clocks | None = key("clocks of the vehicles: [network.clocks]; default: one for all")
     lost: tuple[LostLink, ...] = key(
         "links lost for good during the flight: `lost = [{ between = [1, 2], time = 30.0 }]`", ()
     )
@@ -715,40 +656,39 @@ class Network(Part):
 class Lost(Part):
     """Loss of a vehicle: from this time on it has neither thrust nor edges."""
 
-    agent: Whole = key("agent that is lost, counted from 1")
-    time: Time = key("mission time of the loss [s], > 0")
+    agent: values.Whole = required_key("agent that is lost, counted from 1")
+    time: values.Time = required_key("mission time of the loss [s], > 0")
 
 
 class Stuck(Part):
     """A vehicle that does not follow its slot for some time: it holds its place."""
 
-    agent: Whole = key("agent that is stuck, counted from 1")
-    time: Seconds = key("mission time from which on it is [s]")
-    duration: Time = key("for how long [s]")
+    agent: values.Whole = required_key("agent that is stuck, counted from 1")
+    time: values.Seconds = required_key("mission time from which on it is [s]")
+    duration: values.Time = required_key("for how long [s]")
 
 
 class Disturbances(Part):
     """Disturbances of the flight. Control laws and constraint law do not know them."""
 
-    wind: Velocity = key(
+    wind: values.Velocity = key(
         "velocity of the steady wind [m/s]: the direction in which the air moves", (0.0, 0.0, 0.0)
     )
-    drag: PerAgent | None = key(
+    drag: values.PerAgent | None = key(
         "drag force per velocity relative to the air [N s/m]: a number or a list; default: 0.3 per kg of "
-        "mass if there is wind or gusts, else 0",
-        None,
+        "mass if there is wind or gusts, else 0"
     )
-    mass_error: PerAgentError = key(
+    mass_error: values.PerAgentError = key(
         "relative error of mass [-], > -1: a number or a list; true mass = mass (1 + mass_error), control "
         "laws use mass",
         0.0,
     )
-    gusts: Gusts | None = key("gusts: [disturbances.gusts]", None)
-    noise: Noise | None = key("measurement noise: [disturbances.noise]", None)
-    downwash: Flag = key(
+    gusts: Gusts | None = key("gusts: [disturbances.gusts]")
+    noise: Noise | None = key("measurement noise: [disturbances.noise]")
+    downwash: values.Flag = key(
         "true: vehicles blow on those below them, as a turbulent jet; only with [vehicles]", False
     )
-    ground_effect: Flag = key(
+    ground_effect: values.Flag = key(
         "true: rotors near the ground give more thrust; only with [vehicles]", False
     )
     lost: tuple[Lost, ...] = key(
@@ -765,21 +705,19 @@ class Disturbances(Part):
         "[abort]",
         "continue",
     )
-    hold_until: Time | None = key(
-        "mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission",
-        None,
+    hold_until: values.Time | None = key(
+        "mission time to which on_loss 'hold' holds [s]; default: the planned end of the mission"
     )
     landing_formation: str | None = key(
-        "level formation that on_loss 'land' takes before the descent; default: the one that is held",
-        None,
+        "level formation that on_loss 'land' takes before the descent; default: the one that is held"
     )
 
 
 class Aborting(Part):
     """How the flight is aborted, at any time: `check --abort` plans it, `run --abort-at` flies it."""
 
-    at: Seconds | None = key("mission time at which an abort is ordered [s]; default: never", None)
-    step: Time = key("time between the aborts that `check --abort` plans [s]", 1.0)
+    at: values.Seconds | None = key("mission time at which an abort is ordered [s]; default: never")
+    step: values.Time = key("time between the aborts that `check --abort` plans [s]", 1.0)
     reaction: Annotated[float, Strict(), Field(ge=0, le=60)] = key(
         "time after which all vehicles have the order, or notice a loss, and act at once [s]", 0.5
     )
@@ -788,7 +726,7 @@ class Aborting(Part):
         "the other, or back along the plan. Places are those of the start, or a grid below if that is in the air",
         "any",
     )
-    agents: tuple[AgentNumber, ...] = key(
+    agents: tuple[values.AgentNumber, ...] = key(
         "numbers of the vehicles that go home, as soon as they come near no other one; the others fly the mission on. "
         "Default: all go home",
         (),
@@ -798,8 +736,8 @@ class Aborting(Part):
 class MissionHeader(Part):
     """Keys at the top of a mission file."""
 
-    schema_version: Literal[1] = key("version of this format: 1")
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = key(
+    schema_version: Literal[1] = required_key("version of this format: 1")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = required_key(
         "short name, used for the files of results: letters, digits, '.', '_', '-'"
     )
     title: Annotated[str, Field(pattern=r"^[^\r\n]*$")] = key(
@@ -830,10 +768,10 @@ class MissionHeader(Part):
         "more of a distance above each other than beside",
         1.0,
     )
-    gravity: Annotated[float, Strict(), from_zero(ACCELERATION)] = key(
+    gravity: Annotated[float, Strict(), values.from_zero(ACCELERATION)] = key(
         "gravity [m/s^2], >= 0", 9.81
     )
-    output_step: Time = key("time between samples of the result [s]", 0.05)
+    output_step: values.Time = key("time between samples of the result [s]", 0.05)
     dimension: Literal[2, 3] = key(
         "dimension of the space in which the agents keep their formations, for `check`: 2: in a plane, "
         "where it judges rigidity and searches other shapes; no flight changes by it",
@@ -844,8 +782,12 @@ class MissionHeader(Part):
 class GeodeticOrigin(Part):
     """Place on the Earth of the mission's origin, for exports; x points east, y north and z up there."""
 
-    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = key("latitude [deg], WGS 84")
-    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = key("longitude [deg]")
+    latitude_deg: Annotated[float, Strict(), Field(gt=-90, lt=90)] = required_key(
+        "latitude [deg], WGS 84"
+    )
+    longitude_deg: Annotated[float, Strict(), Field(ge=-180, le=180)] = required_key(
+        "longitude [deg]"
+    )
     altitude: Annotated[float, Strict(), Field(ge=-1000, le=20_000)] = key(
         "height of z = 0 above mean sea level [m]", 0.0
     )
@@ -859,57 +801,44 @@ class VehicleYaw(Part):
         "along their way, and keep their heading while slow; towards: they look at a point",
         "formation",
     )
-    yaw_deg: Angle = key("yaw [deg] of kind 'fixed'", 0.0)
-    point: Vector | None = key("the point [x, y, z] [m] of kind 'towards'", None)
+    yaw_deg: values.Angle = key("yaw [deg] of kind 'fixed'", 0.0)
+    point: values.Vector | None = key("the point [x, y, z] [m] of kind 'towards'")
 
 
 class Contents(MissionHeader):
     """A whole mission file."""
 
-    agents: Agents = key("the vehicles: [agents]")
-    vehicles: dict[str, Vehicle] = key(
-        "models of vehicles by name: [vehicles.NAME]", default_factory=dict
-    )
-    autopilot: Autopilot = key(
-        "sampled control on board: [autopilot]", default_factory=Autopilot.model_construct
-    )
-    avoidance: Avoidance | None = key("barriers and guard in flight: [avoidance]", None)
-    constraint: Constraint = key(
-        "the constraint force: [constraint]", default_factory=Constraint.model_construct
-    )
-    lqr: Lqr = key("regulator of the virtual body: [lqr]", default_factory=Lqr.model_construct)
-    tracking: Tracking = key(
-        "regulator of each agent: [tracking]", default_factory=Tracking.model_construct
-    )
+    agents: Agents = required_key("the vehicles: [agents]")
+    vehicles: dict[str, Vehicle] = key("models of vehicles by name: [vehicles.NAME]", dict)
+    autopilot: Autopilot = key("sampled control on board: [autopilot]", Autopilot.model_construct)
+    avoidance: Avoidance | None = key("barriers and guard in flight: [avoidance]")
+    constraint: Constraint = key("the constraint force: [constraint]", Constraint.model_construct)
+    lqr: Lqr = key("regulator of the virtual body: [lqr]", Lqr.model_construct)
+    tracking: Tracking = key("regulator of each agent: [tracking]", Tracking.model_construct)
     allocation: Allocation = key(
-        "from wrench to forces on agents: [allocation]", default_factory=Allocation.model_construct
+        "from wrench to forces on agents: [allocation]", Allocation.model_construct
     )
     integrator: IntegratorOptions = key(
         "tolerances of the integrator: [integrator]",
-        default_factory=IntegratorOptions.model_construct,
+        IntegratorOptions.model_construct,
     )
-    body_frame: BodyFrame | None = key("attitude of the body frame at t = 0: [body_frame]", None)
-    formations: dict[str, Formation] = key(
-        "formations by name: [formations.NAME]", default_factory=dict
-    )
+    body_frame: BodyFrame | None = key("attitude of the body frame at t = 0: [body_frame]")
+    formations: dict[str, Formation] = key("formations by name: [formations.NAME]", dict)
     obstacles: tuple[Obstacle, ...] = key("obstacles: [[obstacles]]", ())
     fences: tuple[Fence, ...] = key("fences of polygons: [[fences]]", ())
     people: tuple[People, ...] = key("places where people are: [[people]]", ())
-    limits: Limits = key(
-        "limits that the verdict checks: [limits]", default_factory=Limits.model_construct
-    )
-    yaw: VehicleYaw = key("yaw of each vehicle: [yaw]", default_factory=VehicleYaw.model_construct)
+    limits: Limits = key("limits that the verdict checks: [limits]", Limits.model_construct)
+    yaw: VehicleYaw = key("yaw of each vehicle: [yaw]", VehicleYaw.model_construct)
     geodetic_origin: GeodeticOrigin | None = key(
-        "place of the origin on the Earth, for exports: [geodetic_origin]", None
+        "place of the origin on the Earth, for exports: [geodetic_origin]"
     )
     network: Network | None = key(
-        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states",
-        None,
+        "messages between vehicles, only with [vehicles]: [network]; default: one law knows all states"
     )
     disturbances: Disturbances | None = key(
-        "wind, gusts, noise, mass errors, lost vehicles: [disturbances]", None
+        "wind, gusts, noise, mass errors, lost vehicles: [disturbances]"
     )
-    abort: Aborting | None = key("how the flight is aborted: [abort]", None)
-    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = key(
+    abort: Aborting | None = key("how the flight is aborted: [abort]")
+    phases: Annotated[tuple[Phase, ...], Field(min_length=1)] = required_key(
         "phases of the flight, in order: [[phases]]"
     )

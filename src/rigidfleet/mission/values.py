@@ -1,6 +1,6 @@
 """Values of a mission file: numbers within bounds, vectors, lists; and `Part`, the base of all its tables."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -11,7 +11,6 @@ from pydantic import (
     Tag,
     WithJsonSchema,
 )
-from pydantic_core import PydanticUndefined
 
 from rigidfleet.mission import bounds
 from rigidfleet.mission.bounds import (
@@ -75,33 +74,39 @@ Whole = Annotated[int, Strict(), Field(ge=-(2**31), lt=2**31)]
 Flag = Annotated[bool, Strict()]
 #: Number of an agent, from 1.
 AgentNumber = Annotated[int, Strict(), Field(ge=1, le=bounds.AGENTS)]
-_Three = Field(min_length=3, max_length=3)
-Vector = Annotated[tuple[Coordinate, ...], _Three]
-Velocity = Annotated[tuple[Annotated[float, Strict(), of_either_sign(SPEED)], ...], _Three]
-#: A velocity, or "free": any.
-VelocityOrFree = Annotated[
-    Annotated[Velocity, Tag("list")] | Annotated[Literal["free"], Tag("word")],
-    Discriminator(lambda value: "word" if isinstance(value, str) else "list"),
-]
-Force = Annotated[tuple[Annotated[float, Strict(), of_either_sign(FORCE)], ...], _Three]
-Rates = Annotated[tuple[Angle, ...], _Three]
-Weights = Annotated[tuple[Weight, ...], Field(min_length=2, max_length=2)]
 
-_Extent = Annotated[tuple[Length, ...], _Three]
-_Pair = Annotated[tuple[Whole, ...], Field(min_length=2, max_length=2)]
+_T = TypeVar("_T")
+_Other = TypeVar("_Other")
 
 
 def _form(value: object) -> str:
     return "list" if isinstance(value, list | tuple) else "one"
 
 
-Size = Annotated[
-    Annotated[Length, Tag("one")] | Annotated[_Extent, Tag("list")], Discriminator(_form)
+def _wording(value: object) -> str:
+    return "word" if isinstance(value, str) else "one"
+
+
+#: One value, or a list in its place; one value, or as many as there are agents; a value, or a word in its place.
+_OneOrList = Annotated[
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_form)
 ]
-Edges = Annotated[
-    Annotated[Literal["complete", "neighbours", "henneberg", "henneberg-multilevel"], Tag("one")]
-    | Annotated[tuple[_Pair, ...], Tag("list")],
-    Discriminator(_form),
+_PerAgent = _OneOrList[_T, tuple[_T, ...]]
+_ValueOrWord = Annotated[
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_wording)
+]
+_Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
+Vector = Annotated[tuple[Coordinate, ...], _Three]
+Velocity = Annotated[tuple[Annotated[float, Strict(), of_either_sign(SPEED)], ...], _Three]
+#: A velocity, or "free": any.
+VelocityOrFree = _ValueOrWord[Velocity, Literal["free"]]
+Force = Annotated[tuple[Annotated[float, Strict(), of_either_sign(FORCE)], ...], _Three]
+Rates = Annotated[tuple[Angle, ...], _Three]
+Weights = Annotated[tuple[Weight, ...], _Two]
+Size = _OneOrList[Length, Annotated[tuple[Length, ...], _Three]]
+Edges = _OneOrList[
+    Literal["complete", "neighbours", "henneberg", "henneberg-multilevel"],
+    tuple[Annotated[tuple[Whole, ...], _Two], ...],
 ]
 
 #: Of each vehicle, pieces: duration, and coefficients of x, y, z and yaw.
@@ -112,49 +117,17 @@ Trajectories = Annotated[
 ]
 
 #: Where vehicles without a slot wait.
-Rest = Annotated[
-    Annotated[Literal["sides"], Tag("one")] | Annotated[tuple[Vector, ...], Tag("list")],
-    Discriminator(_form),
-]
-
-Damping = Annotated[
-    Annotated[Tolerance, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
-    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
-]
-
+Rest = _OneOrList[Literal["sides"], tuple[Vector, ...]]
+Damping = _ValueOrWord[Tolerance, Literal["auto"]]
 #: A time, or "auto": the least one that keeps the limits.
-Duration = Annotated[
-    Annotated[Time, Tag("one")] | Annotated[Literal["auto"], Tag("word")],
-    Discriminator(lambda value: "word" if isinstance(value, str) else "one"),
-]
-
-
+Duration = _ValueOrWord[Time, Literal["auto"]]
 Delay = Annotated[float, Strict(), Field(ge=0, le=10)]
-_Error = Annotated[float, Strict(), Field(gt=-1, le=bounds.MASS_RATIO)]
 Seed = Annotated[int, Strict(), Field(ge=0, lt=2**31)]
-PerAgent = Annotated[
-    Annotated[Weight, Tag("one")] | Annotated[tuple[Weight, ...], Tag("list")],
-    Discriminator(_form),
-]
-PerAgentError = Annotated[
-    Annotated[_Error, Tag("one")] | Annotated[tuple[_Error, ...], Tag("list")],
-    Discriminator(_form),
-]
-_Drift = Annotated[float, Strict(), Field(ge=-1e5, le=1e5)]
-PerAgentDelay = Annotated[
-    Annotated[Delay, Tag("one")] | Annotated[tuple[Delay, ...], Tag("list")],
-    Discriminator(_form),
-]
-PerAgentDrift = Annotated[
-    Annotated[_Drift, Tag("one")] | Annotated[tuple[_Drift, ...], Tag("list")],
-    Discriminator(_form),
-]
-PerAxis = Annotated[
-    Annotated[Spread, Tag("one")] | Annotated[tuple[Spread, ...], _Three, Tag("list")],
-    Discriminator(_form),
-]
-
-
+PerAgent = _PerAgent[Weight]
+PerAgentError = _PerAgent[Annotated[float, Strict(), Field(gt=-1, le=bounds.MASS_RATIO)]]
+PerAgentDelay = _PerAgent[Delay]
+PerAgentDrift = _PerAgent[Annotated[float, Strict(), Field(ge=-1e5, le=1e5)]]
+PerAxis = _OneOrList[Spread, Annotated[tuple[Spread, ...], _Three]]
 Small = Annotated[float, Strict(), Field(ge=1e-15, le=1.0)]
 Coefficient = Annotated[float, Strict(), Field(ge=0, le=1e3)]
 Scale = Annotated[float, Strict(), Field(ge=0.1, lt=1.0)]
@@ -163,16 +136,11 @@ Rate = Annotated[float, Strict(), Field(ge=1, le=100_000)]
 Tilt = Annotated[float, Strict(), Field(gt=0, lt=90)]
 Inertia = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-9, le=1e6)], ...], _Three]
 BodyDrag = Annotated[tuple[Coefficient, ...], _Three]
-_Two = Field(min_length=2, max_length=2)
 RotorSpeeds = Annotated[tuple[Annotated[float, Strict(), Field(ge=0, le=1e5)], ...], _Two]
 MotorTimes = Annotated[tuple[Annotated[float, Strict(), Field(ge=1e-3, le=10)], ...], _Two]
 AttitudeGains = Annotated[tuple[Annotated[float, Strict(), Field(gt=0, le=1e6)], ...], _Two]
 #: A colour of light: red, green and blue in hexadecimal digits.
-_Light = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
-Colour = Annotated[
-    Annotated[_Light, Tag("one")] | Annotated[tuple[_Light, ...], Tag("list")],
-    Discriminator(_form),
-]
+Colour = _PerAgent[Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]]
 NAME_OR_LIST = WithJsonSchema(
     {"anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}]}
 )
@@ -184,9 +152,21 @@ def number_or_list(least: float) -> WithJsonSchema:
     return WithJsonSchema({"anyOf": [number, {"type": "array", "items": number}]})
 
 
-def key(text: str, default: Any = PydanticUndefined, **more: Any) -> Any:
-    """A key of a table: its meaning with its unit, and its default; without one it is required."""
-    return Field(default, description=text, **more)
+def key(text: str, default: Any = None, **more: Any) -> Any:
+    """A key of a table that may be left out: its meaning with its unit, and its default, or what makes one."""
+    kind = "default_factory" if callable(default) else "default"
+    return Field(description=text, **{kind: default}, **more)
+
+
+def required_key(text: str, **more: Any) -> Any:
+    """A key that a table must have: its meaning with its unit."""
+    return Field(description=text, **more)
+
+
+def models_by_kind(union: Any) -> dict[str, Any]:
+    """Models of a union of tables by their `kind`."""
+    models = get_args(get_args(union)[0])
+    return {get_args(model.model_fields["kind"].annotation)[0]: model for model in models}
 
 
 class Part(BaseModel):

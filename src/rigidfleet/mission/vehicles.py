@@ -108,7 +108,7 @@ def resolve(vehicle: Vehicle) -> VehicleModel:
     return model._replace(thrust_limit=4.0 * model.rotor_limit)
 
 
-def check(m: Draft) -> None:
+def validate_vehicles(m: Draft) -> None:
     """Validate the tables [vehicles.NAME]; invalid ones are left out."""
     m.parts["vehicles"] = {}
     tables = m.data.get("vehicles", {})

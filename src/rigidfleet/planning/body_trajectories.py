@@ -67,11 +67,11 @@ def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tup
     zero, by_law = np.zeros((2, 2)), []
     for law in regulators:
         response = lqr.double_integrator_response(times, length, *law)
-        x = lqr.led(response, times, np.eye(2), zero, length)
+        x = lqr.trajectory_of_response(response, times, np.eye(2), zero, length)
         pieces = [lqr.quintic_pieces(times, *x)]
         if rest > 0.0:
             response = lqr.double_integrator_response(after, rest, *hold, None)
-            x = lqr.led(response, after, (x[0][-1], x[1][-1]), zero, rest)
+            x = lqr.trajectory_of_response(response, after, (x[0][-1], x[1][-1]), zero, rest)
             pieces.append(lqr.quintic_pieces(after, *x))
         by_law.append(np.concatenate(pieces))
     knots = np.concatenate([times, length + after[1:]])

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rigidfleet.formation.assignment import closest_approach
-from rigidfleet.kernel.problem import Reference, septic_polynomial
+from rigidfleet.kernel.problem import SHAPE, Reference, septic_polynomial
 from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import about
 from rigidfleet.mission import Phase
@@ -51,6 +51,20 @@ def certificate_of(
     """
     if phase.control != "tracking" or (reference.T_b == 0.0 and reference.dp.any()):
         return None
+    return _of_some(reference, radius, lost)
+
+
+def in_step(
+    start: Floats, end: Floats, duration: float, radius: Floats, lost: Bools | None = None
+) -> Certificate | None:
+    """Certificate of straight septic blends (N, 3) [m] in step from 0 on [s]; the rest as `certificate_of`."""
+    none, ways = np.zeros(0), end - start
+    reference = Reference(SHAPE, 0.0, duration, none, none, start, ways, np.zeros(3))
+    return _of_some(reference, radius, lost)
+
+
+def _of_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certificate | None:
+    """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
     left = None if lost is None else np.flatnonzero(~lost)
     if left is not None:
         reference, radius = of_agents(reference, left), radius[left]

@@ -158,7 +158,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
     arrival = t_end if phase.travel is None else min(t_end, now.t + phase.travel)
     up, v, lift = np.zeros(3), np.zeros(3), None
     if phase.each:
-        rise, masses = _rises(mission, phase, now), mission.fleet.mass
+        rise, masses = rises(mission, phase, now), mission.fleet.mass
         up[2] = masses @ rise / masses.sum()
         if np.ptp(rise) >= _LEVEL:
             travel = min(phase.travel or math.inf, t_end - now.t)
@@ -270,7 +270,7 @@ def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
     return ""
 
 
-def _rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
+def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     """How far [m] each vehicle (N,) goes up from the pose to hold: to a height, or (down) to just above the ground."""
     assert now.goal is not None
     assert now.slots is not None

@@ -209,7 +209,7 @@ def depart(mission: Mission, phase: Phase, now: PhaseState) -> Departure:
     target = mission.slots_about_cm(now.formation if shaping is None else shaping.formation)
     turn = None
     if shaping is not None:
-        turn = mission.assigned_turn(now.formation, shaping.formation) if shaping.aligned else np.eye(3)  # fmt: skip
+        turn = mission.assigned_turn(now.formation, shaping.formation) if shaping.fits_slots else np.eye(3)  # fmt: skip
     frame, state, turn = _attach_frame(mission, phase, now, left, target, turn)
     # Without slots, the agents' positions in the formations' axes.
     p0 = about_cm(state.r, left) @ mission.drawn_attitude.T if state.slots is None else state.slots

@@ -1,7 +1,8 @@
 """What the others do when a vehicle or link is lost, or an abort is ordered: they brake and hold or land, or go home.
 
 All phases follow from the reference at the moment of the loss, so that nothing jumps: position, velocity and
-acceleration of each slot continue, and in a smooth mission jerk. A change of shape under way is completed.
+acceleration of each slot continue, and in a smooth mission jerk. A change of shape under way is completed. Vehicles
+that fly ways of their own, or whom their brake would lead into something, slow down along the plan.
 """
 
 from __future__ import annotations
@@ -16,17 +17,17 @@ import numpy as np
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
-from rigidfleet.planning.abort import Aborts, Plan, phases_of, state_to_leave
-from rigidfleet.planning.courses import height
+from rigidfleet.planning.abort import BRAKING, DESCENT, JERK, Aborts, phases_of, state_to_leave
+from rigidfleet.planning.clearance import CLOSE, closest, pace
+from rigidfleet.planning.courses import height, rises
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import limits_of, use_of_limits
+from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.timing import timed_leg
 
-#: Greatest acceleration [m/s^2] and jerk [m/s^3] of a slot while it brakes, turns or spreads, and greatest speed [m/s]
-#: and acceleration of the descent, unless `limits` asks for less. A motion that is faster when it begins may go on so.
-BRAKING, JERK = 2.0, 5.0
-DESCENT, DESCENDING = 1.0, 0.5
+#: Greatest acceleration of the descent [m/s^2].
+_DESCENDING = 0.5
 #: Peaks of speed and acceleration of a septic blend over unit way and time.
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.1875, 7.5132
 #: Least time of a phase [s]; ratio of a time tried to the one before, and number of times tried.
@@ -58,58 +59,89 @@ def legs_from(
     return legs
 
 
-def answer_to(mission: Mission, now: PhaseState, plan: Sequence[Leg]) -> Answer:
+def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> Answer:
     """What follows the loss of a vehicle or link, or the order to abort, from the state at that moment.
 
     Parameters
     ----------
     now : the state, with the vehicles lost until then, its reference ``pose`` and the ``blend`` under way
-    plan : the legs of the mission from its start to its end, as far as they are known
+    plan : makes the legs of the mission from its start to its end, as far as they are known
     """
     if not mission.aborts:
-        return Answer(after_loss(mission, now))
-    reaction = mission.aborting.reaction
-    abort = Aborts(mission, plan, now.lost).at(now.t - reaction)
-    now = state_to_leave(plan[Plan(plan).number_at(np.array([now.t]))[0]], now, now.t)
-    return Answer(legs_from(mission, now, phases_of(mission, abort.steps, "abort")), abort.reason)
+        return Answer(after_loss(mission, now, plan))
+    legs = plan()
+    abort = Aborts(mission, legs, now.lost).at(now.t - mission.aborting.reaction)
+    phases = phases_of(mission, abort.steps, "abort: ")
+    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason)
 
 
-def after_loss(mission: Mission, now: PhaseState) -> list[Leg]:
+def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
     """The legs of the phases by which the others brake, and hold or land (`answer_to`)."""
     d = mission.disturbances
     assert d is not None
     rest = 0.0 if now.blend is None else now.blend.t0 + now.blend.T_b - now.t
     legs: list[Leg] = []
 
-    def then(make: Callable[[float], Phase], least: float = _SHORTEST) -> None:
+    def then(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
+        """Add the leg of a phase; with ``freely``, only if it leads into nothing. Return whether it was added."""
         nonlocal now
-        legs.append(_shortest(mission, now, make, least))
-        now = legs[-1].after
+        leg = _shortest(mission, now, make, _SHORTEST)
+        if freely and _hits(mission, leg):
+            return False
+        legs.append(leg)
+        now = leg.after
+        return True
 
+    start = now
     then(lambda t: Brake(kind="brake", name="brake (loss)", duration=max(t, rest), travel=t))
+    # Slots on ways of their own are where they should be only with the body's way.
+    if (start.blend is not None and start.formation is None) or _hits(mission, legs[0]):
+        whole = plan()
+        slow, *_ = Aborts(mission, whole, start.lost).slow_down(start.t)
+        brake = phases_of(mission, [slow._replace(name="brake (loss)")])
+        legs = legs_from(mission, state_to_leave(whole, start), brake)
+        now = legs[-1].after
     if d.on_loss == "hold":
         until = phase_spans(mission)[-1][1] if d.hold_until is None else d.hold_until
         if until > now.t:
             legs.append(leg_of(mission, Hold(kind="hold", name="hold (loss)", until=until), now))
         return legs
     name = d.landing_formation
+    shaped = now.formation is not None
     if name is not None and name != now.formation:
         spread = partial(Reshape, kind="reshape", name="spread (loss)", formation=name)
-        then(lambda t: spread(blend=t, duration=t))
+        shaped = then(lambda t: spread(blend=t, duration=t), freely=True)
     assert now.goal is not None
     axes = now.goal.T.T
-    if math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
+    if shaped and math.acos(min(1.0, float(axes[2, 2]))) > _LEVEL:
         yaw = math.degrees(math.atan2(axes[1, 0] - axes[0, 1], axes[0, 0] + axes[1, 1]))
         level = partial(Turn, kind="turn", name="level (loss)", roll_deg=0.0, pitch_deg=0.0)
-        then(lambda t: level(yaw_deg=yaw, duration=t))
-    depth = height(mission, now)
-    if depth > 0.0:
-        least = max(
-            _PEAK_SPEED * depth / DESCENT, math.sqrt(_PEAK_ACCELERATION * depth / DESCENDING)
+        shaped = then(lambda t: level(yaw_deg=yaw, duration=t), freely=True)
+    everyone = tuple(range(1, mission.n_agents + 1))
+    land = partial(Land, kind="land", name="land (loss)")
+    each = partial(land, agents=everyone)
+    ways = [(each, -float(rises(mission, each(duration=1.0), now).min()))]
+    if shaped:  # together, unless something is below some
+        ways.insert(0, (land, height(mission, now)))
+    for make, depth in ways:
+        if depth <= 0.0:
+            return legs
+        speed, acceleration = (
+            _PEAK_SPEED * depth / DESCENT,
+            _PEAK_ACCELERATION * depth / _DESCENDING,
         )
-        land = partial(Land, kind="land", name="land (loss)")
-        then(lambda t: land(duration=t), max(least, _SHORTEST))
-    return legs
+        least = max(speed, math.sqrt(acceleration), _SHORTEST)
+        down = _shortest(mission, now, lambda t, make=make: make(duration=t), least)
+        if not _hits(mission, down):
+            break
+    return [*legs, down]
+
+
+def _hits(mission: Mission, leg: Leg) -> bool:
+    """Whether a leg leads a slot into an obstacle or the ground."""
+    planned = planned_phase(leg, FEWEST_SAMPLES)
+    near = (closest(planned, x, leg.radius, pace(planned)) for x in mission.obstacles)
+    return any(x.clearance < -CLOSE for x in near)
 
 
 def _shortest(

@@ -22,7 +22,7 @@ from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
-from rigidfleet.planning.abort import Homes, Plan, Step, phases_of
+from rigidfleet.planning.abort import Aborts, Step, phases_of
 from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import transfer
@@ -54,7 +54,7 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         The layers of a phase do not keep the separation, or there is no formation before it; or the groups of a
         staggered phase have no time, or would be under way together.
     """
-    if all(phase.spelled for phase in mission.phases):
+    if all(phase.flown_as_written for phase in mission.phases):
         return mission
     data, tables, forms = mission.to_dict(), [], {}
     before: str | None = None
@@ -62,7 +62,7 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         table = data["phases"][k] | {"name": phase.name}
         table.pop("transition", None)
         parts = [table]
-        if not phase.spelled:
+        if not phase.flown_as_written:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             state = partial(_state_after, mission, so_far, timed)
             parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, state)
@@ -155,13 +155,13 @@ def _to_own_places(
         The vehicles did not stand on the ground, no way is proved, or there is too little time for it.
     """
     mistake = partial(error_of_key, mission, number)
-    homes = Homes(mission, Plan(()), to="own")
+    homes = Aborts(mission, (), to="own")
     problem = (
         "needs vehicles that stand on the ground at the start, and slots before that are known"
     )
-    steps: list[Step] = []
+    steps: tuple[Step, ...] = ()
     if now is not None and now.goal is not None and now.slots is not None and homes.stands:
-        steps, _, problem = homes.search(now.goal.r + now.slots @ now.goal.T, now.t)
+        steps, _, problem, _ = homes.search(now.goal.r + now.slots @ now.goal.T, now.t)
     if not steps:
         remedy = "leave places out, to land below"
         raise mistake("places", "own", problem, remedy)
@@ -170,7 +170,7 @@ def _to_own_places(
     if spare < -1e-6:
         problem = f"is too short for the ways to the own places; the least is {least:.3f} s"
         raise mistake("duration", phase.duration, problem, "give that, or more")
-    parts = phases_of(mission, steps, phase.name)
+    parts = phases_of(mission, steps, f"{phase.name}: ")
     last = parts[-1].model_copy(update={"duration": steps[-1].duration + max(spare, 0.0)})
     keep = {key: x for key, x in table.items() if key in ("control", "input_force")}
     return [keep | x.model_dump(mode="json", exclude_unset=True) for x in (*parts[:-1], last)]

@@ -16,29 +16,30 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
     from rigidfleet.mission import Mission
+    from rigidfleet.mission.fences import Area
     from rigidfleet.result import Result
 
 #: Colour of places with people.
 PEOPLE = "#6A3D9A"
+#: Line of a soft fence.
+_SOFT = 0, (4, 2)
+#: Heights at which a fall is looked at that may end on terrain or a roof.
+_HEIGHTS = 128
 #: Colour of places where vehicles fall, and the most places of a kind that are drawn.
 _FALLS, _MOST = "#E69F00", 4000
 
 
 def areas(mission: Mission) -> list[tuple[str, list[Floats], dict[str, Any]]]:
     """Name, rings (m, 2) [m] and look of each fence and place with people; hatched where no vehicle may be."""
-    drawn: list[tuple[str, list[Floats], dict[str, Any]]] = []
-    looks: list[dict[str, Any]] = []
+    drawn: list[tuple[Area, dict[str, Any]]] = []
     for fence in mission.fences:
-        looks.append({"edgecolor": st.ALERT, "facecolor": "none", "linewidth": 1.1})
-        looks[-1] |= {"linestyle": (0, (4, 2))} if fence.soft else {}
-        looks[-1] |= {"hatch": "////"} if fence.kind == "exclusion" else {}
-    looks += [{"edgecolor": PEOPLE, "facecolor": f"{PEOPLE}2E", "linewidth": 0.8}] * len(
-        mission.people
-    )
-    for x, look in zip((*mission.fences, *mission.people), looks, strict=True):
-        rings = [ring for polygon in x.polygons(mission.geodetic_origin) for ring in polygon]
-        drawn.append((x.name, rings, look))
-    return drawn
+        look: dict[str, Any] = {"edgecolor": st.ALERT, "facecolor": "none", "linewidth": 1.1}
+        look |= {"linestyle": _SOFT} if fence.soft else {}
+        look |= {"hatch": "////"} if fence.kind == "exclusion" else {}
+        drawn.append((fence, look))
+    look = {"edgecolor": PEOPLE, "facecolor": f"{PEOPLE}2E", "linewidth": 0.8}
+    drawn += [(people, look) for people in mission.people]
+    return [(area.name, area.rings(mission.geodetic_origin), look) for area, look in drawn]
 
 
 def draw_from_above(ax: Axes, mission: Mission) -> None:
@@ -63,17 +64,30 @@ def draw_in_space(ax: Axes3D, mission: Mission, floor: float) -> None:
 
 
 def falls_of(result: Result) -> Floats:
-    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m] on the ground, or at z = 0 without one.
+    """Where each vehicle falls that fails at a sample: places (K, N, 2) [m], on the ground, or at z = 0 without one.
 
-    NaN where nothing falls, for want of gravity.
+    Terrain and roofs count at some heights of each fall. NaN where nothing falls, for want of gravity.
     """
     from rigidfleet.mission.boundaries import Boundaries
 
     mission = result.mission
     if mission.gravity < 1.0:
         return np.full((*result.position.shape[:2], 2), np.nan)
+    boundaries, states = Boundaries(mission), (result.position, result.velocity)
     level = mission.ground if np.isfinite(mission.ground) else 0.0
-    return Boundaries(mission).landings(result.position, result.velocity, level)
+    if mission.roofs.kind.size:
+        level = min(
+            level,
+            *(float(np.min(np.asarray(x.heights))) for x in mission.solids if x.kind == "heights"),
+            0.0,
+        )
+    places = boundaries.landings(*states, level)
+    for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
+        height = level + share * (result.position[..., 2] - level)
+        above = boundaries.landings(*states, height)
+        ends = mission.height_at(*np.moveaxis(above, 2, 0)) >= height
+        places[ends] = above[ends]
+    return places
 
 
 @st.in_style
@@ -93,7 +107,7 @@ def sketch(result: Result, falls: Floats) -> Figure:
     line = partial(st.legend_entry, color=st.ALERT, linewidth=1.1)
     kinds = {fence.soft for fence in result.mission.fences}
     handles += [line("fence")] if False in kinds else []
-    handles += [line("soft fence", linestyle=(0, (4, 2)))] if True in kinds else []
+    handles += [line("soft fence", linestyle=_SOFT)] if True in kinds else []
     if result.mission.people:
         handles.append(st.legend_entry("people", color=PEOPLE, linewidth=5.0, alpha=0.4))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")

@@ -9,9 +9,9 @@ import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS, QUANTITIES, Quantity, display_unit
 from rigidfleet.math import attitude as att
-from rigidfleet.plotting import peaks, quadrotors
+from rigidfleet.plotting import quadrotors
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import in_style
+from rigidfleet.plotting.peaks import IDLE, Panel, distinct_limits, peak_before_breakdown
 from rigidfleet.result import Extremum, Result
 from rigidfleet.result.quantities import owner_name, samples
 from rigidfleet.typing import Floats
@@ -138,7 +138,7 @@ def _distinct_columns(values: Floats) -> list[int]:
     return sorted(np.unique(keys, axis=1, return_index=True)[1].tolist())
 
 
-@in_style
+@st.in_style
 def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
@@ -155,36 +155,31 @@ def distances(result: Result) -> Figure:
 # -- the formation as a whole --------------------------------------------------------------------------
 
 
+#: A waypoint.
+_RING: dict[str, Any] = {
+    "linestyle": "", "marker": "o", "markersize": 5.5, "markerfacecolor": "white", "markeredgecolor": st.INK,
+}  # fmt: skip
+
+
 def _draw_components(
     result: Result,
     axes: Any,
     flown: Floats,
     wanted: Floats,
     targets: list[tuple[float, Any]],
-    names: tuple[str, str, str],
+    names: str,
     unit: str,
 ) -> None:
     """A row for each of three components: flown and reference (K, 3), targets (time, [3])."""
-    for i, ax in enumerate(axes):
+    for i, (ax, name) in enumerate(zip(axes, names.split(), strict=True)):
         goals = np.array([goal[i] for _, goal in targets], dtype=float)
         st.draw_line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
         st.draw_reference(ax, result.time, wanted[:, i])
         for t, goal in targets:
-            ax.plot(
-                t, goal[i], "o", markersize=5.5, markerfacecolor="white", markeredgecolor=st.INK,
-                markeredgewidth=1.0, zorder=4, clip_on=False,
-            )  # fmt: skip
-        ax.set_ylabel(f"{names[i]} [{unit}]")
+            ax.plot(t, goal[i], **_RING, markeredgewidth=1.0, zorder=4, clip_on=False)
+        ax.set_ylabel(f"{name} [{unit}]")
         if not st.note_if_still(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit):
             widen_limits(ax, 0.1)
-
-
-def _row_shares(*columns: tuple[Floats, Floats]) -> list[float]:
-    """Heights of three rows, smaller if nothing changes; each column is given as (flown, commanded)."""
-    return [
-        _STILL_ROW if all(st.is_still(f[:, i], w[:, i]) for f, w in columns) else 1.0
-        for i in range(3)
-    ]
 
 
 def widen_limits(ax: Axes, least: float) -> None:
@@ -195,41 +190,37 @@ def widen_limits(ax: Axes, least: float) -> None:
         ax.set_ylim(middle - least / 2, middle + least / 2)
 
 
-def _draw_body_legend(ax: Axes, references: list[Line2D], *, targets: bool) -> None:
-    ring = st.legend_entry(
-        "waypoint", linestyle="", marker="o", markersize=5.5, markerfacecolor="white",
-        markeredgecolor=st.INK,
-    )  # fmt: skip
-    flown = st.legend_entry("flown", color=st.FLOWN, linewidth=2.4)
-    st.draw_legend(ax, [flown, *references, *([ring] if targets else [])])
-
-
 def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
     """Time [s] and value of the waypoints that the flight reached."""
-    targets = [p.target for p in result.phases if p.target is not None]
-    moments = (at for target in targets for at in (*target.get("through", ()), target))
-    values = [(at["time"], at.get(key)) for at in moments]
+    values = [(at["time"], at.get(key)) for _, at in st.targets(result)]
     return [(t, value) for t, value in values if value is not None and t <= result.time[-1] + 1e-9]
 
 
-@in_style
+#: Flown and commanded values (K, 3), those of waypoints (time, [3]), names of the components and their unit.
+_Column = tuple[Floats, Floats, list[tuple[float, Any]], str, str]
+
+
+def _body_figure(result: Result, title: str, *columns: _Column) -> Figure:
+    """Components of the body's state in rows, lower ones where nothing changes; each column beside the other."""
+    still = [all(st.is_still(f[:, i], w[:, i]) for f, w, *_ in columns) for i in range(3)]
+    shares = [_STILL_ROW if x else 1.0 for x in still]
+    fig, axes = st.time_figure(result, title, 3, len(columns), height=1.5, shares=shares)
+    for k, column in enumerate(columns):
+        _draw_components(result, axes[:, k], *column)
+    entries = [st.legend_entry("flown", color=st.FLOWN, linewidth=2.4)]
+    entries += _reference_handle(*(wanted for _, wanted, *_ in columns))
+    entries += [st.legend_entry("waypoint", **_RING)] if any(c[2] for c in columns) else []
+    st.draw_legend(axes[0, 1], entries)
+    return fig
+
+
+@st.in_style
 def cm(result: Result) -> Figure:
     """Centre of mass: flown, reference (dashed) and waypoints (rings)."""
-    columns = (result.cm, result.cm_reference), (result.cm_velocity, result.cm_velocity_reference)
-    fig, axes = st.time_figure(
-        result, "Centre of mass", 3, 2, height=1.5, shares=_row_shares(*columns)
-    )
     places, speeds = _waypoint_values(result, "position"), _waypoint_values(result, "velocity")
-    _draw_components(
-        result, axes[:, 0], result.cm, result.cm_reference, places, ("x", "y", "z"), "m"
-    )
-    _draw_components(
-        result, axes[:, 1], result.cm_velocity, result.cm_velocity_reference, speeds,
-        ("ẋ", "ẏ", "ż"), "m/s",
-    )  # fmt: skip
-    references = _reference_handle(result.cm_reference, result.cm_velocity_reference)
-    _draw_body_legend(axes[0, 1], references, targets=bool(places or speeds))
-    return fig
+    place = result.cm, result.cm_reference, places, "x y z", "m"
+    speed = result.cm_velocity, result.cm_velocity_reference, speeds, "ẋ ẏ ż", "m/s"
+    return _body_figure(result, "Centre of mass", place, speed)
 
 
 def euler_deg(quaternions: Floats) -> Floats:
@@ -257,7 +248,7 @@ def flown_and_wanted_euler(result: Result) -> tuple[Floats, Floats, list[tuple[f
     return flown, wanted, targets
 
 
-@in_style
+@st.in_style
 def attitude(result: Result) -> Figure:
     """Attitude of the formation: flown, reference (dashed) and waypoints (rings)."""
     title = "Attitude of the formation"
@@ -266,40 +257,28 @@ def attitude(result: Result) -> Figure:
         fig, axes = st.time_figure(result, title, 1)
         st.write_note(axes[0, 0], "no body frame attached")
         return fig
-    turned = np.degrees(result.rates), np.degrees(result.rates_reference)
-    shares = _row_shares((flown, wanted), turned)
-    fig, axes = st.time_figure(result, title, 3, 2, height=1.5, shares=shares)
-    _draw_components(result, axes[:, 0], flown, wanted, targets, ("roll", "pitch", "yaw"), "deg")
     turning = [(t, np.degrees(rates)) for t, rates in _waypoint_values(result, "rates")]
-    _draw_components(result, axes[:, 1], *turned, turning, ("p", "q", "r"), "deg/s")
-    references = _reference_handle(wanted, result.rates_reference)
-    _draw_body_legend(axes[0, 1], references, targets=bool(targets or turning))
-    return fig
+    rates = np.degrees(result.rates), np.degrees(result.rates_reference), turning, "p q r", "deg/s"
+    return _body_figure(result, title, (flown, wanted, targets, "roll pitch yaw", "deg"), rates)
 
 
 # -- forces ------------------------------------------------------------------------------------------
 
 
 def draw_thrust(ax: Axes, result: Result) -> None:
-    """Thrust of each agent with its limit, from zero."""
+    """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
+    if not np.isfinite(result.thrust).any() and np.isfinite(result.slot_position).any():
+        quadrotors.draw_off_slot(ax, result)
+        return
     ax.set_ylabel("thrust [N]")
     if not np.isfinite(result.thrust).any():
         st.write_note(ax, "forces are not known")
         return
-    st.draw_agent_lines(ax, result, result.thrust)
-    limits = peaks.distinct_limits(result.mission.fleet.thrust_limit)
-    for value, label, colour in limits:
-        st.draw_limit(ax, value, label, colour)
-    top = max(
-        [*(value for value, *_ in limits), peaks.peak_before_breakdown(result, result.thrust)]
-    )
-    ax.set_ylim(0, 1.12 * top if top > 0 else 1.0)
-    peaks.mark_extremes(
-        ax, result, result.thrust, "N", peaks.agent_name, name="thrust", always=False
-    )
+    panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
+    panel.draw_below(distinct_limits(result.mission.fleet.thrust_limit), always=False)
 
 
-@in_style
+@st.in_style
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
@@ -308,43 +287,40 @@ def inputs(result: Result) -> Figure:
     st.draw_agent_lines(below, result, result.thrust)
     below.set_ylabel("enlarged [N]")
     if not st.note_if_still(below, result.thrust, "N"):
-        peaks.leave_out_final_peak(below, result, result.thrust)
-        widen_limits(below, min(0.1, 0.1 * peaks.peak_before_breakdown(result, result.thrust)))
-        peaks.mark_extremes(below, result, result.thrust, "N", peaks.agent_name, name="thrust")
+        panel = Panel(below, result, result.thrust, "N", result.extreme("thrust"))
+        panel.leave_out_final_peak()
+        widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
+        panel.mark_extremes()
     st.draw_agents_legend(above, result.n_agents)
     return fig
 
 
-@in_style
+@st.in_style
 def constraint_force(result: Result) -> Figure:
     """Constraint force on each vehicle, and tension of each edge (negative: the edge pushes)."""
-
-    def edge(k: int) -> str:
-        return f"edge {result.edge_labels[k]}"
-
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
-    shares = [
-        _TEXT_ROW if np.nanmax(np.abs(v), initial=0.0) <= peaks.IDLE else 1.0
-        for v in (force, tension)
-    ]
+    idle = [np.nanmax(np.abs(v), initial=0.0) <= IDLE for v in (force, tension)]
+    shares = [_TEXT_ROW if still else 1.0 for still in idle]
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel("constraint force [N]")
-    if peaks.draw_from_zero(above, result, force, "N", "constraint_force"):
+    if Panel(above, result, force, "N", result.extreme("constraint_force")).draw_from_zero():
         st.draw_agents_legend(above, result.n_agents)
     below.set_ylabel("tension [N]")
+    name = lambda k: f"edge {result.edge_labels[k]}"  # noqa: E731
+    edges = Panel(below, result, tension, "N", result.extreme("tension"), name)
     if not len(result.edges):
         st.write_note(below, "no edges")
-    elif not peaks.note_if_idle(below, result, tension, "N", edge):
+    elif not edges.note_if_idle():
         draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
-        peaks.leave_out_final_peak(below, result, tension)
-        peaks.mark_extremes(below, result, tension, "N", edge, name="tension", always=False)
+        edges.leave_out_final_peak()
+        edges.mark_extremes(always=False)
         st.draw_legend(below, edge_handles(result))
     return fig
 
 
-@in_style
+@st.in_style
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
@@ -354,7 +330,7 @@ def disturbance(result: Result) -> Figure:
         st.write_note(above, "still air")
     else:
         force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-        if peaks.draw_from_zero(above, result, force, "N"):
+        if Panel(above, result, force, "N").draw_from_zero():
             st.draw_agents_legend(above, result.n_agents)
     quadrotors.draw_off_slot(below, result)
     return fig
@@ -423,7 +399,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     return handles
 
 
-@in_style
+@st.in_style
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     fig, axes = st.time_figure(
@@ -498,7 +474,7 @@ def _draw_planned(ax: Axes, result: Result) -> None:
         st.annotate(ax, words, st.places_around(p.t_start, least), color=st.ALERT)
 
 
-@in_style
+@st.in_style
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
     mission, several = result.mission, result.n_agents > 1
@@ -524,7 +500,7 @@ def limited_motions(result: Result) -> list[Quantity]:
     return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
 
 
-@in_style
+@st.in_style
 def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.formation import distance_geometry
-from rigidfleet.plotting import sketches, space
+from rigidfleet.plotting import sketches
 from rigidfleet.plotting import style as st
-from rigidfleet.result.lights import seen_from
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,6 +19,8 @@ if TYPE_CHECKING:
     from rigidfleet.rigidity import Rigidity
 
 _FORMATS = (".png", ".svg", ".pdf")
+#: Greatest number of edges with their lengths.
+_FEW = 12
 #: The longest arrow of a free motion, relative to the size of the shape.
 _ARROW = 0.35
 #: Greatest number of free motions drawn in one picture; more would hide each other.
@@ -31,10 +31,9 @@ def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     names = list(mission.formations)
     with st.settings():
-        fig, rects = sketches.tiled_figure(len(names), 3.6, 0.4, (0.1, 0.2))
-        for (x, y, width, height), name in zip(rects, names, strict=True):
-            ax = fig.add_axes((x + 0.04 * width, y, 0.92 * width, 0.8 * height))
-            _draw_formation(ax, mission, name, judged.get(name))
+        fig, rects = sketches.tiled_figure(len(names), 3.5, 0.2, (0.05, 0.1))
+        for rect, name in zip(rects, names, strict=True):
+            _draw_formation(fig, rect, mission, name, judged.get(name))
     return fig
 
 
@@ -58,39 +57,21 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
     write(path, drawn)
 
 
-def _draw_formation(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:
-    p, placed = sketches.sketch_places(mission, name)
-    p = p - p.mean(axis=0)
-    edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-    extent = float(np.ptp(p)) or 1.0
-    flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * extent
-    sideways = flat and rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
-    R = np.eye(3) if flat and not sideways else space.camera(-70.0, 30.0 if flat else 16.0)
-    lit = mission.formation_colours(name)
-    R = R if lit is None else space.camera(*np.degrees(seen_from(p)))
+def _draw_formation(
+    fig: Figure, rect: sketches.Rect, mission: Mission, name: str, rigidity: Rigidity | None
+) -> None:
     redundant = set() if rigidity is None else set(rigidity.redundant.tolist())
-    colours = [st.FLOWN if k in redundant else st.GREY for k in range(len(edges))]
-    dashed = [k in redundant for k in range(len(edges))]
-    few = len(edges) <= 12
-    sketches.draw_graph(
-        ax, p @ R.T, edges, colours, lengths if few else None, dashed=dashed, lights=lit
-    )
-    caption = f"{len(edges)} edges" + ("" if placed else "; their distances fix no positions")
+    dashed = [k in redundant for k in range(len(mission.formation_edges(name)))]
+    colours = [st.FLOWN if dash else st.GREY for dash in dashed]
+    words = f"{len(dashed)} edges"
     if rigidity is not None:
-        caption = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {caption}"
-        caption += f", {len(redundant)} redundant" if redundant else ""
-        _draw_free_motions(ax, p, R, rigidity)
-    ax.set_title(f"{st.clean_name(name)}\n", fontweight="bold", parse_math=False)
-    ax.text(
-        0.5,
-        1.02,
-        caption,
-        transform=ax.transAxes,
-        ha="center",
-        va="bottom",
-        fontsize=7,
-        color=st.GREY,
-    )
+        words = f"{rigidity.rigidity_class}, rank {rigidity.rank} of {rigidity.needed}, {words}"
+        words += f", {len(redundant)} redundant" if redundant else ""
+    sideways = rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
+    look: dict[str, Any] = {"most": _FEW, "dashed": dashed, "sideways": sideways}
+    drawn = sketches.sketch(fig, rect, mission, name, colours, words, **look)
+    if rigidity is not None:
+        _draw_free_motions(drawn.ax, drawn.p, drawn.turn, rigidity)
 
 
 def _draw_free_motions(ax: Axes, p: Any, R: Any, rigidity: Rigidity) -> None:

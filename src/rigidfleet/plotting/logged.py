@@ -1,53 +1,147 @@
-"""The figure of a log against its plan."""
+"""A log against its plan: how far vehicles are off their slots and when, and the figure of it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet._common.facts import value
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
+from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: Vehicles that are drawn at most.
 _SHOWN = 12
+#: What is off a slot at least, where the mission has no limit [m]; then twice what is usual counts, too.
+_OFF = 0.01
+#: Time within which a vehicle that is off its slot again is still off it [s].
+_SOON = 1.0
+
+
+class Drift(NamedTuple):
+    """A time in which a vehicle, counted from 0, is surely off its slot [s]; how far at most [m], and when [s]."""
+
+    who: int
+    start: float
+    end: float
+    worst: float
+    at: float
+
+
+class OffPlan(NamedTuple):
+    """Distances of vehicles from their slots.
+
+    Attributes
+    ----------
+    far, doubt : (K, N) distance [m], NaN of those that do not fly; and how far a place is in doubt [m]
+    limit : of the mission, or what would be unusual in this flight [m]
+    """
+
+    far: Floats
+    doubt: Floats
+    limit: float
+
+    @property
+    def interval(self) -> Floats:
+        """From what to what (2, K, N) [m] the distances are."""
+        return np.stack([np.maximum(self.far - self.doubt, 0.0), self.far + self.doubt])
+
+    @property
+    def off(self) -> Bools:
+        """Who is surely beyond the limit (K, N)."""
+        return self.interval[0] > self.limit
+
+    def drifts(self, time: Floats) -> list[Drift]:
+        """Each time in which a vehicle is off, those of one after the other."""
+        drifts = []
+        for i, off in enumerate(self.off.T):
+            for a, b in _spans(runs(off), time):
+                k = a + int(np.nanargmax(self.far[a:b, i]))
+                ends = float(time[a]), float(time[b - 1])
+                drifts.append(Drift(i, *ends, float(self.far[k, i]), float(time[k])))
+        return drifts
+
+
+def runs(mask: Bools) -> list[tuple[int, int]]:
+    """Where a mask (K,) is true: the first sample of each run, and the one after its last."""
+    ends = np.flatnonzero(np.diff(np.pad(mask, 1).astype(int))).tolist()
+    return list(pairwise(ends))[::2]
+
+
+def _spans(spans: list[tuple[int, int]], time: Floats) -> list[tuple[int, int]]:
+    """Runs of samples, those that follow soon after another joined to it."""
+    joined: list[tuple[int, int]] = []
+    for a, b in spans:
+        soon = joined and time[a] - time[joined[-1][1] - 1] < _SOON
+        joined.append((joined.pop()[0], b) if soon else (a, b))
+    return joined
+
+
+def off_plan(result: Result) -> OffPlan | None:
+    """How far the vehicles of a log are off their plan; None of a flight that is no log, or has no plan."""
+    facts = result.statistics
+    vehicles = facts.get("doubt", {}).get("vehicles")
+    if vehicles is None:
+        return None
+    off = np.linalg.norm(result.position - result.slot_position, axis=2)
+    bands = facts.get("bands", {"time": result.time[:1], "place": np.zeros((1, result.n_agents))})
+    places = np.array(bands["place"]).T
+    doubt = np.stack([np.interp(result.time, bands["time"], place) for place in places], axis=1)
+    usual = float(np.median([each["mean_off_m"] for each in vehicles]))
+    limit = result.mission.limits.tracking_error or max(_OFF, 2.0 * usual)
+    return OffPlan(np.where(result.left, off, np.nan), doubt, limit)
+
+
+def log_names(result: Result) -> list[str]:
+    """Names of the vehicles of a log, as their files have them."""
+    return [st.clean_name(x) for x in result.statistics["names"]]
 
 
 @st.in_style
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
-    facts, slots, r, n = result.statistics, result.slot_position, result.position, result.n_agents
-    bands = facts.get("bands", {"time": result.time[:1], "place": np.zeros((1, n))})
-    names = facts.get("names") or [f"agent {i}" for i in range(1, n + 1)]
-    far = 1e3 * np.where(result.left, np.linalg.norm(r - slots, axis=2), np.nan)
     fig = st.blank_figure(st.WIDTH, 3.9, "constrained")
-    above, off = fig.subplots(1, 2, width_ratios=(0.8, 1.2))
-    st.draw_time_axis(off, result)
-    colours = st.agent_colours(n)
+    above, below = fig.subplots(1, 2, width_ratios=(0.8, 1.2))
+    st.draw_head(fig, result, "The flight against its plan")
+    if (off := off_plan(result)) is None:
+        for ax in (above, below):
+            st.write_note(ax, "no log against a plan")
+        return fig
+    n, time, slots = result.n_agents, result.time, result.slot_position
+    st.draw_time_axis(below, result)
+    colours, names = st.agent_colours(n), log_names(result)
     # Of many vehicles, those that are off the most.
-    shown = np.sort(np.argsort(-np.fmax.reduce(far, axis=0))[:_SHOWN]).tolist()
+    shown = np.sort(np.argsort(-np.fmax.reduce(off.far, axis=0))[:_SHOWN]).tolist()
+    low, high = 1e3 * off.interval
     for i in shown:
-        colour = colours[i]
-        above.plot(*r[:, i, :2].T, color=colour, linewidth=1.4)
+        look: dict[str, Any] = {"color": colours[i]}
+        above.plot(*result.position[:, i, :2].T, **look, linewidth=1.4)
         above.plot(*slots[:, i, :2].T, **st.REFERENCE, zorder=3)
-        by = 1e3 * np.interp(result.time, bands["time"], np.array(bands["place"])[:, i])
-        low, high = np.maximum(far[:, i] - by, 0.0), far[:, i] + by
-        off.fill_between(result.time, low, high, color=colour, alpha=0.25, linewidth=0)
-        st.draw_line(off, result.time, far[:, i], color=colour)
-    for i, each in enumerate(facts.get("doubt", {}).get("vehicles", ())):
-        if each["off_its_slot"] or each["late"]:
-            at, most = each["worst_at_s"], 1e3 * each["worst_off_m"]
-            words = f"{st.clean_name(names[i])}: {most:.3g} mm at {at:.2f} s"
-            st.annotate(off, words, st.places_around(at, most), color=colours[i])
+        below.fill_between(time, low[:, i], high[:, i], **look, alpha=0.25, linewidth=0)
+        st.draw_line(below, time, 1e3 * off.far[:, i], **look)
+        mine = [drift for drift in off.drifts(time) if drift.who == i]
+        for drift in mine:  # where and when it is off, in bold
+            k = slice(*np.searchsorted(time, [drift.start, drift.end]))
+            bold = {"color": colours[i], "linewidth": 3.5, "alpha": 0.6, "gid": "drift"}
+            above.plot(*result.position[k, i, :2].T, **bold)
+            below.plot(time[k], 1e3 * off.far[k, i], **bold)
+        if mine:
+            worst = max(mine, key=lambda drift: drift.worst)
+            words = f"{names[i]}: {value(1e3 * worst.worst, 'mm')} at {worst.at:.2f} s"
+            place = st.places_around(worst.at, 1e3 * worst.worst)
+            st.annotate(below, words, place, color=colours[i])
+    below.set_ylim(0.0, 1.25 * float(np.fmax.reduce(high, axis=None, initial=1e-3)))
+    words = "unusual from" if result.mission.limits.tracking_error is None else "limit"
+    st.draw_limit(below, 1e3 * off.limit, f"{words} {value(1e3 * off.limit, 'mm')}")
     above.set(xlabel="x, east [m]", ylabel="y, north [m]")
     above.set_aspect("equal", adjustable="datalim")
-    off.set(xlabel="time [s]", ylabel="distance from the slot [mm]")
-    off.set_ylim(0.0, 1.25 * float(np.fmax.reduce(far, axis=None, initial=1e-3)))
-    look: dict[str, Any] = {"loc": "outside lower center", "ncols": min(n + 1, 8)}
-    entries = [st.legend_entry(st.clean_name(names[i]), color=colours[i]) for i in shown]
+    below.set(xlabel="time [s]", ylabel="distance from the slot [mm]")
+    look = {"loc": "outside lower center", "ncols": min(n + 1, 8)}
+    entries = [st.legend_entry(names[i], color=colours[i]) for i in shown]
     fig.legend(handles=[*entries, st.legend_entry("plan", **st.REFERENCE)], **look)
-    st.draw_head(fig, result, "The flight against its plan")
     return fig

@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import in_style
+from rigidfleet.plotting.peaks import Panel
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+#: Ratio of the greatest push to the usual one from which an axis is logarithmic.
+_DIVERGES = 1e4
 
-@in_style
+
+@st.in_style
 def messages(result: Result) -> Figure:
     """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""
     fig, axes = st.time_figure(result, "Messages of neighbours", 2)
@@ -29,13 +31,16 @@ def messages(result: Result) -> Figure:
             st.write_note(ax, "no network: one law knows all states")
         return fig
     age = oldest_messages(result)
-    peaks.draw_from_zero(above, result, age, "s")
+    Panel(above, result, age, "s").draw_from_zero()
     st.draw_agents_legend(above, result.n_agents)
     if net.silence < 2.0 * np.nanmax(age, initial=0.0):
         st.draw_limit(above, net.silence, f"an edge is let go: {net.silence:g} s")
     push = np.linalg.norm(np.nansum(result.constraint_force, axis=1), axis=1)
     st.draw_line(below, result.time, push, color=st.FLOWN)
-    below.set_ylim(bottom=0.0)
+    if push.max() > _DIVERGES * np.median(push) > 0.0:
+        below.set_yscale("log")
+    else:
+        below.set_ylim(bottom=0.0)
     return fig
 
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.curves import draw_least
-from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.typing import Floats
 
@@ -23,7 +22,7 @@ def leaves_ground(result: Result) -> bool:
     return any(phase.vertical is not None for phase in result.mission.phases)
 
 
-@in_style
+@st.in_style
 def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     """Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.
 

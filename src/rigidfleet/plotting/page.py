@@ -10,7 +10,6 @@ import numpy as np
 
 from rigidfleet.plotting import curves, space
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 
 if TYPE_CHECKING:
@@ -46,7 +45,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
         curves.widen_limits(ax, 0.1)
 
 
-@in_style
+@st.in_style
 def summary(result: Result) -> Figure:
     """Summary of the flight on one page.
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, display_unit
-from rigidfleet.plotting import peaks
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import in_style
+from rigidfleet.plotting.logged import runs
+from rigidfleet.plotting.peaks import Panel, distinct_limits
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.typing import Bools, Floats
@@ -58,7 +57,7 @@ def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
     return max(every, key=lambda x: x.value / limits[x.who], default=None)
 
 
-@in_style
+@st.in_style
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
@@ -77,7 +76,7 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
     """The greatest of the four rotors of each vehicle; as a share of the limit if limits differ."""
     limits, force = rotor_limits(result.mission), rotor_forces(result).max(axis=2)
     between, unit = _nearest_to_limit(result, limits), "N"
-    shown = peaks.distinct_limits(limits)
+    shown = distinct_limits(limits)
     ax.set_ylabel("greatest rotor force [N]")
     if len(shown) > 1:
         if between is not None:
@@ -85,14 +84,7 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
         force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
         ax.set_ylabel("share of the rotor limit [%]")
     between = None if between is None else between._replace(other=-1)
-    st.draw_agent_lines(ax, result, force)
-    for value, label, colour in shown:
-        st.draw_limit(ax, value, label, colour)
-    ax.set_ylim(
-        0.0,
-        1.12 * max([*(value for value, *_ in shown), peaks.peak_before_breakdown(result, force)]),
-    )
-    peaks.mark_extremes(ax, result, force, unit, peaks.agent_name, between=between)
+    Panel(ax, result, force, unit, between).draw_below(shown)
 
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
@@ -106,7 +98,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
     colours = st.colour_scale(4)
     for k, colour in enumerate(colours):
         st.draw_line(ax, result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
-    peaks.leave_out_final_peak(ax, result, force[:, i])
+    Panel(ax, result, force[:, i], "N").leave_out_final_peak()
     low, high = ax.get_ylim()
     if limits[i] < high + 0.3 * (high - low):
         st.draw_limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
@@ -118,7 +110,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
     st.draw_legend(ax, entries, "nearest to its limit")
 
 
-@in_style
+@st.in_style
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
     saturated = _saturation_mask(result)
@@ -153,7 +145,7 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
     limit, unit = q.limit_of(result.mission), display_unit(q.unit)
-    if peaks.draw_from_zero(ax, result, values, unit, between=between) and limit is not None:
+    if Panel(ax, result, values, unit, between).draw_from_zero() and limit is not None:
         top = max(ax.get_ylim()[1], 1.2 * limit)
         ax.set_ylim(-0.04 * top, top)
         st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
@@ -178,9 +170,8 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
         ax.set_ylabel("saturated\n[vehicles]")
         return
     for i, colour in enumerate(st.agent_colours(n)):
-        ends = np.flatnonzero(np.diff(np.pad(saturated[:, i], 1).astype(int)))
         last = np.append(t, t[-1])
-        bars = [(t[a], last[b] - t[a]) for a, b in list(pairwise(ends.tolist()))[::2]]
+        bars = [(t[a], last[b] - t[a]) for a, b in runs(saturated[:, i])]
         ax.broken_barh(bars, (i + 0.6, 0.8), color=colour, linewidth=0.4)
     ax.set_ylim(n + 0.6, 0.4)
     ax.set_yticks(range(1, n + 1))

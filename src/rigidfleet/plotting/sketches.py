@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from rigidfleet.formation import distance_geometry
 from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.space import camera, marker_look
-from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.result.lights import seen_from
 from rigidfleet.typing import Floats
@@ -69,7 +68,7 @@ def tiled_figure(
     ]
 
 
-@in_style
+@st.in_style
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)
@@ -79,7 +78,7 @@ def formations(result: Result) -> Figure:
     if not names:
         fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
     for rect, name in zip(rects, names, strict=True):
-        _sketch(fig, rect, result, name)
+        _draw_formation(fig, rect, result, name)
     if legend:
         entries = curves.edge_handles(result)
         fig.legend(
@@ -91,48 +90,63 @@ def formations(result: Result) -> Figure:
     return fig
 
 
-def _sketch(fig: Figure, rect: Rect, result: Result, name: str) -> None:
-    mission = result.mission
-    p, placed = sketch_places(mission, name)
-    edges = mission.formation_edges(name)
-    lengths = mission.formation_distances(name)
-    masses = mission.fleet.mass
-    origin = masses @ p / masses.sum()
-    flat = distance_geometry.dimension(p, 1e-3) < 3 and float(np.ptp(p[:, 2])) < 1e-3 * max(
-        1e-9, float(np.ptp(p))
-    )
-    x, y, w, h = rect
-    formation = mission.formations[name]
+def _draw_formation(fig: Figure, rect: Rect, result: Result, name: str) -> None:
+    """Draw a formation with the colours of its edges in all figures, and its body axes."""
+    mission, edges = result.mission, result.mission.formation_edges(name).tolist()
+    formation, colours = mission.formations[name], {}
+    for group in curves.edge_groups(result):
+        colours |= {tuple(result.edges[k].tolist()): group.colour for k in group.edges}
     words = formation.shape or ("slots" if formation.slots is not None else "by distances")
-    fig.text(
-        x + w / 2,
-        y + 0.95 * h,
-        st.clean_name(name),
-        ha="center",
-        fontweight="bold",
-        parse_math=False,
-    )
-    caption = f"{words}, {len(edges)} edge{'s' if len(edges) != 1 else ''}"
-    caption += "" if placed else "; their distances fix no positions"
-    fig.text(x + w / 2, y + 0.89 * h, caption, ha="center", fontsize=7.5, color=st.GREY)
+    words += f", {len(edges)} edge{'s' if len(edges) != 1 else ''}"
+    of_edge = [colours[i, j] for i, j in edges]
+    drawn = sketch(fig, rect, mission, name, of_edge, words, most=curves.SINGLE)
+    if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
+        size = np.linalg.norm(drawn.p, axis=1)
+        reach, taken = float(size.max()), bool(size.min() < 0.1 * size.max())
+        length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)] * reach
+        _draw_axes(drawn.ax, drawn.turn.T, length, taken=taken)
+
+
+class Sketch(NamedTuple):
+    """A formation that is drawn: its axes, places (N, 3) [m] about its centre, whether these are its slots; the turn.
+
+    The rows of ``turn`` (3, 3) point to the right, upwards and towards the viewer.
+    """
+
+    ax: Axes
+    p: Floats
+    placed: bool
+    turn: Floats
+
+
+def sketch(
+    fig: Figure, rect: Rect, mission: Mission, name: str, colours: list[str], words: str, *,
+    most: int, dashed: Sequence[bool] = (), sideways: bool = False,
+) -> Sketch:  # fmt: skip
+    """Draw a formation's graph under its name and ``words``; lengths of up to ``most`` edges.
+
+    A flat one is seen from its own side unless ``sideways``, lights from where they are meant to be.
+    """
+    p, placed = sketch_places(mission, name)
+    masses = mission.fleet.mass
+    p = p - masses @ p / masses.sum()
+    edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
+    thin = float(np.ptp(p[:, 2])) < 1e-3 * max(1e-9, float(np.ptp(p)))
+    flat = thin and distance_geometry.dimension(p, 1e-3) < 3
+    turn, lit = np.eye(3), mission.formation_colours(name)
+    if lit:
+        turn = camera(*np.degrees(seen_from(p)))
+    elif sideways or not flat:
+        turn = camera(-70.0, 30.0 if flat else 16.0)
+    x, y, w, h = rect
+    title, small = st.clean_name(name), "" if placed else "; their distances fix no positions"
+    look: dict[str, Any] = {"ha": "center", "parse_math": False}
+    fig.text(x + w / 2, y + 0.95 * h, title, **look, fontweight="bold")
+    fig.text(x + w / 2, y + 0.89 * h, words + small, **look, fontsize=7.5, color=st.GREY)
     ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
-    turned = p - origin
-    axes = np.eye(3)
-    lit = mission.formation_colours(name)
-    if not flat or lit:
-        R = camera(*np.degrees(seen_from(p))) if lit else camera(-70.0, 16.0)
-        turned, axes = turned @ R.T, axes @ R.T
-    colours = {k: g.colour for g in curves.edge_groups(result) for k in g.edges}
-    index = {edge: k for k, edge in enumerate(map(tuple, result.edges.tolist()))}
-    of_edge = [colours[index[edge]] for edge in map(tuple, edges.tolist())]
-    draw_graph(
-        ax, turned, edges, of_edge, lengths if len(edges) <= curves.SINGLE else None, lights=lit
-    )
-    if placed and len(p) > 1 and not lit:
-        reach = float(np.linalg.norm(turned, axis=1).max())
-        taken = bool(np.linalg.norm(turned, axis=1).min() < 0.1 * reach)
-        length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(p, 1e-3)] * reach
-        _draw_axes(ax, axes, length, taken=taken)
+    shown = lengths if len(edges) <= most else None
+    draw_graph(ax, p @ turn.T, edges, colours, shown, dashed=dashed, lights=lit)
+    return Sketch(ax, p, placed, turn)
 
 
 def draw_graph(

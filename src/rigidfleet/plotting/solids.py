@@ -1,4 +1,4 @@
-"""Obstacles that are not boxes along the axes, in figures: from the side, from above, and where they move."""
+"""Obstacles in figures: from the side, from above, and where they move."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ class DrawnObstacle:
 
     name: str
     zone: bool
+    plain: bool  # whether it is a box along the axes, which is seen through
     terrain: bool
     surface: Outline  # without motion
     at: Floats  # (M, 3) displacements at which it is drawn, in order of time [m]
@@ -50,12 +51,12 @@ class DrawnObstacle:
 def drawn_obstacles(
     mission: Mission, begin: float, end: float, low: Floats, high: Floats
 ) -> list[DrawnObstacle]:
-    """Obstacles that are no plain boxes, over a time [s], as far as they come near the space from low to high (3,)."""
+    """Obstacles over a time [s], as far as they come near the space from low to high (3,), where boxes are cut."""
     near_obstacles = []
     for thing in mission.solids:
-        if thing.corners is not None and not thing.zone:
-            continue
-        solid = thing.solid
+        solid, surface = thing.solid, outline(thing.solid)
+        if plain := thing.corners is not None and not thing.zone:
+            surface = Outline(*(np.clip(x, low, high) for x in surface))
         at = way = np.zeros((1, 3))
         if solid.moves:
             since, until = np.clip(solid.there[0], begin, end)
@@ -71,10 +72,9 @@ def drawn_obstacles(
                 for k, n in enumerate(solid.grid[0])
             )
             grid = x, y, solid.heights.reshape(solid.grid[0])
-        shape = DrawnObstacle(
-            thing.name, thing.zone, grid is not None, outline(solid), at, way, grid
-        )
-        near = (shape.ends[1] >= low) & (shape.ends[0] <= high)
+        terrain = grid is not None
+        shape = DrawnObstacle(thing.name, thing.zone, plain, terrain, surface, at, way, grid)
+        near = (shape.ends[1] > low) & (shape.ends[0] < high)
         if near.all():
             near_obstacles.append(shape)
     return near_obstacles
@@ -92,13 +92,17 @@ def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
 
     colour = st.ALERT if shape.zone else COLOUR
     dashes: Any = (0, (4, 2)) if shape.zone else "-"
+    faces = shape.surface.triangles
+    if shape.plain:  # its sides, as seams between translucent triangles would show
+        faces = np.concatenate([faces[:6], faces[6:, 2:]], axis=1)
     for at, share in zip(shape.at, _opacities(shape), strict=True):
-        opacity = float(share) * (0.07 if shape.zone else 0.7 if shape.terrain else 0.6)
-        faces = Poly3DCollection(
-            list(shape.surface.triangles + at), facecolors=_face_colours(shape, colour, opacity), edgecolors="none",
-            linewidths=0, antialiaseds=shape.zone, zorder=0.5 if shape.terrain else 2, gid="obstacle",
-        )  # fmt: skip
-        ax.add_collection3d(faces)
+        opacity = 0.07 if shape.zone else 0.22 if shape.plain else 0.7 if shape.terrain else 0.6
+        opacity *= float(share)
+        colours, zorder = _face_colours(shape, faces, colour, opacity), 0.5 if shape.terrain else 2
+        look: dict[str, Any] = {"edgecolors": "none", "linewidths": 0, "antialiaseds": shape.zone}
+        sides = Poly3DCollection(list(faces + at), facecolors=colours, **look, zorder=zorder)
+        sides.set_gid("obstacle")
+        ax.add_collection3d(sides)
         ax.add_collection3d(
             Line3DCollection(
                 list(shape.surface.lines + at), colors=colour, linewidths=0.5, linestyles=dashes,
@@ -110,16 +114,16 @@ def draw_in_space(ax: Axes3D, shape: DrawnObstacle) -> None:
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=2.2)
 
 
-def _face_colours(shape: DrawnObstacle, colour: str, opacity: float) -> Floats:
-    """Colours (T, 4) of the faces of a shape, lighter towards the light."""
+def _face_colours(shape: DrawnObstacle, faces: Floats, colour: str, opacity: float) -> Floats:
+    """Colours (T, 4) of the faces (T, 3 or more, 3) of a shape, lighter towards the light."""
     from matplotlib.colors import to_rgb
 
-    a, b, c = shape.surface.triangles.swapaxes(0, 1)
+    a, b, c = faces[:, :3].swapaxes(0, 1)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     light = 0.5 + 0.5 * normal @ np.array([-0.36, -0.48, 0.8])
     dark = (1.0 - np.array(to_rgb(colour))) * (1.25 - 0.75 * light[:, None])
-    if shape.zone:
+    if shape.zone or shape.plain:
         return np.column_stack([np.clip(1.0 - dark, 0.0, 1.0), np.full(len(dark), opacity)])
     # Opaque in a paler colour: seams between translucent faces would show.
     return np.column_stack([np.clip(1.0 - opacity * dark, 0.0, 1.0), np.ones(len(dark))])
@@ -134,8 +138,7 @@ def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     flat = shape.surface.triangles.reshape(-1, 3)[:, :2]
     rim = flat[ConvexHull(flat).vertices]
     look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 1}
-    if shape.zone:
-        look |= {"edgecolor": colour, "linewidth": 0.8, "linestyle": (0, (4, 2))}
+    dashed: dict[str, Any] = {"fill": False, "edgecolor": colour, "linestyle": (0, (4, 2))}
     if shape.grid is not None:
         x, y, z = shape.grid
         ax.contourf(x, y, z.T, 8, cmap=_height_colours(), alpha=0.5, zorder=0.8)
@@ -144,8 +147,8 @@ def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
         opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
         patch = ax.add_patch(Polygon(rim + at[:2], **look, alpha=opacity * float(share)))
         if shape.zone:
-            ax.add_patch(Polygon(rim + at[:2], fill=False, edgecolor=colour, linewidth=0.8,
-                                 linestyle=(0, (4, 2)), alpha=float(share), zorder=1.1))  # fmt: skip
+            border = Polygon(rim + at[:2], **dashed, linewidth=0.8, alpha=float(share), zorder=1.1)
+            ax.add_patch(border)
     if len(shape.way) > 1:
         way = shape.way[:, :2] + rim.mean(axis=0)
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=1.2)

@@ -10,7 +10,6 @@ import numpy as np
 
 from rigidfleet.plotting import areas, solids
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.style import in_style
 from rigidfleet.result import Result
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.result.lights import view as seen
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 
-_BOX = solids.COLOUR
 _GROUND = "#E9E6DF"
 _ELEVATION = 24.0  # of the camera [deg]
 #: Least and greatest elevation of the camera in front of lights, and how far it stands aside, to show the axes [deg].
@@ -46,8 +44,7 @@ class Scene:
     high: Floats
     floor: float  # height of the plane that shadows fall on [m]
     ground: bool  # whether this plane is the ground
-    boxes: list[tuple[str, Floats, Floats]]  # name and corners [m]
-    shapes: list[solids.DrawnObstacle]  # all other obstacles
+    shapes: list[solids.DrawnObstacle]
     waypoints: list[tuple[str, Floats]]
 
 
@@ -66,14 +63,6 @@ def scene(result: Result) -> Scene:
     near = float((high - low).max()) + 5.0
     if stands := mission.ground > low[2] - near:  # on a ground that is near
         low[2] = min(low[2], mission.ground)
-    boxes = []
-    for o in mission.obstacles:
-        if o.kind == "box" and o.corners is not None and not o.zone:
-            # Only the part of a large box that is near the flight is shown.
-            a = np.clip(np.array(o.min), low - near, high + near)
-            b = np.clip(np.array(o.max), low - near, high + near)
-            if (b > a).all():
-                boxes.append((o.name, a, b))
     begin, end = float(result.time[0]), float(result.time[-1])
     shapes = solids.drawn_obstacles(mission, begin, end, low - near, high + near)
     seen_too = [np.clip(shape.ends, low - near, high + near) for shape in shapes]
@@ -81,40 +70,25 @@ def scene(result: Result) -> Scene:
         flat = np.concatenate(rings)
         ends = np.array([[*f(flat, axis=0), z] for f, z in ((np.min, low[2]), (np.max, high[2]))])
         seen_too.append(np.clip(ends, low - near, high + near))
-    low = np.minimum.reduce([low, *(a for _, a, _ in boxes), *(ends[0] for ends in seen_too)])
-    high = np.maximum.reduce([high, *(b for _, _, b in boxes), *(ends[1] for ends in seen_too)])
+    low = np.minimum.reduce([low, *(ends[0] for ends in seen_too)])
+    high = np.maximum.reduce([high, *(ends[1] for ends in seen_too)])
     # A margin around it; no direction too thin to see.
     size = float((high - low).max()) or 2.0
     lack = np.maximum(0.3 * size - (high - low), 0.08 * size) / 2
     floor = mission.ground if stands else low[2] - lack[2]
     high = high + lack
     low = np.array([low[0] - lack[0], low[1] - lack[1], min(floor, low[2])])
-    return Scene(
-        r[thin],
-        result.cm[thin],
-        _drawn_samples(result, rows),
-        low,
-        high,
-        floor,
-        stands,
-        boxes,
-        shapes,
-        waypoints,
-    )
+    shots = _drawn_samples(result, rows)
+    return Scene(r[thin], result.cm[thin], shots, low, high, floor, stands, shapes, waypoints)
 
 
 def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     """Short name and position of each waypoint, once for each position."""
     names: dict[tuple[float, ...], str] = {}
-    for phase in result.phases:
-        target = phase.target or {}
-        for position in [
-            *(at["position"] for at in target.get("through", ())),
-            target.get("position"),
-        ]:
-            if position is not None:
-                place = tuple(np.round(np.asarray(position, dtype=float), 6).tolist())
-                names.setdefault(place, st.clean_name(phase.name.split(":")[0], 12))
+    for phase, at in st.targets(result):
+        if at.get("position") is not None:
+            place = tuple(np.round(np.asarray(at["position"], dtype=float), 6).tolist())
+            names.setdefault(place, st.clean_name(phase.name.split(":")[0], 12))
     return [(name, np.array(place)) for place, name in names.items()]
 
 
@@ -145,12 +119,6 @@ def _drawn_samples(result: Result, rows: Any) -> list[int]:
     keep(ends, 0.3 * size)
     keep(rows[st.spaced_indices(len(rows), 80)].tolist(), max(1.2 * size, path / 14))
     return sorted(kept)
-
-
-def _box_faces(low: Floats, high: Floats) -> list[Floats]:
-    c = corners(low, high)
-    sides = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]
-    return [c[list(side)] for side in sides]
 
 
 def _edge_segments(result: Result, shots: list[int]) -> Floats:
@@ -242,14 +210,6 @@ def draw_space(
         flat = corners(low, high)[[0, 2, 6, 4]]
         flat[:, 2] = view.floor
         ax.add_collection3d(Poly3DCollection([flat], facecolor=_GROUND, alpha=0.8, zorder=0))
-    for _, a, b in view.boxes:
-        faces: dict[str, Any] = {
-            "facecolor": _BOX,
-            "edgecolor": _BOX,
-            "linewidth": 0.5,
-            "alpha": 0.22,
-        }
-        ax.add_collection3d(Poly3DCollection(_box_faces(a, b), **faces, zorder=2, gid="obstacle"))
     for shape in view.shapes:
         solids.draw_in_space(ax, shape)
     areas.draw_in_space(ax, result.mission, view.floor)
@@ -367,6 +327,7 @@ def _fit_axes(
 def draw_above(ax: Axes, result: Result, view: Scene) -> None:
     """Draw the trajectory from above, with one scale on both axes."""
     from matplotlib.collections import LineCollection
+    from matplotlib.patches import Rectangle
 
     ax.set(xlim=(view.low[0], view.high[0]), ylim=(view.low[1], view.high[1]))
     ax.set(xlabel="x [m]", ylabel="y [m]")
@@ -375,15 +336,14 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
     if has_lights(result):
         ax.set_facecolor(st.NIGHT)
         ax.grid(visible=False)
-    for name, low, high in view.boxes:
-        _draw_box(ax, low, high, name, facecolor=_BOX, alpha=0.3, linewidth=0)
     for shape in view.shapes:
         solids.draw_from_above(ax, shape)
     areas.draw_from_above(ax, result.mission)
     fence = result.mission.limits.geofence
     if fence is not None:
         look: dict[str, Any] = {"fill": False, "edgecolor": st.ALERT, "linestyle": (0, (6, 2))}
-        _draw_box(ax, np.array(fence.min), np.array(fence.max), "", **look, gid="geofence")
+        (x, y), size = fence.min[:2], np.subtract(fence.max, fence.min)
+        ax.add_artist(Rectangle((x, y), *size[:2], **look, zorder=1, gid="geofence"))
     edges = _edge_segments(result, view.shots)[..., :2]
     edges = edges if len(edges) <= _LINES else edges[:0]  # more would hide everything
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
@@ -398,15 +358,6 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         )  # fmt: skip
 
 
-def _draw_box(ax: Axes, low: Floats, high: Floats, name: str, **look: Any) -> None:
-    """Draw a box from above, with its name if it fits."""
-    from matplotlib.patches import Rectangle
-
-    (x, y), (width, depth) = low[:2].tolist(), (high - low)[:2].tolist()
-    box = ax.add_artist(Rectangle((x, y), width, depth, zorder=1, **look))
-    st.name_box(ax, box, x + width / 2, y, name)
-
-
 def legend_handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
     waypoints = [st.legend_entry("waypoint", **_CROSS)] if view.waypoints else []
@@ -419,7 +370,7 @@ def legend_handles(result: Result, view: Scene) -> list[Any]:
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
-@in_style
+@st.in_style
 def trajectory(result: Result) -> Figure:
     """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)

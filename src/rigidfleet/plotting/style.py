@@ -10,11 +10,12 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.result import Result
+from rigidfleet.result import PhaseRecord, Result
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -67,49 +68,12 @@ _ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), 
 #: Whether figures have titles, and their width [mm]; None for the usual one.
 _shape: ContextVar[tuple[bool, float | None]] = ContextVar("shape", default=(True, None))
 
-_RC: dict[str, Any] = {
-    "font.family": "sans-serif",
-    # In files that keep text; each font is sought for each text
-    "font.sans-serif": ["DejaVu Sans", "Verdana", "Arial"],
-    "font.size": 8.5,
-    "axes.titlesize": 9,
-    "axes.labelsize": 8.5,
-    "axes.edgecolor": GREY,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "axes.formatter.limits": (-5, 6),
-    "axes.xmargin": 0,
-    "axes3d.xaxis.panecolor": "none",
-    "axes3d.yaxis.panecolor": "none",
-    "axes3d.zaxis.panecolor": "none",
-    "grid.color": "#E3E6E8",
-    "grid.linewidth": 0.5,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.labelsize": 8,
-    "ytick.labelsize": 8,
-    "text.color": INK,
-    "text.hinting": "none",  # finer letters, of the true width, in less time
-    "axes.labelcolor": INK,
-    "lines.linewidth": 1.1,
-    "lines.solid_capstyle": "round",
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "legend.handlelength": 1.6,
-    "legend.borderaxespad": 0.0,
-    "figure.dpi": _DPI,
-    "figure.constrained_layout.w_pad": _PAD,
-    "figure.constrained_layout.h_pad": _PAD,
-    "savefig.dpi": _DPI,
-    "pdf.fonttype": 42,  # TrueType: publishers refuse Type 3
-    "svg.fonttype": "none",  # text remains text
-    "svg.hashsalt": "rigidfleet",  # the same flight gives the same file
+#: What the style sheet leaves to this file.
+_SHARED: dict[str, Any] = {
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), GREY),
+    **dict.fromkeys(("figure.dpi", "savefig.dpi"), _DPI),
+    **dict.fromkeys(("figure.constrained_layout.w_pad", "figure.constrained_layout.h_pad"), _PAD),
 }
 
 
@@ -119,7 +83,8 @@ def settings() -> Generator[None]:
     import matplotlib as mpl
 
     # As `matplotlib.style` does, which loads all styles first
-    look: Any = {key: value for key, value in mpl.rcParamsDefault.items() if key != "backend"} | _RC
+    sheet: Any = mpl.rc_params_from_file(Path(__file__).with_name("rigidfleet.mplstyle"))
+    look: Any = {key: value for key, value in sheet.items() if key != "backend"} | _SHARED
     with mpl.rc_context(look), warnings.catch_warnings():
         # Letters that the font lacks show as boxes in a PNG, and correctly in an SVG.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
@@ -218,6 +183,12 @@ def time_figure(
     axes = axes.reshape(stacked).T if stacked else axes
     _name_phases(axes[0], result)
     return fig, axes
+
+
+def targets(result: Result) -> list[tuple[PhaseRecord, dict[str, Any]]]:
+    """All that phases are to reach: points to pass on the way, and the target at the end."""
+    reached = ((p, p.target) for p in result.phases if p.target is not None)
+    return [(p, at) for p, target in reached for at in (*target.get("through", ()), target)]
 
 
 def draw_head(fig: Figure, result: Result, title: str) -> None:

@@ -16,7 +16,8 @@ from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.files import write_file
 from rigidfleet._common.text import agent_names
 from rigidfleet.mission import Mission
-from rigidfleet.planning.abort import Abort, Aborts, Nearest
+from rigidfleet.mission.boundaries import Worst
+from rigidfleet.planning.abort import Abort, Aborts
 from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.losses import legs_from
 
@@ -34,7 +35,7 @@ class AbortsCheck(Shown):
 
     mission: Mission
     aborts: list[Abort]
-    unheard: list[list[Nearest]]
+    unheard: list[list[Worst]]
 
     @property
     def least(self) -> float:
@@ -81,31 +82,32 @@ class AbortsCheck(Shown):
                 )
             )
 
-    def _unheard(self, each: list[Nearest]) -> str:
+    def _unheard(self, each: list[Worst]) -> str:
         """What follows if a vehicle does not hear, in words."""
         if not each:
             return ""
-        least, when, (i, j) = min(each)
+        least, when, i, j = min(each)
         near = f"least {least:.2f} m," if least > 0.0 else "hits"
         text = f"{agent_names([i])} flies on: {near} {agent_names([j])} at {when:.1f} s"
         count = self._in_danger(each)
         return text + (f"; {count} would come too near" if count else "")
 
-    def _in_danger(self, each: list[Nearest]) -> int:
+    def _in_danger(self, each: list[Worst]) -> int:
         """How many vehicles would come within the limit of separation."""
-        return sum(x.separation < (self.mission.limits.separation or 0.0) for x in each)
+        return sum(x.value < (self.mission.limits.separation or 0.0) for x in each)
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents counted from 1."""
         options = self.mission.aborting
         return {
+            "mission_sha256": self.mission.digest,
             "to": options.to, "reaction_s": options.reaction, "step_s": options.step,
             "aborts": [
                 {
                     "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stops,
-                    "ends_s": x.end,
-                    "way": x.way, "reason": x.reason, "ways": x.number, "separation": _nearest([x.least]),
-                    "unheard": _nearest(each), "endangered": self._in_danger(each),
+                    "ends_s": x.end, "way": x.way, "reason": x.reason, "ways": x.home.number,
+                    "separation": _nearest(x.least.separation, x.least.time, *x.least.agents),
+                    "unheard": _nearest(*min(each)) if each else None, "endangered": self._in_danger(each),
                 }
                 for x, each in zip(self.aborts, self.unheard, strict=True)
             ],
@@ -116,11 +118,13 @@ class AbortsCheck(Shown):
 
         Each vehicle flies its own trajectory until the abort begins and has waited, slows down along it by the clock,
         so that its time along it goes on by T (x - 2.5 x^4 + 3 x^5 - x^6), with x the share of the time T of slowing
-        down, and flies straight from place to place, by the share 35 x^4 - 84 x^5 + 70 x^6 - 20 x^7 of each way.
+        down, and flies straight from place to place, by the share 35 x^4 - 84 x^5 + 70 x^6 - 20 x^7 of each way. In a
+        step with ``back_to_s``, its time along its trajectory goes back to that, by the same share. Where ``ways`` is
+        null, it flies its own trajectory to the end.
         """
         folder.mkdir(parents=True, exist_ok=True)
         data = self.data()
-        homes = {x.number: x.home for x in self.aborts}
+        homes = {x.home.number: x.home.steps for x in self.aborts if x.home.number is not None}
         keys = ("ordered_s", "begins_s", "waits_s", "stops_s", "ways")
         aborts = [{key: x[key] for key in keys} for x in data["aborts"] if x["way"]]
         tables = {"aborts.json": data}
@@ -128,6 +132,7 @@ class AbortsCheck(Shown):
             ways = {
                 number: [
                     {"name": x.name, "duration_s": x.duration, "to_m": x.end[i].round(6).tolist()}
+                    | ({} if x.path is None else {"back_to_s": x.path})
                     for x in steps
                 ]
                 for number, steps in homes.items()
@@ -137,12 +142,10 @@ class AbortsCheck(Shown):
             write_file(folder / name, (json.dumps(table, indent=1) + "\n").encode())
 
 
-def _nearest(each: list[Nearest]) -> dict[str, Any] | None:
-    """The least of several."""
-    least, when, who = min(each, default=Nearest(np.inf, 0.0, (0, 0)))
-    if not np.isfinite(least):
-        return None
-    return {"least_m": least, "time_s": when, "agents": [i + 1 for i in who]}
+def _nearest(least: float, when: float, *who: int) -> dict[str, Any] | None:
+    """Two vehicles that come nearest, as plain data; None for one alone."""
+    agents = [i + 1 for i in who]
+    return {"least_m": least, "time_s": when, "agents": agents} if np.isfinite(least) else None
 
 
 def check_aborts(
@@ -158,7 +161,7 @@ def check_aborts(
     progress("planned paths")
     aborts = Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
     every: list[Abort] = []
-    unheard: list[list[Nearest]] = []
+    unheard: list[list[Worst]] = []
     for abort in aborts.every():
         progress(f"way home from {abort.ordered:g} s")
         every.append(abort)

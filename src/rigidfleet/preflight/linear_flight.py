@@ -1,15 +1,17 @@
 """The flight by neighbours of a formation that holds its slots, linear in what little it is off them.
 
 Edges then do not turn, and all that a vehicle computes (`kernel.neighbours`) is a sum of what it knows. What it has
-heard is kept as it was brought forward to now, so that time enters by the messages alone: a tick is a product with
-constant matrices, and an arrival replaces a part of the state. Attitude and rotors follow as their linear lag
-(`math.margins.Lag`), limits do not act, and messages are sent and used at ticks of the formation law.
+heard is kept as it was brought forward to now, so that time enters by the messages alone. Attitude and rotors follow as
+their linear lag (`math.margins.Lag`), limits do not act, and messages are sent and used at ticks of the formation law.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,11 +24,14 @@ from rigidfleet.typing import Floats, Ints
 
 #: Of each coordinate: place, velocity, acceleration and two derivatives of it; those of a point end with the velocity.
 _ORDERS = 5
-#: What is heard over a link, all along the edge: half of what the hearer then was, less what the sender was, in place,
-#: velocity and acceleration; velocity and acceleration of the sender, and the share of its input.
-_HEARD = ("place", "velocity", "acceleration", "their velocity", "their acceleration", "input")
+#: Rows of what is heard over a link, all along the edge: half of what the hearer then was, less what the sender was, in
+#: place, velocity and acceleration; velocity and acceleration of the sender, and the share of its input. Then follows
+#: what the sender's other edges do to it, by each iterate.
+_PLACE, _VELOCITY, _ACCELERATION, _THEIR_VELOCITY, _THEIR_ACCELERATION, _INPUT, _REST = range(7)
 #: Shortest time constant of a rotor [s]: a shorter one makes no difference.
 _QUICK = 1e-4
+#: Number of links up to which products with full matrices are quicker than with sparse ones.
+_FEW = 200
 
 #: What the arrivals at a tick change, (W, L, B): from the tick, and the change if all arrived that are some ticks late.
 Arrivals = Callable[[int, Callable[[int], Floats]], Floats | float]
@@ -46,9 +51,10 @@ class Radio(NamedTuple):
 
 
 class LinearFlight:
-    """Matrices of one tick of N vehicles with L links.
+    """N vehicles with L links.
 
-    The state (size, B) of B flights at once ends with the part of each link: its integral, and what it holds.
+    The state (size, B) of B flights at once begins with the places (3 N), and ends with the W rows of each link: its
+    integral, and what it holds.
 
     Parameters
     ----------
@@ -69,136 +75,91 @@ class LinearFlight:
         lags: Sequence[Lag],
         drag: Floats,
     ) -> None:
-        from scipy import sparse
-
+        tracks, iterated = law.control == "tracking", law.solver == "iterated"
+        self.law = law if tracks else replace(law, k1=0.0, k2=0.0, ki=0.0)
         self.n, self.r, self.radio = len(r), r, radio
-        self.links, back = links_of(edges)
-        self.tracks = law.control == "tracking"
-        self.iterations = law.iterations if law.solver == "iterated" else 1
-        self._gains = (law.k1, law.k2) if self.tracks else (0.0, 0.0)
+        self.links, self.back = links_of(edges)
+        #: Whether nothing acts on motions of the whole formation.
+        self.is_free = not (tracks or drag.any())
+
         i, j = self.links.T
+        L, n3, iterations = len(i), 3 * self.n, law.iterations if iterated else 1
         unit = r[i] - r[j]
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        L, n3 = len(i), 3 * self.n
-        rows = np.repeat(np.arange(L), 3)
-        own, other = (
-            sparse.csr_array((unit.ravel(), (rows, (3 * x[:, None] + range(3)).ravel())), (L, n3))
-            for x in (i, j)
+        own, other = (_along(unit, x, n3) for x in (i, j))
+        #: Errors of edges (m, N 3) of places.
+        self.edges = (own - other)[i < j]
+        inverse = 1.0 / masses
+        pull = own.T * np.repeat(inverse, 3)[:, None]
+        self._maps = [x.toarray() if L <= _FEW else x.tocsr() for x in (own, other, pull)]
+        self._theirs = inverse[j, None]
+        self._mean, self._damping = masses.mean(), law.damping * iterated
+
+        # The equations of each vehicle's own edges, those of one vehicle below each other; L stands for no edge.
+        first = np.searchsorted(i, np.arange(self.n + 1))
+        most = int(np.diff(first).max())
+        self._at = i, np.arange(L) - first[i]
+        self._rows = np.full((self.n, most), L)
+        self._rows[self._at] = np.arange(L)
+        u, diagonal = np.zeros((self.n, most, 3)), np.ones((self.n, most))
+        u[self._at] = unit
+        diagonal[self._at] = self._mean * (inverse[i] + inverse[j]) + self._damping
+        self._diagonal = np.eye(most) * diagonal[:, None]
+        self._coupling = self._mean * inverse[:, None, None] * (u @ u.transpose(0, 2, 1))
+        self._coupling *= 1.0 - np.eye(most)
+        self._inverse = self._inverses(np.ones((self.n, most)), np.arange(self.n))
+
+        self._late, tick = lags[0].delay, radio.tick
+        waits = math.ceil(self._late / tick - 1e-9)
+        orders = _ORDERS if any(not lag.point for lag in lags) else 2
+        self._motion, self._early = (
+            _motion_over(t, lags, drag, orders) for t in (tick, waits * tick - self._late)
         )
         #: Rows that are held and sent of each link, and number of links.
-        self.shape = len(self._held()) + 1, L
-        #: Whether nothing acts on motions of the whole formation.
-        self.is_free = not (self.tracks or drag.any())
-        self._ends = own, other
-        #: Errors of edges (m, N 3) of places.
-        self.edges = sparse.csr_array(own - other)[i < j]
+        self.shape = 1 + _REST + iterations, L
+        self._shapes = {
+            "orders": (orders, n3), "seen": (waits, 2, n3), "estimate": (n3,), "gust": (n3,), "commanded": (n3,),
+            "error": (n3 * (self.law.ki > 0.0),), "held": self.shape,
+        }  # fmt: skip
+        self.size = sum(map(math.prod, self._shapes.values()))
 
-        damping = law.damping if law.solver == "iterated" else 0.0
-        mean, inverse = masses.mean(), 1.0 / masses
-        pull = sparse.diags_array(np.repeat(inverse, 3)) @ own.T
-        theirs = sparse.diags_array(inverse[j])
-        matrix = mean * (own @ pull + theirs) + damping * sparse.eye_array(L)
-        solve = _inverse_of_blocks(matrix, np.searchsorted(i, np.arange(self.n + 1)))
-        # What a neighbour's other edges do to it: all of them, without the one that leads back.
-        rest = sparse.csr_array(other @ pull + sparse.csr_array((inverse[j], (range(L), back))))
-        rest.data[np.abs(rest.data) < 1e-12] = 0.0
-        rest.eliminate_zeros()
+    def parts(self, x: Floats) -> Any:
+        """Views of the parts of a state (size, B), by name."""
+        ends = np.cumsum([math.prod(shape) for shape in self._shapes.values()])
+        cut = zip(self._shapes.items(), np.split(x, ends[:-1]), strict=True)
+        return SimpleNamespace(**{name: y.reshape(*shape, x.shape[1]) for (name, shape), y in cut})
 
-        self.late = late = lags[0].delay
-        drift = law.ki if self.tracks else 0.0
-        waits = math.ceil(late / radio.tick - 1e-9)
-        motion, early = (
-            _motion_over(t, lags, drag) for t in (radio.tick, waits * radio.tick - late)
-        )
-        orders = _ORDERS if any(not lag.point for lag in lags) else 2
-        self.slices, self.size = _places(
-            {f"order {q}": n3 for q in range(orders)}
-            | {f"seen {q} {waits}": n3 for waits in range(waits) for q in range(2)}
-            | dict.fromkeys(("estimate", "gust", "commanded", *(["error"] if drift else [])), n3)
-            | dict.fromkeys(("integral", *self._held()), L)
-        )
+    def _bring_forward(self, heard: Floats, t: float) -> Floats:
+        """Bring forward what was heard (W, L, B) in place by t [s], as `neighbours.bring_forward` does."""
+        place, velocity, acceleration, v, a, put = heard[:_REST]
+        place += t * (velocity + 0.5 * t * acceleration)
+        velocity += t * acceleration
+        put -= t * (self.law.k1 * (v + 0.5 * t * a) + self.law.k2 * a)
+        v += t * a
+        return heard
 
-        def law_of(x: dict[str, Any]) -> tuple[dict[str, Any], Any]:
-            """What vehicles know and keep, and the right side of each link without others' pulls."""
-            r, v = (x[f"seen {q} {waits - 1}" if waits else f"order {q}"] for q in range(2))
-            known = x["estimate"] + radio.tick * (x["commanded"] + x["gust"])
-            lag, off = max(radio.lag, 4.0 * radio.tick), v - known
-            y = {
-                "r": r,
-                "v": v,
-                "own input": -self._gains[0] * r - self._gains[1] * v,
-                "estimate": known + min(1.0, 2.0 * radio.tick / lag) * off,
-                "gust": x["gust"] + radio.tick / lag**2 * off,
-            }
-            if drift:
-                y["error"] = x["error"] + radio.tick * r
-            gap, along = FRESH * (own @ r) + x["place"], FRESH * (own @ v) + x["velocity"]
-            y["integral"] = x["integral"] + radio.tick * gap
-            right = x["input"] - own @ y["own input"] - 2.0 * law.alpha * along - law.beta**2 * gap
-            return y, right - law.gamma * y["integral"]
+    def _inverses(self, grip: Floats, who: Ints) -> Floats:
+        """Inverses (K, W, W) of the equations of some vehicles, whose edges have the ``grip`` (K, W).
 
-        # Each equation above is written once: of an identity matrix, it gives the matrix.
-        x = self._parts(sparse.eye_array(self.size, format="csr"))
-        right = law_of(x)[1]
-        self.right = sparse.vstack(
-            [mean * (right + x[f"rest {q}"]) for q in range(self.iterations)], format="csr"
-        )
-        self.solve, self.damping = solve, damping
-        x = self._parts(identity := sparse.eye_array(self.size + self.iterations * L, format="csr"))
-        multipliers = [identity[self.size + q * L :][:L] for q in range(self.iterations)]
-        y = law_of(x)[0]
-        y["commanded"] = y["own input"] + pull @ multipliers[-1]
-        if drift:
-            y["commanded"] = y["commanded"] - drift * y["error"]
-        state = [x[f"order {q}"] for q in range(orders)] + [y["commanded"]]
+        As in `neighbours.solve_own_edges`, an edge that slips has a larger entry on the diagonal.
+        """
+        rows = grip[:, :, None] * self._coupling[who] + self._diagonal[who]
+        return np.linalg.inv(rows) * grip[:, None]
 
-        def after(over: Floats, q: int) -> Any:
-            parts = [*range(orders), _ORDERS]
-            return sum(
-                sparse.diags_array(over[:, q, p]) @ z for p, z in zip(parts, state, strict=True)
-            )
+    def _slipping(self, grip: Floats) -> tuple[Ints, Ints, Floats]:
+        """Vehicles (K,) in flights (K,) of which an edge slips, and the inverses of their equations."""
+        each = np.concatenate([grip, np.ones((1, grip.shape[1]))])[self._rows]
+        who, flight = np.nonzero((each < 1.0).any(axis=1))
+        return who, flight, self._inverses(each[who, :, flight], who)
 
-        y |= {f"order {q}": after(motion, q) for q in range(orders)}
-        for q in range(2 * bool(waits)):
-            y[f"seen {q} 0"] = after(early, q)
-            y |= {f"seen {q} {k}": x[f"seen {q} {k - 1}"] for k in range(1, waits)}
-        y |= dict(
-            zip(
-                self._held(),
-                self.brought_forward([x[c] for c in self._held()], radio.tick),
-                strict=True,
-            )
-        )
-        said = [y["r"], y["v"], y["commanded"] + y["gust"], y["own input"], y["integral"]]
-        self.step = sparse.vstack([*(y[name] for name in self.slices), *said], format="csr")
-        # Messages, of what is said and the multipliers.
-        identity = sparse.eye_array(4 * n3 + L + self.iterations * L, format="csr")
-        r, v, a, put = (identity[q * n3 :][:n3] for q in range(4))
-        integral = identity[4 * n3 :][:L]
-        halves = [(1.0 - FRESH) * (own @ z) - other @ z for z in (r, v, a)]
-        pulls = [rest @ identity[4 * n3 + (1 + q) * L :][:L] for q in range(self.iterations)]
-        parts = [integral - integral[back], *halves, *(other @ z for z in (v, a, put)), *pulls]
-        self.message = sparse.vstack(parts, format="csr")
-
-    def _held(self) -> tuple[str, ...]:
-        return (*_HEARD, *(f"rest {q}" for q in range(self.iterations)))
-
-    def _parts(self, x: Any) -> dict[str, Any]:
-        return {name: x[place] for name, place in self.slices.items()}
-
-    def brought_forward(self, heard: Sequence[Any], t: float) -> list[Any]:
-        """What was heard, as it is t [s] later without a further message (`neighbours.bring_forward`)."""
-        place, velocity, acceleration, v, a, put, *rest = heard
-        k1, k2 = self._gains
-        return [
-            place + t * velocity + 0.5 * t * t * acceleration,
-            velocity + t * acceleration,
-            acceleration,
-            v + t * a,
-            a,
-            put - k1 * t * v - (0.5 * k1 * t * t + k2 * t) * a,
-            *rest,
-        ]
+    def _solve(self, right: Floats, slipping: tuple[Ints, Ints, Floats] | None) -> Floats:
+        """Multipliers (L, B) by the right sides of all rows."""
+        each = np.concatenate([right, np.zeros((1, right.shape[1]))])[self._rows]
+        y = self._inverse @ each
+        if slipping is not None:
+            who, flight, inverses = slipping
+            y[who, :, flight] = (inverses @ each[who, :, flight, None])[..., 0]
+        return y[self._at]
 
     def drift(self, delay: int) -> Floats:
         """Places and steady velocities of the whole formation, which no vehicle feels.
@@ -206,26 +167,18 @@ class LinearFlight:
         Of each, the state with the messages of ``delay`` ticks (size + ..., 2 t), as `fly` takes them.
         """
         Q = rigid_motions(self.r)
-        still, none = np.hstack([Q, 0.0 * Q]), np.hstack([0.0 * Q, Q])
-        own, other = self._ends
-        x, messages = (
-            np.zeros((self.size, 2 * Q.shape[1])),
-            np.zeros((delay, *self.shape, 2 * Q.shape[1])),
-        )
-        tick = self.radio.tick
-        x[self.slices["order 0"]], x[self.slices["order 1"]] = still, none
-        x[self.slices["estimate"]] = none
-        waits = sum(name.startswith("seen 0") for name in self.slices)
-        for k in range(waits):
-            x[self.slices[f"seen 0 {k}"]] = still + ((waits - 1 - k) * tick - self.late) * none
-            x[self.slices[f"seen 1 {k}"]] = none
-        held = x[self.slices["integral"].start :].reshape(self.shape + (-1,))
-        for parts, age in ((held, 0), *((messages[k], delay - k) for k in range(delay))):
-            parts[1], parts[2] = (
-                (1.0 - FRESH) * (own @ z) - other @ z
-                for z in (still - (age * tick + self.late) * none, none)
-            )
-            parts[4] = other @ none
+        still, moving = np.hstack([Q, 0.0 * Q]), np.hstack([0.0 * Q, Q])
+        x = np.zeros((self.size, still.shape[1]))
+        messages = np.zeros((delay, *self.shape, still.shape[1]))
+        z, tick, (own, _, _) = self.parts(x), self.radio.tick, self._maps
+        z.orders[:2], z.estimate[:] = (still, moving), moving
+        for waits, seen in enumerate(z.seen[::-1]):
+            seen[:] = still + (waits * tick - self._late) * moving, moving
+        for k, (_, *held) in enumerate((*messages, z.held)):
+            # Edges keep their lengths, so that both ends move alike along them.
+            before = still - ((delay - k) * tick + self._late) * moving
+            held[_PLACE][:], held[_VELOCITY][:] = -FRESH * (own @ before), -FRESH * (own @ moving)
+            held[_THEIR_VELOCITY][:] = own @ moving
         return np.concatenate([x, messages.reshape(-1, x.shape[1])])
 
     def fly(
@@ -235,79 +188,90 @@ class LinearFlight:
         ticks: int,
         delay: int,
         arrivals: Arrivals,
-        grip: Floats | float = 1.0,
+        grip: Floats | None = None,
     ) -> tuple[Floats, Floats]:
         """Fly ``ticks`` ticks from a state (size, B), with the messages (D, W, L, B) of the last D ticks, oldest first.
 
         ``sent`` is changed in place, the message of tick k is then at k modulo D. ``grip`` (L, B) is the share with
-        which an end pulls. Returns the sums of squares of errors of edges (ticks, B) [m^2], and the state.
+        which an end pulls, which ``arrivals`` may change; default: all of it. Returns the sums of squares of errors of
+        edges (ticks, B) [m^2], and the state.
         """
-        L, depth, errors = len(self.links), len(sent), np.zeros((ticks, x.shape[1]))
+        x, squares = x.copy(), np.zeros((ticks, x.shape[1]))
+        z, law, tick, (own, other, pull) = self.parts(x), self.law, self.radio.tick, self._maps
+        lag, (integral, *held) = max(self.radio.lag, 4.0 * tick), z.held
         for k in range(ticks):
-            right = self.right @ x
-            unknown = self.solve @ right[:L]
-            multipliers = [grip * unknown]
-            for q in range(1, self.iterations):
-                unknown = self.solve @ (right[q * L :][:L] + self.damping * unknown)
-                multipliers.append(grip * unknown)
-            y = self.step @ np.concatenate([x, *multipliers])
-            x, said = y[: self.size], y[self.size :]
-            message = self.message @ np.concatenate([said, *multipliers])
-            sent[k % depth] = message.reshape(sent.shape[1:])
-            held = x[self.slices["integral"].start :].reshape(sent.shape[1:])
+            r, v = z.seen[-1] if len(z.seen) else z.orders[:2]
+            z.estimate += tick * (z.commanded + z.gust)
+            off = v - z.estimate
+            z.estimate += min(1.0, 2.0 * tick / lag) * off
+            z.gust += tick / lag**2 * off
+            put, nearer, faster = -law.k1 * r - law.k2 * v, own @ r, own @ v
+            gap, along = FRESH * nearer + held[_PLACE], FRESH * faster + held[_VELOCITY]
+            integral += tick * (gap if grip is None else gap * (grip > 0.0))
+            right = held[_INPUT] - own @ put - 2.0 * law.alpha * along - law.beta**2 * gap
+            right -= law.gamma * integral
+            slipping = None if grip is None else self._slipping(grip)
+            y, force, rest = np.zeros_like(right), 0.0, []
+            for theirs in held[_REST:]:
+                y = self._solve(self._mean * (right + theirs) + self._damping * y, slipping)
+                force = pull @ y
+                # What a vehicle's other edges do to it: all of them, without the one that leads back.
+                rest.append(other @ force + self._theirs * y[self.back])
+            z.commanded[:] = put + force
+            if law.ki:
+                z.error += tick * r
+                z.commanded -= law.ki * z.error
+            a = z.commanded + z.gust
+            pace, change = other @ v, other @ a
+            sent[k % len(sent)] = [
+                integral - integral[self.back], (1.0 - FRESH) * nearer - other @ r, (1.0 - FRESH) * faster - pace,
+                (1.0 - FRESH) * (own @ a) - change, pace, change, other @ put, *rest,
+            ]  # fmt: skip
+            motion = np.concatenate([z.orders, z.commanded[None]])
+            if len(z.seen):
+                z.seen[1:] = z.seen[:-1].copy()
+                z.seen[0] = np.einsum("qpn,pnb->qnb", self._early[:2], motion)
+            z.orders[:] = np.einsum("qpn,pnb->qnb", self._motion, motion)
+            self._bring_forward(z.held[1:], tick)
+            z.held += arrivals(k + 1, partial(self._news, sent, k + 1, delay, z.held))
+            squares[k] = ((self.edges @ z.orders[0]) ** 2).sum(axis=0)
+        return squares, x
 
-            def change(late: int, k: int = k, held: Floats = held) -> Floats:
-                age = delay + late
-                difference, *heard = sent[(k + 1 - age) % depth]
-                part = min(TOGETHER, UNDER_WAY / max(age / self.radio.every, 1.0))
-                forward = self.brought_forward(heard, age * self.radio.tick)
-                return np.stack(
-                    [-part * difference, *(a - b for a, b in zip(forward, held[1:], strict=True))]
-                )
-
-            held += arrivals(k + 1, change)
-            errors[k] = ((self.edges @ x[self.slices["order 0"]]) ** 2).sum(axis=0)
-        return errors, x
+    def _news(self, sent: Floats, k: int, delay: int, held: Floats, late: int) -> Floats:
+        """What changes in what is held (W, L, B) if each link's message arrives at tick k, some ticks late."""
+        age = delay + late
+        news = sent[(k - age) % len(sent)].copy()
+        news[0] *= -min(TOGETHER, UNDER_WAY / max(age / self.radio.every, 1.0))
+        news[1:] = self._bring_forward(news[1:], age * self.radio.tick) - held[1:]
+        return news
 
 
-def _places(sizes: dict[str, int]) -> tuple[dict[str, slice], int]:
-    ends = np.cumsum(list(sizes.values())).tolist()
-    starts = [0, *ends[:-1]]
-    return {name: slice(a, b) for name, a, b in zip(sizes, starts, ends, strict=True)}, ends[-1]
-
-
-def _inverse_of_blocks(matrix: Any, first: Ints) -> Any:
-    """Inverse of a matrix of blocks along the diagonal that begin at ``first``."""
+def _along(unit: Floats, who: Ints, columns: int) -> Any:
+    """The map (L, 3 N) of vectors of vehicles to the components of one of them (L,) along unit vectors (L, 3)."""
     from scipy import sparse
 
-    matrix = sparse.csr_array(matrix)
-    blocks = [
-        np.linalg.inv(matrix[a:b, a:b].toarray())
-        for a, b in zip(first[:-1].tolist(), first[1:].tolist(), strict=True)
-        if b > a
-    ]
-    return sparse.block_diag(blocks, format="csr")
+    places = np.repeat(np.arange(len(who)), 3), (3 * who[:, None] + range(3)).ravel()
+    return sparse.csr_array((unit.ravel(), places), (len(who), columns))
 
 
-def _motion_over(t: float, lags: Sequence[Lag], drag: Floats) -> Floats:
-    """What place, velocity and acceleration with its derivatives become in t [s]: (3 N, 5, 6), the command held."""
+def _motion_over(t: float, lags: Sequence[Lag], drag: Floats, orders: int) -> Floats:
+    """What places and their derivatives become in t [s]: (Q, Q + 1, 3 N), the command, which is held, last."""
     from scipy.linalg import expm
 
     kinds: dict[Any, Floats] = {}
     for lag, friction in zip(lags, drag.tolist(), strict=True):
         for axis in range(3):
-            A, tau, orders = np.zeros((6, 6)), max(lag.tau, _QUICK), _ORDERS
+            A, tau, moving = np.zeros((6, 6)), max(lag.tau, _QUICK), _ORDERS
             A[0, 1], A[1, 1] = 1.0, -friction[axis]
             if lag.point:
-                A[1, 5], orders = 1.0, 2
+                A[1, 5], moving = 1.0, 2
             elif axis == 2:
-                A[1, 2], A[2, 2], A[2, 5], orders = 1.0, -1.0 / tau, 1.0 / tau, 3
+                A[1, 2], A[2, 2], A[2, 5], moving = 1.0, -1.0 / tau, 1.0 / tau, 3
             else:
                 A[1, 2] = A[2, 3] = A[3, 4] = 1.0
                 A[4, 2:] = -lag.k_R / tau, -lag.k_omega / tau, -1.0 / tau, lag.k_R / tau
-            over = expm(t * A)[:_ORDERS]
-            over[orders:] = 0.0
-            kinds.setdefault((lag, axis == 2, friction[axis]), over)
-    return np.array(
-        [kinds[lag, axis == 2, drag[i, axis]] for i, lag in enumerate(lags) for axis in range(3)]
-    )
+            over = expm(t * A)
+            over[moving:] = 0.0
+            kinds[lag, axis == 2, friction[axis]] = over[:orders, [*range(orders), 5]]
+    of = [[kinds[lag, q == 2, drag[i, q]] for q in range(3)] for i, lag in enumerate(lags)]
+    return np.moveaxis(np.array(of).reshape(-1, orders, orders + 1), 0, -1)

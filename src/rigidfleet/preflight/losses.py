@@ -63,7 +63,7 @@ def planned_answer(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:
     when = mission.abandons_at
     lost = mission.lost_at <= when
     now = copy_with(at.state_at(when), lost=lost if lost.any() else None)
-    return answer_to(mission, now, legs)
+    return answer_to(mission, now, lambda: legs)
 
 
 def _links(mission: Mission) -> Iterator[Remark]:
@@ -75,7 +75,7 @@ def _links(mission: Mission) -> Iterator[Remark]:
     used = {p.shaping.formation for p in mission.phases if p.shaping is not None}
     for name in mission.formations:
         slots, edges = mission.formation_slots(name), mission.formation_edges(name)
-        kept = edges[mission.linked(edges, np.inf)]
+        kept = edges[mission.has_link(edges, np.inf)]
         head = f"without the lost links ({links}), '{name}'"
         if name not in used or slots is None:
             continue

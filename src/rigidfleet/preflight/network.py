@@ -34,8 +34,9 @@ from rigidfleet.typing import Floats
 _LARGEST = 6_000
 #: Delays beyond this are not looked at [s].
 _LATEST = 2.0
-#: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius.
-_PERIOD, _VECTORS, _ACCURACY = 1.0, 20, 1e-4
+#: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius: with 1e-6,
+#: stresses that neither grow nor decay were taken to grow by up to 5e-3 a second.
+_PERIOD, _VECTORS, _ACCURACY = 0.4, 20, 1e-8
 #: Losses that are tried first; the limit is then found to the hundredth.
 _LOSSES = (0.5, 0.8, 0.95)
 #: Time for which second moments move [s].
@@ -70,8 +71,10 @@ def linear_flights(
     """Each formation under each law with which it is flown, and how many of its edges nobody hears along."""
     if mission.network is None or mission.vehicle_models is None:
         return
-    net, every, tick = network_of(mission), *_law_ticks(mission)
-    radio = Radio(max(1, round(net.every / every)), math.ceil(net.delay / every), net.lag, tick)
+    net, every = network_of(mission), _law_every(mission)
+    radio = Radio(
+        max(1, round(net.every / every)), math.ceil(net.delay / every), net.lag, every / mission.autopilot.rate
+    )  # fmt: skip
     drag = np.array([model.linear_drag for model in mission.vehicle_models])
     drag /= mission.fleet.mass[:, None]
     pairs = zip(mission.phases, way, strict=False)
@@ -87,23 +90,22 @@ def linear_flights(
             yield name, flight, int((~near).sum())
 
 
-def _law_ticks(mission: Mission) -> tuple[int, float]:
-    """Attitude ticks from one evaluation of the law to the next, and the time between them [s]."""
-    every = max(1, round(mission.autopilot.rate / mission.autopilot.formation_rate))
-    return every, every / mission.autopilot.rate
-
-
 def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
     own, net, radio = mission.network, network_of(mission), flight.radio
-    every, tick = _law_ticks(mission)
     assert own is not None
+    every = _law_every(mission)
     latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
     loss = loss_borne(flight) if radio.delay <= delay else None
     growing = None
     if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
         growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
-    broadcasts = flight.n / (radio.every * tick)
-    return FormationNetwork(broadcasts, tick, delay, latest, loss, own.loss, growing, unheard)
+    broadcasts = flight.n / (radio.every * radio.tick)
+    return FormationNetwork(broadcasts, radio.tick, delay, latest, loss, own.loss, growing, unheard)
+
+
+def _law_every(mission: Mission) -> int:
+    """Attitude ticks from one evaluation of the law to the next."""
+    return max(1, round(mission.autopilot.rate / mission.autopilot.formation_rate))
 
 
 def growth_at(flight: LinearFlight, delay: int) -> float:
@@ -113,42 +115,31 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
     """
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 
-    every = flight.radio.every
-    ticks = max(1, round(_PERIOD / flight.radio.tick / every)) * every
+    every, tick = flight.radio.every, flight.radio.tick
+    ticks = max(1, round(_PERIOD / tick / every)) * every
     messages = (delay, *flight.shape, 1)
     size = flight.size + math.prod(messages)
-
     drift = np.linalg.qr(flight.drift(delay))[0] if flight.is_free else np.zeros((size, 0))
+
+    def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
+        return news(0) if (k - delay) % every == 0 else 0.0
 
     def period_later(z: Floats) -> Floats:
         sent = z[flight.size :].reshape(messages).copy()
-        _, x = flight.fly(z[: flight.size].reshape(-1, 1), sent, ticks, delay, _all(flight, delay))
-        sent = np.roll(sent, -(ticks % delay), axis=0)
-        z = np.concatenate([x.ravel(), sent.ravel()])
+        _, x = flight.fly(z[: flight.size].reshape(-1, 1), sent, ticks, delay, arrive)
+        z = np.concatenate([x.ravel(), np.roll(sent, -(ticks % delay), axis=0).ravel()])
         return z - drift @ (drift.T @ z)  # motions of the whole formation are projected out
 
     # No class of its own: what scipy declares of this one is not how it is made.
     operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
-    start = np.random.default_rng(0).normal(size=size)
-    options: dict[str, Any] = {"k": 1, "v0": start, "tol": _ACCURACY, "maxiter": 20}
-    values = np.zeros(0)
-    for vectors in (_VECTORS, 3 * _VECTORS):  # many, where several motions grow alike
-        try:
-            values = eigs(
-                operator, return_eigenvectors=False, ncv=min(vectors, size - 1), **options
-            )
-        except ArpackNoConvergence as stopped:
-            values = stopped.eigenvalues
-        if len(values):
-            break
-    return math.log(np.abs(values).max(initial=1e-300) if len(values) else 1.0) / (
-        ticks * flight.radio.tick
-    )
-
-
-def _all(flight: LinearFlight, delay: int) -> Arrivals:
-    """All messages arrive after ``delay`` ticks."""
-    return lambda k, change: change(0) if (k - delay) % flight.radio.every == 0 else 0.0
+    try:
+        values = eigs(
+            operator, 1, ncv=min(_VECTORS, size - 1), tol=_ACCURACY, return_eigenvectors=False,
+            v0=np.random.default_rng(0).normal(size=size),
+        )  # fmt: skip
+    except ArpackNoConvergence as stopped:  # several motions grow alike
+        values = stopped.eigenvalues if len(stopped.eigenvalues) else np.ones(1)
+    return math.log(max(np.abs(values).max(), 1e-300)) / (ticks * tick)
 
 
 def last_stable_delay(flight: LinearFlight) -> int:
@@ -171,44 +162,41 @@ def mean_square_growth(
     """Growth [1/s] of the root mean square of errors of edges, for each share of messages lost."""
     rng = np.random.default_rng(0)
     delay, every = flight.radio.delay, flight.radio.every
-    L = len(flight.links)
     kept = np.repeat(1.0 - losses, states)
     spread = np.sqrt(kept * (1.0 - kept))
     block = np.arange(len(losses))[:, None] * states
 
-    def arrivals(k: int, change: Callable[[int], Floats]) -> Floats | float:
+    def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
         if (k - delay) % every:
             return 0.0
-        news = change(0)
-        # Of which other state each link has its noise: a rotation of those with the same loss.
-        turn = (np.arange(states) + rng.integers(0, states, (L, 1, 1))) % states
-        other = np.take_along_axis(news, (block + turn).reshape(1, L, -1), axis=2)
-        sign = rng.integers(0, 2, (L, len(kept))) * 2.0 - 1.0
-        return kept * news + spread * sign * other
+        change = news(0)
+        # Of which other state each link has its noise: a rotation of those with the same loss. One rotation for all
+        # links would draw the states together.
+        turn = (np.arange(states) + rng.integers(0, states, (len(flight.links), 1, 1))) % states
+        other = np.take_along_axis(change, (block + turn).reshape(1, len(turn), -1), axis=2)
+        sign = rng.integers(0, 2, (len(turn), len(kept))) * 2.0 - 1.0
+        return kept * change + spread * sign * other
 
-    errors = _squares_of_errors(flight, delay, len(kept), time, arrivals)
-    return _growth(errors.reshape(len(errors), len(losses), states).mean(axis=2), time)
+    squares = _squares_flown(flight, delay, len(kept), time, arrive)
+    return growth_of(squares.reshape(len(squares), len(losses), states).mean(axis=2), time)
 
 
-def _squares_of_errors(
+def _squares_flown(
     flight: LinearFlight,
     depth: int,
     columns: int,
     time: float,
     arrivals: Arrivals,
-    grip: Floats | float = 1.0,
+    grip: Floats | None = None,
 ) -> Floats:
     """Squares of errors of edges (ticks, B) in flights from random places; ``depth`` ticks of messages are kept."""
-    x = np.zeros((flight.size, columns))
-    place = flight.slices["order 0"]
-    x[place] = np.random.default_rng(1).normal(size=(place.stop - place.start, columns))
-    sent = np.zeros((depth, *flight.shape, columns))
-    return flight.fly(x, sent, round(time / flight.radio.tick), flight.radio.delay, arrivals, grip)[
-        0
-    ]
+    x, places = np.zeros((flight.size, columns)), 3 * flight.n
+    x[:places] = np.random.default_rng(1).normal(size=(places, columns))
+    sent, ticks = np.zeros((depth, *flight.shape, columns)), round(time / flight.radio.tick)
+    return flight.fly(x, sent, ticks, flight.radio.delay, arrivals, grip)[0]
 
 
-def _growth(squares: Floats, time: float) -> Floats:
+def growth_of(squares: Floats, time: float) -> Floats:
     """Growth [1/s] of the root of squares (ticks, ...) from the second to the last quarter of a time [s]."""
     quarter = len(squares) // 4
     before, after = squares[quarter : 2 * quarter], squares[-quarter:]
@@ -219,6 +207,7 @@ def loss_borne(flight: LinearFlight) -> float:
     """Share of messages lost up to which the formation is stable in mean square at its own delay."""
     few, many, links = _STATES
     states = min(max(links // len(flight.links), few), many)
+
     tried = np.array(_LOSSES)
     low, high = 0.0, math.inf
     while len(tried):
@@ -235,38 +224,31 @@ def loss_borne(flight: LinearFlight) -> float:
 
 def sampled_growth(flight: LinearFlight, net: Links, every: int) -> Floats:
     """Growth [1/s] of the errors of edges in some flights (B,) with the losses, jitter and time-outs of a network."""
-    rng, (_, L) = np.random.default_rng(0), flight.shape
-    delay, late = (
-        flight.radio.delay,
-        math.ceil((net.delay + net.jitter) / every) - flight.radio.delay,
-    )
-    shape = late + 1, L, _FLIGHTS
-    fading, grip = np.zeros(shape[1:], dtype=np.bool_), np.ones(shape[1:])
-    due, newest = np.full(shape, -1), np.zeros(shape[1:], dtype=np.int64)
-    step = every / net.silence
+    rng, delay, L = np.random.default_rng(0), flight.radio.delay, len(flight.links)
+    late = math.ceil((net.delay + net.jitter) / every) - delay
+    fading, grip = np.zeros((L, _FLIGHTS), dtype=np.bool_), np.ones((L, _FLIGHTS))
+    due, newest = np.full((late + 1, L, _FLIGHTS), -1), np.zeros((L, _FLIGHTS), dtype=np.int64)
 
-    def arrivals(k: int, change: Callable[[int], Floats]) -> Floats | float:
+    def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
         # The message sent at tick k - delay is due in some ticks from now, or never.
-        nonlocal fading
         total: Floats | float = 0.0
         due[(k - delay) % len(due)] = -1
         if (k - delay) % flight.radio.every == 0:
-            fading = np.where(
-                fading, rng.random(shape[1:]) >= net.recovers, rng.random(shape[1:]) < net.worsens
-            )
-            wait = (rng.random(shape[1:]) * (late + 1)).astype(np.int64)
+            draw, wait = rng.random((2, L, _FLIGHTS))
+            fading[:] = np.where(fading, draw >= net.recovers, draw < net.worsens)
+            wait = (wait * (late + 1)).astype(np.int64)
             due[(k - delay) % len(due)] = np.where(fading, -1, k + wait)
         for waited in range(late + 1):  # the newest of those that arrive together
             sent = k - delay - waited
             now = (due[sent % len(due)] == k) & (sent > newest)
             if now.any():
                 newest[now] = sent
-                total = total + now * change(waited)
-        silent = k - newest > net.silence / every
-        grip[:] = np.clip(np.where(silent, grip - step, grip + step), 0.0, 1.0)
+                total = total + now * news(waited)
+        change = np.where(k - newest > net.silence / every, -every, every) / net.silence
+        np.clip(grip + change, 0.0, 1.0, out=grip)
         return total
 
-    return _growth(_squares_of_errors(flight, delay + late, _FLIGHTS, _TIME, arrivals, grip), _TIME)
+    return growth_of(_squares_flown(flight, delay + late, _FLIGHTS, _TIME, arrive, grip), _TIME)
 
 
 def network_remarks(preflight: Preflight) -> Iterator[Remark]:

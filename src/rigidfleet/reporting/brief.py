@@ -3,32 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from hashlib import sha256
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidfleet._common.facts import value
-from rigidfleet._common.text import agent_names, all_hold
+from rigidfleet._common.text import agent_names
 from rigidfleet.assessment import Verdict
-from rigidfleet.plotting import areas, encode_figure
+from rigidfleet.result import Result
 from rigidfleet.typing import Floats
-
-if TYPE_CHECKING:
-    from rigidfleet.result import Result
 
 #: Checks about fences and people.
 _AREAS = "fence", "soft_fence", "people"
 
 
 def rows(
-    result: Result,
-    verdict: Verdict,
-    falls: Floats,
-    rehearsed: Sequence[str] = (),
-    abort: Sequence[str] = (),
-) -> list[tuple[str, list[str]]]:
+    result: Result, verdict: Verdict, falls: Floats, rehearsed: Sequence[str] = (), abort: Sequence[str] = ()
+) -> list[tuple[str, Sequence[str]]]:  # fmt: skip
     """Headings, each with its sentences.
 
     Parameters
@@ -37,49 +30,53 @@ def rows(
     rehearsed : what drills have shown, in sentences
     abort : how the flight is aborted
     """
-    beside = [f"{check.message}." for check in verdict.checks if check.check in _AREAS]
-    beside = [x[0].upper() + x[1:] for x in beside]
+    beside = [
+        f"{x.message[0].upper()}{x.message[1:]}." for x in verdict.checks if x.check in _AREAS
+    ]
     return [
-        ("Planned", _plan(result)),
+        ("Planned", plan(result)),
         ("Proved", _proofs(result, verdict)),
-        ("Rehearsed", [*rehearsed] or ["No drill belongs to this report."]),
-        ("Aborted", [*abort] or ["No way home belongs to this report."]),
+        ("Rehearsed", rehearsed or ["No drill belongs to this report."]),
+        ("Aborted", abort or ["No way home belongs to this report."]),
         ("Fences and people", beside or ["The mission has neither."]),
         ("Where things fall", _falls(result, falls)),
-        ("Versions and digests", _digests(result)),
+        ("Versions and digests", digests(result)),
     ]
 
 
-def _plan(result: Result) -> list[str]:
-    n, z = result.n_agents, result.position[..., 2]
+def plan(result: Result) -> list[str]:
+    """What flies, for how long, and how far and fast."""
+    mission, mass = result.mission, sorted({*result.mission.agents.mass})
     lasting = value(float(result.time[-1] - result.time[0]), "s")
-    vehicles = "One vehicle flies" if n == 1 else f"{n:,} vehicles fly"
-    names = list(dict.fromkeys(phase.name for phase in result.phases))
-    what = f": {', '.join(names)}" if result.interpolation is None else ", as others planned it"
+    count = Counter(mission.vehicles[name].model for name in mission.agents.vehicle)
+    what = ", ".join(f"{n} × {name}" for name, n in count.items())
+    what += f"{', ' * bool(count)}{mass[0]:.4g}{f' to {mass[-1]:.4g}' * (len(mass) > 1)} kg"
+    how = f" ({what}) for {lasting}: {', '.join(dict.fromkeys(x.name for x in result.phases))}"
+    if result.interpolation is not None:
+        how = f" for {lasting}, as others planned it: {result.interpolation}"
+    edges = {name: len(mission.formation_edges(name)) for name in mission.formations}
+    held = ", ".join(f"{name} ({n} edges)" for name, n in edges.items() if n)
     fastest = result.extreme("speed")
-    ends = f"They reach up to {value(float(np.nanmax(z)), 'm')}"
+    ends = f"They reach up to {value(float(np.nanmax(result.position[..., 2])), 'm')}"
     ends += "" if fastest is None else f" and {value(fastest.value, 'm/s')}"
-    return [f"{vehicles} for {lasting}{what}.", f"{ends}."]
+    ends += f". Distances are held in {held}" * bool(held)
+    number = "One vehicle flies" if result.n_agents == 1 else f"{result.n_agents:,} vehicles fly"
+    return [f"{number}{how}.", f"{ends}."]
 
 
 def _proofs(result: Result, verdict: Verdict) -> list[str]:
-    """The least of the plan's certificates, and how many checks of the flight hold, at all times."""
+    """The least of the plan's certificates, and how many checks of the flight are judged at all times."""
+    judged = [check.at_samples for check in verdict.checks if check.judged]
+    known = f"{judged.count(False)} of {len(judged)} checks are judged at all times, not at samples alone."
     proofs = [phase.planned for phase in result.phases if phase.planned is not None]
-    lines = []
-    if proofs:
-        least = min(proofs, key=lambda x: x["separation"])
-        who = agent_names(sorted(least["agents"]))
-        lines.append(
-            f"The plan keeps {value(least['separation'], 'm')} between surfaces, proved for {len(proofs)} of"
-            f" {len(result.phases)} phases; {who} come nearest, at {least['time']:.2f} s."
-        )
-    judged = [check for check in verdict.checks if check.judged]
-    failed = sum(not check.passed for check in judged)
-    words = f"{failed} of {len(judged)} checks fail" if failed else all_hold(len(judged))
-    known = sum(not check.at_samples for check in judged)
-    how = "all of them" if known == len(judged) else f"{known} of them"
-    words = f"{words[0].upper()}{words[1:]}; {how} are judged at all times, not at samples alone."
-    return [*lines, words]
+    if not proofs:
+        return [known]
+    least = min(proofs, key=lambda x: x["separation"])
+    return [
+        f"The plan keeps {value(least['separation'], 'm')} between surfaces, proved for {len(proofs)} of"
+        f" {len(result.phases)} phases; {agent_names(sorted(least['agents']))} come nearest, at {least['time']:.2f} s.",
+        known,
+    ]
 
 
 def _falls(result: Result, falls: Floats) -> list[str]:
@@ -102,19 +99,16 @@ def _falls(result: Result, falls: Floats) -> list[str]:
     ]
 
 
-def _digests(result: Result) -> list[str]:
+def digests(result: Result) -> list[str]:
+    """Versions, what the flight took to compute, and digests of its mission, of files and of what was flown."""
     versions = ", ".join(f"{name} {version}" for name, version in result.versions.items())
-    about = result.mission.about.replace("# ", "").splitlines()
-    digest = sha256(result.mission_text.encode()).hexdigest()
     states = sha256(np.ascontiguousarray(result.position).tobytes()).hexdigest()
+    known, steps = result.statistics, ""
+    if {"steps", "rtol", "atol"} <= known.keys():
+        steps = f", in {known['steps']:,} steps at tolerances of {known['rtol']:g} and {known['atol']:g}"
     return [
-        f"{versions}; made {result.created.replace('T', ' ').replace('+00:00', ' UTC')}.",
-        f"Mission file, SHA-256 {digest}",
+        f"{versions}, on {result.platform}; made {result.created[:19].replace('T', ' ')} UTC{steps}.",
+        f"Mission file, SHA-256 {result.mission.digest}",
         f"Positions flown, SHA-256 {states}",
-        *about,
+        *result.mission.about.replace("# ", "").splitlines(),
     ]
-
-
-def sketch(result: Result, falls: Floats) -> bytes:
-    """The ground from above with fences, people, and where vehicles fly and fall, as an SVG."""
-    return encode_figure(areas.sketch(result, falls), ["svg"])["svg"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from base64 import b64encode
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,8 @@ from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
 from rigidfleet._common.text import all_hold
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
-from rigidfleet.plotting.areas import falls_of
+from rigidfleet.plotting import encode_figure
+from rigidfleet.plotting.areas import falls_of, sketch
 from rigidfleet.plotting.quadrotors import (
     has_rotors,
     rotor_forces,
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
 _VEHICLES = 24
 #: Greatest number of differing mission keys that are shown.
 _KEYS = 40
-#: Relative difference below which numbers count as the same.
-_SAME = 1e-3
 
 
 def contents(
@@ -71,7 +69,7 @@ def contents(
     if not several:
         falls = falls_of(flights[0])
         first["brief"] = brief.rows(flights[0], judged[0], falls, **more)
-        first["sketch"] = _data_url(brief.sketch(flights[0], falls))
+        first["sketch"] = _data_url(encode_figure(sketch(flights[0], falls), ["svg"])["svg"])
     return {
         "title": " · ".join(names),
         "several": several,
@@ -93,13 +91,10 @@ def contents(
 def _names_of(flights: Sequence[Result]) -> list[str]:
     """Names of the missions, numbered if a name occurs twice."""
     names = [flight.mission.name for flight in flights]
-    count = Counter(names)
-    seen: Counter[str] = Counter()
-    numbered = []
-    for name in names:
-        seen[name] += 1
-        numbered.append(f"{name} ({seen[name]})" if count[name] > 1 else name)
-    return numbered
+    return [
+        f"{name} ({names[:k].count(name)})" if names.count(name) > 1 else name
+        for k, name in enumerate(names, start=1)
+    ]
 
 
 # -- one flight --------------------------------------------------------------------------------------
@@ -117,26 +112,22 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "source": mission.source,
         "passed": verdict.passed,
         "word": verdict.word,
-        "head": _head(
-            len(judged), len(failed), "undecided" if verdict.word == "undecided" else "failed"
-        ),
+        "head": f"{len(failed)} of {len(judged)} checks {verdict.word}"
+        if failed
+        else all_hold(len(judged)),
         "words": [f.message for f in (*verdict.failures, *verdict.open_checks)]
         or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
-        "facts": _facts(result),
+        "plan": brief.plan(result),
         "phases": mission.phase_table,
         "checks": [part for part in verdict.facts().shown if isinstance(part, FactTable)],
         "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
         "gains": _gains_table(result),
-        "versions": _versions(result),
+        "digests": brief.digests(result),
         "text": result.mission_text,
     }
-
-
-def _head(judged: int, failed: int, word: str) -> str:
-    return f"{failed} of {judged} checks {word}" if failed else all_hold(judged)
 
 
 def _covers(flights: Sequence[Result]) -> str:
@@ -152,35 +143,6 @@ def _covers(flights: Sequence[Result]) -> str:
     return (
         "This is a simulation: vehicles are point masses that produce any thrust vector instantly."
     )
-
-
-def _facts(result: Result) -> list[tuple[str, str]]:
-    mission = result.mission
-    mass = sorted(set(mission.agents.mass))
-    masses = f"{mass[0]:.4g} kg" if len(mass) == 1 else f"{mass[0]:.4g} to {mass[-1]:.4g} kg"
-    counts = {name: len(mission.formation_edges(name)) for name in mission.formations}
-    forms = [f"{name} ({n} edges)" if n else name for name, n in counts.items()]
-    made = result.created.replace("T", " ").replace("+00:00", " UTC")
-    if result.interpolation is not None:
-        return [
-            ("vehicles", f"{result.n_agents}"),
-            ("duration", f"{result.time[-1] - result.time[0]:.4g} s"),
-            ("curve", result.interpolation),
-            ("read", made),
-        ]
-    return [
-        ("vehicles", f"{result.n_agents}, {masses}{_models(mission)}"),
-        ("formations", ", ".join(forms) or "none"),
-        ("control", mission.architecture),
-        ("duration", f"{result.time[-1]:.4g} s, {len(result.phases)} phases"),
-        ("judged" if "doubt" in result.statistics else "simulated", made),
-    ]
-
-
-def _models(mission: Mission) -> str:
-    """Models of vehicles with their number; "" for points."""
-    count = Counter(mission.vehicles[name].model for name in mission.agents.vehicle)
-    return ": " * bool(count) + ", ".join(f"{n} × {name}" for name, n in count.items())
 
 
 def _gains_table(result: Result) -> FactTable | None:
@@ -233,21 +195,6 @@ def _vehicles_table(result: Result) -> FactTable:
     return FactTable(("agent", *columns), rows)
 
 
-def _versions(result: Result) -> list[tuple[str, str]]:
-    known = result.statistics
-    rows = [*result.versions.items(), ("platform", result.platform)]
-    for name, key, form in (
-        ("integrator steps", "steps", "{}"),
-        ("rejected steps", "rejected", "{}"),
-        ("relative tolerance", "rtol", "{:g}"),
-        ("absolute tolerance", "atol", "{:g}"),
-        ("computing time", "wall_s", "{:.3g} s"),
-    ):
-        if known.get(key) is not None:
-            rows.append((name, form.format(known[key])))
-    return rows
-
-
 # -- safety table -----------------------------------------------------------------------------------
 
 
@@ -292,7 +239,8 @@ def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
     when = f"{worst.when:.2f} s" + ", at samples" * worst.at_samples
     margin, at = Cell(left, share=row.used), Cell(when, worst.phase)
-    return row.fact.bound, value(worst.value, row.unit), margin, at, worst.who
+    size = Cell(value(worst.value, row.unit), row.fact.doubt)
+    return row.fact.bound, size, margin, at, worst.who
 
 
 def _safety_cell(name: str, row: Safety | None) -> Cell:
@@ -343,15 +291,9 @@ def _mean_thrust(result: Result) -> float | None:
     return float(np.trapezoid(mean, result.time)) / length
 
 
-def _are_close(a: float | None, b: float | None) -> bool:
-    if a is None or b is None:
-        return a is b
-    return math.isclose(a, b, rel_tol=_SAME, abs_tol=1e-9)
-
-
 def _change(first: float | None, x: float | None) -> str:
     """Change of a number from that of the first flight, if it is meaningful."""
-    if first is None or x is None or _are_close(first, x) or abs(first) < 1e-6:
+    if first is None or x is None or abs(first) < 1e-6:
         return ""
     percent = 100 * (x - first) / abs(first)
     if abs(percent) >= 300:

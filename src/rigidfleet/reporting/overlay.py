@@ -14,13 +14,10 @@ from rigidfleet.reporting import gains
 from rigidfleet.result.quantities import samples
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from rigidfleet.mission import Mission
     from rigidfleet.result import Result
-
-Floats = st.Floats
 
 _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
 
@@ -51,15 +48,16 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         fig = st.blank_figure(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
         for ax, name in zip(axes, panels, strict=False):
-            known = [
-                _panel(ax, flight, samples(flight, name).worst, look)
-                for flight, look in zip(flights, _looks(flights), strict=True)
-            ]
+            known = False
+            for flight, look in zip(flights, _looks(flights), strict=True):
+                values = samples(flight, name).worst
+                st.draw_line(ax, flight.time, values, **look)
+                known |= bool(np.isfinite(values).any())
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
             ax.set_title(
                 f"{'least' if q.at_least else 'greatest'} {q.name_in_words} [{display_unit(q.unit)}]"
             )
-            if not any(known):
+            if not known:
                 st.write_note(ax, "nothing to show")
             elif logarithmic:
                 ax.set_yscale("log", nonpositive="clip")
@@ -94,12 +92,6 @@ def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None
         if len(missions) > 1:
             _key(fig, missions, labels)
         return _svg(fig)
-
-
-def _panel(ax: Axes, flight: Result, values: Floats, look: dict[str, Any]) -> bool:
-    """Draw one flight's line; return whether there was anything to draw."""
-    st.draw_line(ax, flight.time, values, **look)
-    return bool(np.isfinite(values).any())
 
 
 def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:

@@ -9,7 +9,6 @@ drops the least useful of all candidates, and then exchanges edges as long as th
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable
 from itertools import combinations
 from typing import Literal
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 from rigidfleet._common.arguments import numbers
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
-from rigidfleet.formation.graphs import complete_graph, henneberg, henneberg_multilevel, neighbours
+from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.products import product_in_blocks
 from rigidfleet.rigidity import full_rank, jacobian, rigid_motions
 from rigidfleet.rigidity.analysis import as_framework, flatten
@@ -128,22 +127,13 @@ def limits(slots: ArrayLike) -> str:
     )
 
 
-#: Graphs with a name in missions, made from slots (N, 3) and, for neighbours, their reach in spacings.
-GRAPHS: dict[str, Callable[[Floats, float], Ints]] = {
-    "complete": lambda p, _: complete_graph(len(p)),
-    "neighbours": neighbours,
-    "henneberg": lambda p, _: henneberg(p),
-    "henneberg-multilevel": lambda p, _: henneberg_multilevel(p),
-}
-
-
 def mission_fragment(
     name: str, slots: ArrayLike, edges: ArrayLike | str, reach: float | None = None
 ) -> str:
     """A formation as a part of a mission file, agents counted from 1.
 
     The name is quoted if TOML requires it. Slots keep all digits, because flat shapes need them. ``edges`` may
-    be one of `GRAPHS`.
+    be one of `formation.graphs.GRAPHS`.
     """
     from rigidfleet._common.toml import toml_key
 

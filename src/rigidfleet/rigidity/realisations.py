@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet.rigidity.analysis import RigidityClass, as_framework, classify, flatten
 from rigidfleet.rigidity.framework import Framework
 from rigidfleet.rigidity.order import STRIDES, align, are_joined
@@ -31,6 +31,7 @@ class Kind(StrEnum):
     COINCIDENT = "coincident"
 
 
+@with_earlier_names(found="starts")
 @dataclass(frozen=True)
 class Realisation:
     """A shape with the given distances.
@@ -54,12 +55,6 @@ class Realisation:
     rigid: bool
     bends: bool = False
 
-    @property
-    def found(self) -> int:
-        """The former name of `starts`."""
-        warnings.warn("Realisation.found is now .starts", DeprecationWarning, stacklevel=2)
-        return self.starts
-
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
         return {
@@ -73,6 +68,7 @@ class Realisation:
         }
 
 
+@with_earlier_names(found="shapes")
 @dataclass(frozen=True)
 class Realisations:
     """Result of a search from many starts.
@@ -88,12 +84,6 @@ class Realisations:
     starts: int
     converged: int
     leads_to: int | None = None
-
-    @property
-    def found(self) -> tuple[Realisation, ...]:
-        """The former name of `shapes`."""
-        warnings.warn("Realisations.found is now .shapes", DeprecationWarning, stacklevel=2)
-        return self.shapes
 
     @property
     def unique(self) -> bool:

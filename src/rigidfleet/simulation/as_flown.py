@@ -66,7 +66,7 @@ def with_phase(
         data["phases"] = []
     data["phases"] = [*data["phases"], dict(table)]
     made = Mission.from_dict(data, "begin()")
-    if not made.phases[-1].spelled:
+    if not made.phases[-1].flown_as_written:
         spread = expand_phases(made, timed_leg)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
@@ -80,7 +80,7 @@ def _check_flown(phase: Phase) -> None:
         problem = "finds its way before the flight, and cannot begin by hand"
         remedy = "use kind 'fly', or put it into the mission"
         raise MissionError([Finding("begin()", "kind", phase.kind, problem, remedy)])
-    if not phase.spelled:
+    if not phase.flown_as_written:
         vertical = phase.vertical
         key = "transition" if vertical is None else "stagger" if vertical.stagger else "places"
         problem = "is flown as several phases, and cannot begin by hand"
@@ -174,7 +174,7 @@ def _phase_table(phase: Phase, record: PhaseRecord) -> dict[str, Any]:
         keys.pop(key, None)
     table: dict[str, Any] = {"kind": record.kind, "name": record.name, "until": record.t_end}
     table = keys | table | {"control": record.control}
-    return table | phase.ended(record.t_end - record.t_start)
+    return table | phase.keys_if_ended(record.t_end - record.t_start)
 
 
 def _formation_table(mission: Mission, name: str) -> dict[str, Any]:

@@ -165,16 +165,12 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         out, r, v = np.zeros(self.size, dtype=np.float32), view.position, view.velocity
         if not math.isnan(view.reference_position[0]):
             out[:3], out[3:_SELF] = r - view.reference_position, v - view.reference_velocity
-        if neighbours := self.neighbours[view.agent]:
-            own, inbox, lengths = np.concatenate([r, v, self.silence]), view.inbox, view.distance
-            heard = [inbox.get(j) for j in neighbours]
-            parts = out[_SELF : _SELF + len(heard) * self.width].reshape(len(heard), self.width)
-            parts[:, :3] = [
-                (1.0, message.age, lengths.get(j, 0.0)) if message else (0.0, 0.0, 0.0)
-                for j, message in zip(neighbours, heard, strict=True)
-            ]
-            said = [message.content if message else own for message in heard]
-            parts[:, 3:] = np.concatenate(said).reshape(len(heard), -1) - own
+        own, row = np.concatenate([r, v, self.silence]), _SELF
+        for j in self.neighbours[view.agent]:
+            if message := view.inbox.get(j):
+                out[row : row + 3] = 1.0, message.age, view.distance.get(j, 0.0)
+                out[row + 3 : row + self.width] = message.content - own
+            row += self.width
         return out
 
     def answer(self, view: View, action: Sequence[float] | Vector) -> tuple[Floats, Floats]:

@@ -112,14 +112,14 @@ class CurveWatch:
             self.solids, corners = join([thing.solid for thing in obstacles]), []
         self.boxes = np.array(corners).reshape(-1, 6)
 
-    def _begin_monitor(self, states: int, gauge: int, steps: int) -> None:
-        """Begin to monitor trails of so many states, forces and steps."""
+    def _begin_monitor(self, states: int, gauge: int) -> None:
+        """Begin to monitor trails of so many states and forces."""
         self.monitor = native.Watch(
             records.monitor(
                 self.radius, self.boxes, self.fence, states, gauge,
                 worst=self.worst, when=self.when, who=self.who, sign=self.sign, left=self.left,
                 standing=self.standing, low=self.low, pad=PAD, altitude=self.altitude, pairs=self.pairs,
-                columns=self.columns, struck=self.struck, listed=np.zeros((2, steps), dtype=np.int64),
+                columns=self.columns, struck=self.struck,
             )
         )  # fmt: skip
 
@@ -133,7 +133,7 @@ class CurveWatch:
         problem = problem._replace(vehicles=problem.vehicles._replace(m=np.ones(self.n)))
         trail = state.trail._replace(clock=clock, points=points)
         if "monitor" not in vars(self):
-            self._begin_monitor(points.shape[2], 0, 0)
+            self._begin_monitor(points.shape[2], 0)
         count = np.zeros_like(state.count)
         count[records.TRAILED] = len(clock)
         self.take_path(problem, work, state._replace(trail=trail, count=count))
@@ -196,7 +196,7 @@ class CurveWatch:
         before = [array.copy() for array in arrays]
         self.worst.fill(-np.inf)  # nothing else is searched for
         self.worst[kind] = -_TOUCH
-        arrays[-1][:] = 0, records.ANY_STEP, records.ANY_STEP
+        arrays[-1][:] = 0
         self._take_solids(problem, state, 0, len(steps[0]))
         self.monitor.distances(problem, state, 0, len(steps[0]))
         contact = self._extremum(kind) if self.worst[kind] < -_TOUCH else None
@@ -224,9 +224,8 @@ class CurveWatch:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
         none = self.none.tolist()
-        new = tuple.__new__  # an extremum by its own name takes twice as long
         extremes = {
-            name: new(Extremum, (sign * worst[k], when[k], *who[k]))
+            name: Extremum(sign * worst[k], when[k], *who[k])
             for name, k, sign in _STORED
             if -math.inf < worst[k] < none[k]
         }
@@ -403,8 +402,7 @@ class Extremes(CurveWatch):
             trail = records.trail(size[1], self.n, edges, self.directed)
             self.state = state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
             self.size = size
-            steps, gauge = state.trail.gauge.shape
-            self._begin_monitor(size[1], gauge, steps)
+            self._begin_monitor(size[1], state.trail.gauge.shape[1])
             if aside:
                 # Memory costs far more time when it is first touched than ever after. The rows that the integrator
                 # reaches after it has handed over steps are touched while it flies these.
@@ -445,8 +443,8 @@ class Extremes(CurveWatch):
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        count, steps = self.monitor.monitor.count, int(state.count[records.TRAILED])
-        first, listed = int(count[records.STAYED]), int(count[records.LISTED_DISTANCES])
+        first = int(self.monitor.monitor.count[records.STAYED])
+        steps = int(state.count[records.TRAILED])
         self._take_solids(problem, state, first, steps)
         self._take_boundaries(problem, state, first, steps)
         if self.n > _FEW:
@@ -454,8 +452,7 @@ class Extremes(CurveWatch):
                 self._step(problem, work, state, step)
         else:
             self.monitor.distances(problem, state, first, steps)
-        some = np.arange(first, steps) if listed < 0 else self.monitor.monitor.listed[0, :listed]
-        self._find_contacts(problem, work, state, some)
+        self._find_contacts(problem, work, state, np.arange(first, steps))
         self.monitor.forces(problem, work, state, last=last)
 
     def room(self, state: records.IntegratorState) -> int:

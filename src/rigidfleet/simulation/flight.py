@@ -272,7 +272,7 @@ class Flight:
         self._unproved = ""  # why no way home is proved, after an abort
         self._plans: list[
             PhasePlan
-        ] = []  # of the phases begun, if an abort may have to follow them
+        ] = []  # of the phases begun, if the flight may have to leave them
         self._started = self._reported = clock.perf_counter()
         self._count = np.zeros(3, dtype=np.int64)
         self._solves: dict[str, Counts] = {}
@@ -388,7 +388,7 @@ class Flight:
             self.ending = str(stop)
             return False
         self._asked.append(phase)
-        if self.mission.aborts:
+        if self.mission.abandons_at < math.inf:
             self._plans.append(plan)
         # Nobody asks a controller of the user's to follow the plan.
         record = PhaseRecord(
@@ -649,18 +649,20 @@ class Flight:
         if lost.any():
             self._extremes.lose(lost)
             self._now.lost = lost
-        plan: list[Leg] = []
-        if self.mission.aborts:  # along the plan, which goes on beyond the phase under way
-            for leg, record in zip(self._plans, self.phases, strict=True):
-                end = max(leg.end, record.t_end) if record.abandoned else record.t_end
-                plan.append(copy_with(leg, end=end))
-            k = self._following
-            plan += legs_from(self.mission, plan[-1].state_at(plan[-1].end), self._route[k:], k)
-        legs, self._unproved = answer_to(self.mission, self._now, plan)
+        legs, self._unproved = answer_to(self.mission, self._now, self._whole_plan)
         if legs:
             self._reached = legs[0].before
         self._route = [*self._asked, *(leg.phase for leg in legs)]
         self._following = len(self._asked)
+
+    def _whole_plan(self) -> list[Leg]:
+        """The legs of the phases begun, and of those of the route that were to follow."""
+        plan: list[Leg] = []
+        for leg, record in zip(self._plans, self.phases, strict=True):
+            end = max(leg.end, record.t_end) if record.abandoned else record.t_end
+            plan.append(copy_with(leg, end=end))
+        k = self._following
+        return plan + legs_from(self.mission, plan[-1].state_at(plan[-1].end), self._route[k:], k)
 
     def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:
         """End the phase under way.

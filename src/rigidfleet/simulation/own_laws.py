@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -69,6 +70,7 @@ class View:
 
 #: A law returns the force (3,) [N] of its vehicle, weight included, and what it says to its neighbours; None: nothing.
 Law = Callable[[View], tuple[ArrayLike, Any]]
+_FORCE = "return a force (3,) [N], weight included, and a message"
 
 
 class OwnLaws:
@@ -90,9 +92,8 @@ class OwnLaws:
         self.said: deque[list[Any]] = deque(maxlen=(net.delay + net.jitter) // flight.every + 2)
         #: Of each link, the tick at which the newest message was written, and what it says.
         self.newest: list[tuple[int, Any]] = [(-1, None)] * len(pairs)
-        #: Lengths of each vehicle's edges [m] and their rates [m/s], by neighbour.
-        self.distances: list[dict[int, float]] = [{} for _ in range(n)]
-        self.distance_rates: list[dict[int, float]] = [{} for _ in range(n)]
+        #: Length that the edge of each link is to have [m], and its rate [m/s]: (2, L).
+        self.lengths = np.zeros((2, len(pairs)))
         #: The views last made, with their tick and problem: who looks before the flight asks has the same ones.
         self.last: tuple[int, Problem, list[View | None]] | None = None
         self.numbers = 0  # in the longest message
@@ -107,119 +108,90 @@ class OwnLaws:
         FlightError
             A law raised an exception, or did not return a force and a message. It names the vehicle and the tick.
         """
-        answers: list[Any] = []
-        for view in self.views(phase, problem, w, flight, state):
+        said: list[Any] = [None] * len(self.laws)
+        for i, view in enumerate(self.views(phase, problem, w, flight, state)):
+            if view is None:
+                continue
             try:
-                answers.append(view and self.laws[view.agent](view))
+                answer = self.laws[i](view)
             except Exception as error:
-                assert view is not None
-                words = f"raised {type(error).__name__}", f": {error}"
-                raise self._failure(view.agent, *words, state) from error
-        self.take(answers, flight, state)
-
-    def views(
-        self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
-    ) -> list[View | None]:
-        """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
-        k, S, tracks = int(state.count[TICKS]), state.S, problem.control.kind == TRACKING
-        if self.last is not None and self.last[0] == k and self.last[1] is problem:
-            return self.last[2]
-        t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
-        self._open(k, state.mail.stamp.tolist())
-        np.maximum(
-            state.mail.oldest,
-            k - state.mail.stamp,
-            out=state.mail.oldest,
-            where=state.mail.stamp >= 0,
-        )
-        slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
-        known = np.stack([w.r, w.v, *slots])
-        masses, lost = problem.vehicles.m.tolist(), flight.vehicles.lost.tolist()
-        self._take_lengths(state.mail.edge.tolist(), w.d.tolist(), w.d_dot.tolist())
-        views: list[View | None] = []
-        for i, links in enumerate(self.links):
-            if lost[i]:
-                views.append(None)
-                continue
-            r, v, r_ref, v_ref, a_ref = known[:, i].copy()
-            rotors = () if self.points[i] else np.split(S[i, 6:].copy(), (4, 7))
-            heard = [(j, *self.newest[l]) for l, j in links if self.newest[l][0] >= 0]
-            views.append(
-                View(
-                    i, t, dt, phase, masses[i], g, r, v, r_ref, v_ref, a_ref,
-                    self.distances[i].copy(), self.distance_rates[i].copy(),
-                    {j: Message(content, (k - written) * self.tick) for j, written, content in heard},
-                    self.memories[i], *rotors,
-                )
-            )  # fmt: skip
-        self.last = k, problem, views
-        return views
-
-    def take(self, answers: Sequence[Any], flight: SampledFlight, state: SampledState) -> None:
-        """Take forces and messages of all vehicles for the tick that comes; nothing of those that are lost."""
-        said: list[Any] = []
-        for i, answer in enumerate(answers):
-            if flight.vehicles.lost[i]:
-                said.append(None)
-                continue
+                raise self._failure(
+                    i, f"raised {type(error).__name__}", str(error), state
+                ) from error
             try:
                 force, message = answer
             except (TypeError, ValueError):
-                words = f"returned {answer!r}", ": return a force (3,) [N] and a message"
-                raise self._failure(i, *words, state) from None
+                more = "return a force (3,) [N] and a message"
+                raise self._failure(i, f"returned {answer!r}", more, state) from None
             state.f_u[i] = self._force(i, force, state)
             try:
-                content, numbers = (None, 0) if message is None else plain_copy(message)
+                said[i], numbers = (None, 0) if message is None else plain_copy(message)
             except TypeError as error:
-                remedy = f": it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
+                remedy = f"it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
                 raise self._failure(
                     i, "returned a message that cannot be sent", remedy, state
                 ) from None
             self.numbers = max(self.numbers, numbers)
             state.mail.mute[i] = message is None
-            said.append(content)
         self.said.append(said)
         state.count[ANSWERED] = state.count[TICKS] + 1
 
-    def _open(self, k: int, stamps: Sequence[int]) -> None:
-        """Take over what was heard until tick k; a message is sent at the tick that is its stamp, or again then."""
-        now = k // self.every
-        for links in self.links:
+    def views(
+        self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
+    ) -> list[View | None]:
+        """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
+        k, mail = int(state.count[TICKS]), state.mail
+        if self.last is not None and self.last[0] == k and self.last[1] is problem:
+            return self.last[2]
+        t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
+        has_heard = mail.stamp >= 0
+        mail.oldest[has_heard] = np.maximum(mail.oldest, k - mail.stamp)[has_heard]
+        # An edge that has lost its other end keeps its last length, as nobody has told.
+        has_edge, held = (mail.edge != NONE).tolist(), mail.edge >= 0
+        self.lengths[:, held] = w.d[mail.edge[held]], w.d_dot[mail.edge[held]]
+        (d, d_dot), stamps = self.lengths.tolist(), mail.stamp.tolist()
+        tracks = problem.control.kind == TRACKING
+        slots = [w.r_ref, w.v_ref, w.a_ref] if tracks else [np.full_like(w.r, np.nan)] * 3
+        known, masses = np.stack([w.r, w.v, *slots], axis=1), problem.vehicles.m.tolist()
+        views: list[View | None] = [None] * len(masses)
+        for i in np.flatnonzero(~flight.vehicles.lost).tolist():
+            links, inbox = self.links[i], {}
             for l, j in links:
-                written = stamps[l] // self.every
-                if stamps[l] >= 0 and written * self.every > self.newest[l][0]:
-                    self.newest[l] = written * self.every, self.said[written - now][j]
-
-    def _take_lengths(
-        self, edges: Sequence[int], d: Sequence[float], d_dot: Sequence[float]
-    ) -> None:
-        """Lengths of the phase's edges; what has lost its other end keeps its last one, as nobody has told."""
-        for own, rates, links in zip(self.distances, self.distance_rates, self.links, strict=True):
-            for l, j in links:
-                if (c := edges[l]) >= 0:
-                    own[j], rates[j] = d[c], d_dot[c]
-                elif c == NONE:
-                    own.pop(j, None), rates.pop(j, None)
+                # A message is sent at the tick that is its stamp: it says what was said last then.
+                asked, (written, content) = stamps[l] // self.every, self.newest[l]
+                if asked * self.every > written:
+                    written, content = asked * self.every, self.said[asked - k // self.every][j]
+                    self.newest[l] = written, content
+                if written >= 0:
+                    inbox[j] = Message(content, (k - written) * self.tick)
+            rotors = () if self.points[i] else np.split(state.S[i, 6:].copy(), (4, 7))
+            r, v, r_ref, v_ref, a_ref = known[i].copy()
+            views[i] = View(
+                i, t, dt, phase, masses[i], g, r, v, r_ref, v_ref, a_ref, {j: d[l] for l, j in links if has_edge[l]},
+                {j: d_dot[l] for l, j in links if has_edge[l]}, inbox, self.memories[i], *rotors,
+            )  # fmt: skip
+        self.last = k, problem, views
+        return views
 
     def _force(self, i: int, force: ArrayLike, state: SampledState) -> Floats:
-        remedy = ": return a force (3,) [N], weight included, and a message"
         try:
             f = np.array(force)
-            f = f if f.dtype.kind in "biuf" else None
         except (TypeError, ValueError):
-            f = None
-        if f is None:
-            raise self._failure(i, f"returned the force {force!r}", remedy, state)
-        if f.shape != (3,):
-            raise self._failure(i, f"returned a force of shape {f.shape}", remedy, state)
-        if not np.isfinite(f).all():
-            raise self._failure(i, "returned a force that is not finite", f": {f.tolist()}", state)
-        return f
+            f = np.array(None)
+        if f.dtype.kind not in "biuf":
+            what, more = f"the force {force!r}", _FORCE
+        elif f.shape != (3,):
+            what, more = f"a force of shape {f.shape}", _FORCE
+        elif not all(map(math.isfinite, f.tolist())):
+            what, more = "a force that is not finite", str(f.tolist())
+        else:
+            return f
+        raise self._failure(i, f"returned {what}", more, state)
 
     def _failure(self, i: int, what: str, more: str, state: SampledState) -> FlightError:
         k = int(state.count[TICKS])
         return FlightError(
-            f"the law of agent {i + 1} {what} at tick {k}, t = {k * self.tick:.3f} s{more}"
+            f"the law of agent {i + 1} {what} at tick {k}, t = {k * self.tick:.3f} s: {more}"
         )
 
 
@@ -235,10 +207,8 @@ def plain_copy(x: Any) -> tuple[Any, int]:
         y = x.copy()
         y.flags.writeable = False
         return y, y.size
-    if isinstance(x, int | float):
-        return x, 1
-    if isinstance(x, np.floating | np.integer | np.bool_):
-        return x.item(), 1
+    if isinstance(x, int | float | np.floating | np.integer | np.bool_):
+        return x.item() if isinstance(x, np.generic) else x, 1
     if isinstance(x, tuple | list):
         parts = [plain_copy(part) for part in x]
         return tuple(part for part, _ in parts), sum(size for _, size in parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -44,10 +44,6 @@ _SINGULAR = 400
 #: Greatest work for singular values in a phase, as (size of J)^3 times samples (some tenths of a second), and least
 #: number of samples.
 _WORK, _LEAST = 400_000_000, 9
-
-
-#: Agents whose vectors are turned at a time.
-_AT_ONCE = 4096
 
 #: Columns of a record that are those of the phase, also where a user's controller flies.
 _REFERENCES = "r_ref", "p", "motion", "rates", "T_ref", "wrench"
@@ -113,14 +109,12 @@ class Unevaluated(NamedTuple):
     def evaluate(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
         out = recorder(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
-        self.evaluate_into(native.pack_anew(out), 0, times, work, native.pack(self.problem))
+        self.evaluate_into(native.pack_anew(out), 0, times, work)
         return out
 
-    def evaluate_into(
-        self, out: native.Packed, first: int, times: Floats, work: Workspace, problem: native.Packed
-    ) -> None:
-        """Write them into a record from row ``first`` on; it and the ``problem`` as flown are packed."""
-        native.record_into(out, first, problem, work, times, self.y)
+    def evaluate_into(self, out: native.Packed, first: int, times: Floats, work: Workspace) -> None:
+        """Write them into a packed record from row ``first`` on."""
+        native.record_into(out, first, native.pack_anew(self.problem), work, times, self.y)
         if self.problem is not self.planned:
             of_phase = native.record(self.planned, work, times, self.y)
             for name in _REFERENCES:
@@ -128,15 +122,8 @@ class Unevaluated(NamedTuple):
 
 
 def _in_world(x: Floats, T: Floats, origin: Floats) -> Floats:
-    """origin + T^T x of vectors x (K, N, 3) in body axes, world -> body T (K, 3, 3), and origin (K, 3).
-
-    Of some agents at a time: what is between stays in the cache, and no threads are started for so little.
-    """
-    out = np.empty(x.shape)
-    for k in range(0, x.shape[1], _AT_ONCE):
-        part = slice(k, k + _AT_ONCE)
-        np.add(origin[:, None], x[:, part] @ T, out=out[:, part])
-    return out
+    """origin + T^T x of vectors x (K, N, 3) in body axes, world -> body T (K, 3, 3), and origin (K, 3)."""
+    return origin[:, None] + x @ T
 
 
 @dataclass
@@ -153,12 +140,6 @@ class Piece:
     followed: FollowedReferences  # what the slots follow, if they are tracked
     vehicles: VehicleSamples | None = None
     layers: LayerSamples | None = None
-    #: The problem as flown, packed while it is at hand; None of a large formation, and where nothing is left to do.
-    _problem: native.Packed | None = field(init=False, default=None)
-
-    def __post_init__(self) -> None:
-        if isinstance(self.source, Unevaluated) and self.source.setup is None:
-            self._problem = native.pack(self.source.problem)
 
     @cached_property
     def record(self) -> Record:
@@ -182,16 +163,12 @@ class Piece:
             planned = solved_by(solver, source.planned)
             own = source.problem is source.planned
             problem = planned if own else solved_by(solver, source.problem)
-            renewed, words = (
-                source._replace(problem=problem, planned=planned),
-                native.pack(problem),
-            )
-            renewed.evaluate_into(out, first, self.time, solver.workspace, words)
+            renewed = source._replace(problem=problem, planned=planned)
+            renewed.evaluate_into(out, first, self.time, solver.workspace)
             solver.check()
         else:
-            assert self._problem is not None
             work = small_workspace(source.planned)
-            source.evaluate_into(out, first, self.time, work, self._problem)
+            source.evaluate_into(out, first, self.time, work)
             give_back(source.planned, work)
 
 

@@ -19,12 +19,15 @@ from rigidfleet.simulation.flight import Flight, simulate
 from rigidfleet.simulation.point_phase import PointPhase
 
 if TYPE_CHECKING:
-    from rigidfleet.kernel.engine.batch import Vector  # imports the compiler
+    from rigidfleet.kernel.engine import batch  # imports the compiler
 
 T = TypeVar("T")
 
 #: Number of missions of a vector.
 WIDTH = 8
+#: Greatest number of vehicles in a vector: straight-line code of more takes longer to compile than it gains, and of a
+#: thousand minutes and gigabytes.
+MOST_VEHICLES = 60
 #: Greatest number of common steps between two looks at Ctrl-C.
 _STEPS = 2000
 
@@ -32,17 +35,19 @@ _STEPS = 2000
 def simulate_together(missions: Sequence[Mission]) -> list[Result]:
     """Fly at most eight missions side by side, each as by `simulate`; return their records.
 
-    A flight's last bits depend on the others. If a step of the common ones fails, each mission is flown alone.
+    A flight's last bits depend on the others. If a step of the common ones fails, each mission is flown alone; so it is
+    with more than `MOST_VEHICLES`.
 
     Raises
     ------
     MissionError
         A mission has errors.
     """
-    if len({mission.output_step for mission in missions}) > 1:
+    many = any(mission.n_agents > MOST_VEHICLES for mission in missions)
+    if many or len({mission.output_step for mission in missions}) > 1:
         return [simulate(mission) for mission in missions]
     flights = [Flight(mission) for mission in missions]
-    vector: Vector | None = None
+    vector: batch.Vector | None = None
     while True:
         going = [flight.begin() for flight in flights]
         if not any(going):
@@ -50,7 +55,10 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
         steppers = [x.stepper for x in active if isinstance(x.stepper, PointPhase)]
         if all(going) and len(steppers) == len(active) and _alike(active):
-            vector = vector or _vector(active)
+            if vector is None:
+                from rigidfleet.kernel.engine import batch
+
+                vector = batch.Vector(_fill_lanes([x.plan.problem.disturbance for x in active]))
             if not _fly(steppers, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
@@ -88,17 +96,10 @@ def _kind(phase: ActivePhase) -> tuple[object, ...]:
     plan, extremes = phase.plan, phase.extremes
     points = tuple(at["time"] for at in plan.through)
     times = plan.start, plan.t_end, plan.arrival, points
-    return *times, plan.integrator.rtol, len(phase.state.y), len(extremes.boxes)
+    return *times, plan.integrator.rtol, len(phase.state.y), extremes.directed
 
 
-def _vector(active: Sequence[ActivePhase]) -> Vector:
-    """A vector for flights whose first phases these are."""
-    from rigidfleet.kernel.engine import batch
-
-    return batch.Vector(_fill_lanes([phase.plan.problem.disturbance for phase in active]))
-
-
-def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
+def _fly(steppers: Sequence[PointPhase], vector: batch.Vector) -> bool:
     """Fly phases to their end in common steps and record them; return whether they came there."""
     from rigidfleet.kernel.engine.tracer import UnfitError
 
@@ -110,7 +111,6 @@ def _fly(steppers: Sequence[PointPhase], vector: Vector) -> bool:
         vector.begin(
             _fill_lanes([stretch.problem for stretch in stretches]),
             _fill_lanes([phase.state for phase in active]),
-            _fill_lanes([phase.extremes.monitor.monitor for phase in active]),
             t_end,
             times,
             _fill_lanes([stretch.samples for stretch in stretches]),

@@ -2,7 +2,7 @@
 
 Every function takes coordinates x, y, z that are numbers, or arrays of one shape. NumPy runs it on arrays. The kernel
 compiles the same source for numbers (`rigidfleet.kernel.compiler.elementwise`), so there is one distance in plan,
-flight and verdict. What differs between numbers and arrays is in `choose`, `some`, `floor` and `zero`.
+flight and verdict. What differs between numbers and arrays is in `choose`, `some` and `floor`.
 
 Points are in the solid's own axes, unless a docstring says otherwise.
 """
@@ -10,13 +10,11 @@ Points are in the solid's own axes, unless a docstring says otherwise.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from rigidfleet.solids.records import CYLINDER, HEIGHTS, ROUNDED
-from rigidfleet.typing import Floats
 
 #: A number [m], or an array of them.
 Numbers = Any
@@ -37,38 +35,21 @@ def floor(x: Numbers) -> Any:
     return np.floor(x).astype(np.int64)
 
 
-def zero(x: Numbers) -> Any:
-    """Zero: as zeros of the same shape if there are few, with which NumPy compares in half the time."""
-    return _zeros(np.shape(x)) if np.size(x) <= _FEW else 0.0
-
-
-@lru_cache(4)
-def _zeros(shape: tuple[int, ...]) -> Floats:
-    """Zeros that nobody writes to."""
-    zeros = np.zeros(shape)
-    zeros.flags.writeable = False
-    return zeros
-
-
-#: Greatest number of zeros: more would not stay in the processor's cache.
-_FEW = 100_000
-
 # -- boxes, balls, half spaces -------------------------------------------------------------------------
 
 
 def from_box(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Numbers:
     """Signed distance [m] from a box (6,), which may be infinite in both x and y."""
-    none = zero(z)
     inside = np.maximum(box[2] - z, z - box[5])  # positive outside
-    beyond = np.maximum(inside, none)
+    beyond = np.maximum(inside, 0.0)
     outside = beyond * beyond
     if box[0] > -math.inf or box[3] < math.inf:
         a = np.maximum(box[0] - x, x - box[3])
         b = np.maximum(box[1] - y, y - box[4])
         inside = np.maximum(np.maximum(a, b), inside)
-        a, b = np.maximum(a, none), np.maximum(b, none)
+        a, b = np.maximum(a, 0.0), np.maximum(b, 0.0)
         outside = a * a + b * b + outside
-    return np.sqrt(outside) + np.minimum(inside, none)
+    return np.sqrt(outside) + np.minimum(inside, 0.0)
 
 
 def box_normal(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Any:

@@ -42,16 +42,8 @@ class Region(NamedTuple):
     def across(self, x: Floats) -> Floats:
         """Signed distance (M,) [m] of points (M, 2) from the area as seen from above: negative inside."""
         some = max(1, _TOGETHER // len(self.edges))
-        parts = [x[k : k + some] for k in range(0, len(x), some)]
-        return np.concatenate(
-            [np.zeros(0), *(self._distance(self._off(part), part) for part in parts)]
-        )
-
-    def beyond(self, r: Floats) -> Floats:
-        """Signed distance (M,) [m] of points (M, 3): negative inside."""
-        return corner(
-            self.across(r[:, :2]), np.maximum(self.floor - r[:, 2], r[:, 2] - self.ceiling)
-        )
+        parts = np.split(x, range(some, len(x), some))
+        return np.concatenate([self._distance(self._off(part), part) for part in parts])
 
     def most(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
@@ -124,8 +116,8 @@ def middle(points: Floats) -> Floats:
     return points @ weights
 
 
-def crossing(edges: Floats) -> tuple[int, int] | None:
-    """Two edges of (E, 2, 2) that cross, or overlap, at more than an end that they share; None if no two do."""
+def some_cross(edges: Floats) -> bool:
+    """Whether two of the edges (E, 2, 2) cross, or overlap, at more than an end that they share."""
     a, b = edges[:, 0], edges[:, 1]
 
     def turn(p: Floats, q: Floats, r: Floats) -> Floats:
@@ -144,5 +136,5 @@ def crossing(edges: Floats) -> tuple[int, int] | None:
         overlap = np.minimum(spans[1], 1.0) - np.maximum(spans[0], 0.0) > 1e-9
         crossed |= (one == 0.0) & (other == 0.0) & overlap
         if crossed.any():
-            return k, k + 1 + int(crossed.argmax())
-    return None
+            return True
+    return False

@@ -27,7 +27,7 @@ from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown_key
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.text import parse_toml, read_text
-from rigidfleet.mission.values import Part
+from rigidfleet.mission.values import Part, key
 from rigidfleet.sweep import controllers, faults, keypaths
 from rigidfleet.sweep.faults import Drill
 from rigidfleet.sweep.variation import (
@@ -38,8 +38,6 @@ from rigidfleet.sweep.variation import (
     from_line,
     is_number,
 )
-
-Evaluate = Literal["flight", "final"]
 
 #: Remedy if final states cannot be evaluated alone.
 _STARTS = ("agents", "position"), ("agents", "velocity")
@@ -57,41 +55,35 @@ _LATER = {"random_numbers", "controller", "rate", "agent", "drill"}
 class SweepHeader(Part):
     """Keys at the top of a sweep file."""
 
-    mission: str = Field(
-        description="a shipped mission, or the path of a mission file relative to this file"
+    mission: str = key("a shipped mission, or the path of a mission file relative to this file")
+    runs: Annotated[int, Strict(), Field(ge=1, le=_RUNS)] | None = key(
+        "number of runs; default: one per point of the grid", None
     )
-    runs: Annotated[int, Strict(), Field(ge=1, le=_RUNS)] | None = Field(
-        None, description="number of runs; default: one per point of the grid"
-    )
-    seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = Field(
-        0, description="seed of the random numbers"
-    )
-    evaluate: Evaluate = Field(
+    seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = key("seed of the random numbers", 0)
+    evaluate: Literal["flight", "final"] = key(
+        "flight: evaluate whole flights; final: evaluate only the final states of phases, thousands of runs per second,"
+        " for open-loop missions with varied start states",
         "flight",
-        description="flight: evaluate whole flights; final: evaluate only the final states of phases, thousands of "
-        "runs per second, for open-loop missions with varied start states",
     )
-    random_numbers: Literal["shared", "own"] = Field(
+    random_numbers: Literal["shared", "own"] = key(
+        "of noise, gusts and network: shared: every run has the seeds of the mission, so that runs differ only in what"
+        " varies; own: each run has a seed of its own",
         "shared",
-        description="of noise, gusts and network: shared: every run has the seeds of the mission, so that runs differ "
-        "only in what varies; own: each run has a seed of its own",
     )
-    controller: str = Field(
+    controller: str = key(
+        "controller of your own, MODULE:NAME: a function of an observation, or a class, of which each run has a new"
+        " object; default: the laws of the mission",
         "",
-        description="controller of your own, MODULE:NAME: a function of an observation, or a class, of which each run "
-        "has a new object; default: the laws of the mission",
     )
-    rate: Annotated[float, Strict(), Field(gt=0, le=1e6)] = Field(
-        50.0, description="rate at which the controller is called [Hz]"
+    rate: Annotated[float, Strict(), Field(gt=0, le=1e6)] = key(
+        "rate at which the controller is called [Hz]", 50.0
     )
-    agent: str = Field(
+    agent: str = key(
+        "law of each vehicle's own, MODULE:NAME: a function of what it knows, or a class, of which each vehicle has a"
+        " new object; for missions with [network]; default: the laws of the mission",
         "",
-        description="law of each vehicle's own, MODULE:NAME: a function of what it knows, or a class, of which each "
-        "vehicle has a new object; for missions with [network]; default: the laws of the mission",
     )
-    drill: Drill | None = Field(
-        None, description="faults of the day, in turn, instead of what varies: [drill]"
-    )
+    drill: Drill | None = key("faults of the day, in turn, instead of what varies: [drill]", None)
 
     @property
     def own(self) -> tuple[str, str]:
@@ -442,15 +434,15 @@ def _check(
         data["vary"] = [entries[k] if k in wrong else entry for k, entry in enumerate(parsed)]
     collector = FindingCollector(data, origin)
     known = [*SweepHeader.model_fields, "vary"]
-    for key in data:
-        if key not in known:
-            collector.add((key,), *unknown_key(key, known))
+    for name in data:
+        if name not in known:
+            collector.add((name,), *unknown_key(name, known))
     own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
     header = collector.validate(SweepHeader, own, ())
     by_final_states = header is not None and header.evaluate == "final"
-    if header is not None and header.drill is not None:
-        cases = _cases(collector, header.drill, mission)
-        if collector.findings:
+    if data.get("drill") is not None:
+        cases = [] if header is None else _cases(collector, header.drill or Drill(), mission)
+        if collector.findings or header is None:
             raise SweepError(collector.findings)
         return cases, header
     whole = None if mission is None else keypaths.whole_document(mission)
@@ -501,16 +493,21 @@ def _check(
 
 def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -> list[Variation]:
     """The cases of a drill; nothing else varies."""
-    for key, default in (("vary", []), ("evaluate", "flight")):
-        if collector.data.get(key, default) != default:
-            collector.add((key,), "has no effect on a drill", "remove it, or [drill]")
+    for name, default in (("vary", []), ("evaluate", "flight")):
+        if collector.data.get(name, default) != default:
+            collector.add((name,), "has no effect on a drill", "remove it, or [drill]")
     if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
         collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
     if drill.links and mission is not None and mission.network is None:
         problem = "has no effect: without [network], one law knows all states"
         collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
-    grids = drill.grids(1 if mission is None else mission.n_agents)
-    if not grids:
+    n = 1 if mission is None else mission.n_agents
+    for name, most in faults.most_of(n).items():
+        if name in drill.model_fields_set and max(getattr(drill, name), default=0) > most:
+            remedy = f"give at most {most}"
+            collector.add(("drill", name), f"is too much for {n} vehicles", remedy)
+    grids = drill.grids(n)
+    if not (grids or collector.findings):
         collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
     return grids
 

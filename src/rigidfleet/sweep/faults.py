@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,7 +24,7 @@ from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, piece_at
 from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.obstacles import Ground
-from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, Whole, key
+from rigidfleet.mission.values import AgentNumber, Angle, Part, Positive, key
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.variation import Grid, Variation
 from rigidfleet.typing import Bools, Floats, Ints
@@ -59,13 +59,13 @@ class Drill(Part):
     links: _Counts = key("so many links are lost, each at any time", ())
     lost: _Counts = key("so many vehicles are lost, each at any time", (1,))
     vehicles: _Counts = key("of how many at once late, another, stale and bias are faults", (1, 5))
-    trials: Whole = key("trials of each magnitude: other vehicles, directions, times", 20, ge=1)
+    trials: AgentNumber = key("trials of each magnitude: other vehicles, directions, times", 20)
     files: tuple[str, ...] = key("files of others that are flown, not those of the mission", ())
 
     def grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
         possible = PARTIAL | SETUP if self.files else UNITS
-        faults = self.model_fields_set & UNITS.keys() or possible.keys()
+        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), most_of(n)
         some = sorted({min(count, n) for count in self.vehicles})
         counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
@@ -74,6 +74,7 @@ class Drill(Part):
             for fault in UNITS
             if fault in faults
             for size in (places if fault == "stale" else getattr(self, fault))
+            if fault not in most or size <= most[fault]
             for count in counts.get(fault, [int(size) if fault == "lost" else n])
         ]
         names = "drill.fault", "drill.magnitude", "drill.vehicles"
@@ -95,6 +96,11 @@ class Drill(Part):
 
         named = {key: (*map(whole, getattr(self, key)),) for key in ("stale", "files")}
         return self.model_copy(update={key: x for key, x in named.items() if x})
+
+
+def most_of(n: int) -> dict[str, int]:
+    """Of how many vehicles or links at most a key may be in a show of n vehicles."""
+    return {"vehicles": n, "another": n - 1, "lost": n - 1, "links": n * (n - 1) // 2}
 
 
 def stream_of(seed: int, *number: int) -> np.random.Generator:
@@ -144,10 +150,12 @@ class _Chords(NamedTuple):
     ----------
     place : (3, K + 1, N) positions at knots [m]
     sag : (K, N) greatest distance of a way from its chord, at the same time [m]
+    move : (N,) greatest distance of a way, between two knots, from where it is at the nearer one [m]
     """
 
     place: Floats
     sag: Floats
+    move: Floats
 
     @classmethod
     def of(cls, way: Piecewise) -> _Chords:
@@ -157,7 +165,13 @@ class _Chords(NamedTuple):
         share = np.linspace(0.0, 1.0, points.shape[-1])
         points -= place[:-1, ..., None] + np.diff(place, axis=0)[..., None] * share
         sag = np.linalg.norm(points, axis=2).max(axis=-1)
-        return cls(np.ascontiguousarray(place.transpose(2, 0, 1)), sag)
+        return cls.through(np.ascontiguousarray(place.transpose(2, 0, 1)), sag)
+
+    @classmethod
+    def through(cls, place: Floats, sag: Floats) -> _Chords:
+        """Chords through places (3, K + 1, N) [m], with sags (K, N) [m]."""
+        step = proximity.root_of_squares(np.diff(place, axis=1)).max(axis=0)
+        return cls(place, sag, 0.5 * step + sag.max(axis=0))
 
 
 class Show:
@@ -190,6 +204,8 @@ class Show:
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
         self._data, self.radius, limits = data, mission.fleet.radius, mission.limits
         self.reach = max(limits.separation or 0.0, limits.separation_below or 0.0)
+        #: Whether other pairs than the nearest of all may matter.
+        self.by_height = bool(limits.separation_below or limits.separation_altitude is not None)
         solid = any(not isinstance(thing, Ground) for thing in mission.obstacles)
         #: Whether it matters where the show is as a whole: flat ground is the same everywhere.
         self.bounded = solid or limits.geofence or mission.fences or mission.people
@@ -197,15 +213,12 @@ class Show:
         self._rows = np.ascontiguousarray(self.curve.pieces.transpose(3, 1, 2, 0))
         self._chords = _Chords.of(self.curve)
         self._on_knots: dict[bytes, _Chords] = {}  # one for each magnitude of a delay
-
-    @cached_property
-    def versions(self) -> list[Piecewise]:
-        """The ways of earlier versions."""
-        return [
+        #: The ways of earlier versions.
+        self.versions = [
             self._ways(load_mission(name), ())[0]
             if name in mission_names() or name.endswith(".toml")
-            else self._ways(self.mission, (name,))[0]
-            for name in self.drill.stale
+            else self._ways(mission, (name,))[0]
+            for name in drill.stale
         ]
 
     def _ways(self, mission: Mission, files: Sequence[str]) -> tuple[Piecewise, str, Verdict]:
@@ -218,10 +231,15 @@ class Show:
 
         if files:
             read = read_trajectories(files, spans="stand")
+            if len(read.curves) != self.n:
+                raise RigidfleetError(
+                    f"{files[0]}: has {len(read.curves)} vehicles, and the show {self.n}. Give a file of each."
+                )
             return join(read.curves), read.assumed, assess(of_curves(read, mission=mission))
         if mission.n_agents != self.n:
             raise RigidfleetError(
-                f"stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}."
+                f"drill.stale: {mission.name} has {mission.n_agents} agents, and the show {self.n}. Give an earlier"
+                " version of the same show."
             )
         result = simulate(mission)
         motion = result.motion(flown=False)
@@ -301,25 +319,27 @@ class Show:
         return Piecewise(flown.time, pieces)
 
     def _near(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
-        """Which vehicles (N,) may come near one of those (S,) that fly by other chords, or are the nearest to it."""
-        place, sag = (x.copy() for x in self._chords_on(knots))
-        place[:, :, who], sag[:, who] = own
-        # Between two knots none moves further than half of a step from the nearer one.
-        step = 0.5 * np.linalg.norm(np.diff(place, axis=1), axis=0).max(axis=0) + sag.max(axis=0)
-        near = np.zeros(self.n, dtype=np.bool_)
+        """Which vehicles (N,) may be the nearest to one of those (S,) that fly by other chords, or hit it.
+
+        If distances count by height, these are all that may come nearer than a limit.
+        """
+        place, sag, move = (x.copy() for x in self._chords_on(knots))
+        place[:, :, who], sag[:, who], move[who] = own
+        near, least = np.full(self.n, np.inf), self.reach
         for i in who.tolist():
-            apart = place - place[:, :, i : i + 1]
-            allowed = self.reach + self.radius + self.radius[i]
-            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - allowed
+            apart, radii = place - place[:, :, i : i + 1], self.radius + self.radius[i]
+            ends = np.sqrt((apart**2).sum(axis=0).min(axis=0)) - radii
             ends[i] = np.inf
-            near[ends.argmin()] = True
-            some = np.flatnonzero(ends < step + step[i])
+            nearest = ends.argmin()
+            near[nearest] = -np.inf
+            least = least if self.by_height else min(least, max(float(ends[nearest]), 0.0))
+            some = np.flatnonzero(ends < least + move + move[i])
             a, d = apart[:, :-1, some], np.diff(apart[:, :, some], axis=1)
             share = -(a * d).sum(axis=0) / np.maximum((d * d).sum(axis=0), 1e-300)
             a += np.clip(share, 0.0, 1.0) * d
-            gap = proximity.root_of_squares(a) - sag[:, some] - sag[:, i : i + 1]
-            near[some[gap.min(axis=0) < allowed[some]]] = True
-        return near
+            gap = proximity.root_of_squares(a) - sag[:, some] - sag[:, i : i + 1] - radii[some]
+            near[some] = np.minimum(near[some], gap.min(axis=0))
+        return near < least
 
     def _chords_on(self, knots: Floats) -> _Chords:
         """Chords of all vehicles on other knots: on a part of a piece, the sag may be twice that of the piece."""
@@ -330,7 +350,8 @@ class Show:
             within = np.clip(knots, own[0], own[-1])
             place = np.ascontiguousarray(self.curve.at(within)[:, :, :3].transpose(2, 0, 1))
             middle = 0.5 * (within[:-1] + within[1:])
-            self._on_knots[key] = _Chords(place, 2.0 * self._chords.sag[piece_at(own, middle)])
+            sag = 2.0 * self._chords.sag[piece_at(own, middle)]
+            self._on_knots[key] = _Chords.through(place, sag)
         return self._on_knots[key]
 
     def _some(self, who: Ints) -> Piecewise:

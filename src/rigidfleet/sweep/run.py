@@ -8,6 +8,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet.errors import FlightError, MissionError
+from rigidfleet.mission import Mission
 from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
@@ -48,21 +49,21 @@ def _record_fault(sweep: Sweep, run: int) -> RunRecord:
     who = faults.some_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
     stream = faults.stream_of(sweep.seed, run, 2)
     outcome = _value_or_error(lambda: show.outcome(fault, size, who, stream))
-    return _record(sweep, run, values, outcome, perf_counter() - begun)
+    return _record(sweep, run, values, outcome, begun)
 
 
 def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     """Fly a group of runs side by side; one by one, if anything unforeseen happens to any of them."""
     from rigidfleet.simulation.flight import simulate
-    from rigidfleet.simulation.together import simulate_together
+    from rigidfleet.simulation.together import MOST_VEHICLES, simulate_together
 
     law, header = sweep.law[0], sweep.header
 
-    def flight_of(run: int) -> Result:
+    def flight_of(mission: Mission) -> Result:
         if header.agent:
-            return simulate(flown[run], agent=law)
+            return simulate(mission, agent=law)
         own = law() if isinstance(law, type) else law
-        return simulate(flown[run], controller=own, rate=header.rate)
+        return simulate(mission, controller=own, rate=header.rate)
 
     begun = perf_counter()
     values = {run: sweep.values(run) for run in runs}
@@ -70,14 +71,20 @@ def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
         run: _value_or_error(lambda run=run: sweep.mission_of(run, values[run])) for run in runs
     }
     valid = [run for run, mission in flown.items() if not isinstance(mission, Exception)]
-    together = law or _value_or_error(lambda: simulate_together([flown[run] for run in valid]))
-    if law is not None or isinstance(together, Exception):
-        together = [_value_or_error(lambda run=run: flight_of(run)) for run in valid]
-    flown |= zip(valid, together, strict=True)
-    del together
-    shared = (perf_counter() - begun) / len(runs)
-    # Each flight is let go of when it is judged: the next one's record takes its memory over.
-    return [_record(sweep, run, values[run], flown.pop(run), shared) for run in runs]
+    if law is None and sweep.mission.n_agents <= MOST_VEHICLES:
+        together = _value_or_error(lambda: simulate_together([flown[run] for run in valid]))
+        if not isinstance(together, Exception):
+            flown |= zip(valid, together, strict=True)
+        del together
+    shared, rows = (perf_counter() - begun) / len(runs), []
+    for run in runs:
+        # Each flight is let go of when it is judged: the next one's record takes its memory over.
+        begun, flight = perf_counter() - shared, flown.pop(run)
+        if isinstance(flight, Mission):
+            flight = _value_or_error(lambda mission=flight: flight_of(mission))
+        rows.append(_record(sweep, run, values[run], flight, begun))
+        del flight
+    return rows
 
 
 def _value_or_error(job: Callable[[], Any]) -> Any:
@@ -90,9 +97,8 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
         return error
 
 
-def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, shared: float) -> RunRecord:
-    """Judge and measure a flight, unless it is the outcome; ``shared``: its share of its group's time so far [s]."""
-    begun = perf_counter()
+def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: float) -> RunRecord:
+    """Judge and measure a flight, unless it is the outcome; ``begun``: when, by `perf_counter` [s]."""
     codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
     done = isinstance(flown, Exception | tuple)
@@ -107,7 +113,7 @@ def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, shared: f
         case _:
             known, reason, detail = outcome
             metrics |= {name: math.nan if x is None else x for name, x in known.items()}
-    wall = shared + perf_counter() - begun
+    wall = perf_counter() - begun
     return RunRecord(run, not reason, reason, " ".join(detail.split()), codes, metrics, wall)
 
 

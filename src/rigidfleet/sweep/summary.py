@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from itertools import groupby
 from statistics import NormalDist
 from typing import Any
 
@@ -154,7 +155,7 @@ class Summary(Shown):
         strong = [d for d in self.drivers if d.adjusted < _CHANCE]
         parts: list[Any] = [self._percentiles(), self._reasons(), self._correlations(strong)]
         if self.drill:
-            parts = [self._cases(), self._reasons()]
+            parts = [*self._cases(), self._reasons()]
         if n:
             words = f"{len(strong)} of {n} pairs tested correlate (false discovery rate {100 * _CHANCE:g} %)."
             parts.append(Line(words))
@@ -173,16 +174,38 @@ class Summary(Shown):
             parts.append(Line(words, "ok" if s.count == s.of else "note"))
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
-    def _cases(self) -> FactTable:
-        rows = []
+    def rehearsals(self) -> list[str]:
+        """What a drill has shown, a sentence or two for each fault: for the first page of a report."""
+        lines = []
+        for fault, same_fault in groupby(self.drill, lambda x: x.fault):
+            cases, harmless, dangerous = [*same_fault], [], []
+            for size, same_size in groupby(cases, lambda x: x.magnitude):
+                rates = [x.failed for x in same_size]
+                count, by = sum(r.count for r in rates), f"{size:g} {display_unit(cases[0].unit)}"
+                share = f" ({count} of {sum(r.of for r in rates)} runs)" if count else ""
+                (dangerous if count else harmless).append(by.strip() + share)
+            parts = ("no failure", harmless), ("failures", dangerous)
+            words = "; ".join(f"{name} by {', '.join(some)}" for name, some in parts if some)
+            details = [x.worst.detail for x in cases if x.worst]
+            least = f" The last of these: {details[-1]}." if details else ""
+            lines.append(f"{fault.capitalize()}: {words}.{least}")
+        return lines
+
+    def _cases(self) -> list[FactTable]:
+        """Shares of each case, and below them the worst run of those that fail: its words are too long for a column."""
+        shares, worst = [], []
         for x in self.drill:
             size, by = x.failed, f"{x.magnitude:g} {display_unit(x.unit)}".strip()
-            share = f"{size.count} of {size.of}", f"{100 * size.rate:.3g} %"
-            words = f"run {x.worst.run}: {x.worst.detail}" if x.worst else ""
+            case, share = (x.fault, by, x.vehicles), f"{100 * size.rate:.3g} %"
             level: Any = "fails" if size.count else "ok"
-            rows.append(Row((x.fault, by, x.vehicles, *share, x.separation, words), level))
-        heads = "fault", "by", "vehicles", "fail", "share", "least apart [m]", "the worst"
-        return FactTable(heads, rows, ("the worst",))
+            shares.append(Row((*case, f"{size.count} of {size.of}", share, x.separation), level))
+            if x.worst:
+                worst.append(Row((*case, x.worst.run, x.worst.detail)))
+        heads = "fault", "by", "vehicles"
+        return [
+            FactTable((*heads, "fail", "share", "least apart [m]"), shares),
+            FactTable((*heads, "run", "the worst"), worst, ("the worst",)),
+        ]
 
     def _percentiles(self) -> FactTable:
         rows = [
@@ -198,16 +221,8 @@ class Summary(Shown):
         for reason, count in self.reasons.items():
             example = self.examples[reason]
             words = f"run {example.run}{': ' if example.detail else ''}{example.detail}"
-            rows.append(
-                Row(
-                    (
-                        reason_in_words(reason),
-                        count,
-                        f"{100 * count / self.success.of:.3g} %",
-                        words,
-                    )
-                )
-            )
+            share = f"{100 * count / self.success.of:.3g} %"
+            rows.append(Row((reason_in_words(reason), count, share, words)))
         return FactTable(("failed check", "runs", "of all", "for example"), rows, ("for example",))
 
     def _correlations(self, strong: Sequence[Driver]) -> FactTable:

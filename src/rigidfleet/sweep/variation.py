@@ -16,13 +16,13 @@ from abc import abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from statistics import NormalDist
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet.mission.findings import suggest
-from rigidfleet.mission.values import Number, Part, Positive
+from rigidfleet.mission.values import Number, Part, Positive, key
 
 #: Signs in a line, and the change that each stands for.
 SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
@@ -35,13 +35,11 @@ _MOST = sys.float_info.max
 class Variation(Part):
     """A variation: a path in the mission, and the values there."""
 
-    path: str = Field(
-        description="path in the mission, counted from 1: agents.mass.2; * stands for all entries, each with its "
-        "own value"
+    path: str = key(
+        "path in the mission, counted from 1: agents.mass.2; * stands for all entries, each with its own value"
     )
-    change: Literal["set", "add", "scale"] = Field(
-        "set",
-        description="set: replaces the value in the mission; add: is added to it; scale: multiplies it",
+    change: Literal["set", "add", "scale"] = key(
+        "set: replaces the value in the mission; add: is added to it; scale: multiplies it", "set"
     )
 
     def apply(self, there: Any, value: Any) -> Any:
@@ -73,10 +71,10 @@ class Variation(Part):
 class Gridded(Variation):
     """A grid: values taken in turn."""
 
-    group: str = Field(
+    group: str = key(
+        "grids of the same group take their values together, the first with the first; they have as many values;"
+        " default: every grid is combined with all others",
         "",
-        description="grids of the same group take their values together, the first with the first; they have as many "
-        "values; default: every grid is combined with all others",
     )
 
     @property
@@ -88,52 +86,55 @@ class Gridded(Variation):
 class Normal(Variation):
     """A normal distribution."""
 
-    kind: Literal["normal"] = Field(description="normal distribution")
-    mean: Number = Field(description="mean")
-    sd: Positive = Field(description="standard deviation, > 0")
+    kind: Literal["normal"] = key("normal distribution")
+    mean: Number = key("mean")
+    sd: Positive = key("standard deviation, > 0")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
         return NormalDist(self.mean, self.sd).inv_cdf(u)
 
 
-class Uniform(Variation):
+class _Between(Variation):
+    """A distribution between two ends."""
+
+    low: Number = key("lower end")
+    high: Number = key("upper end, > low")
+
+    def wrong(self) -> tuple[str, str, str] | None:
+        """Ends in the wrong order."""
+        if self.low < self.high:
+            return None
+        problem = f"must be above low = {self.low:g}"
+        return "high", problem, "swap the two, or set a single value by grid"
+
+
+class Uniform(_Between):
     """A uniform distribution."""
 
-    kind: Literal["uniform"] = Field(description="uniform distribution")
-    low: Number = Field(description="lower end")
-    high: Number = Field(description="upper end, > low")
+    kind: Literal["uniform"] = key("uniform distribution")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
         return self.low + u * (self.high - self.low)
 
-    def wrong(self) -> tuple[str, str, str] | None:
-        """Ends in the wrong order."""
-        return _order_error(self.low, self.high)
 
-
-class LogUniform(Variation):
+class LogUniform(_Between):
     """A distribution whose logarithm is uniform."""
 
-    kind: Literal["log-uniform"] = Field(description="distribution whose logarithm is uniform")
-    low: Positive = Field(description="lower end, > 0")
-    high: Positive = Field(description="upper end, > low")
+    kind: Literal["log-uniform"] = key("distribution whose logarithm is uniform")
+    low: Positive = key("lower end, > 0")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
         return self.low * (self.high / self.low) ** u
 
-    def wrong(self) -> tuple[str, str, str] | None:
-        """Ends in the wrong order."""
-        return _order_error(self.low, self.high)
-
 
 class _Listed(Variation):
     """A list of values."""
 
-    values: Annotated[tuple[Any, ...], Field(min_length=1)] = Field(
-        description="values: numbers, words, true or false, lists"
+    values: Annotated[tuple[Any, ...], Field(min_length=1)] = key(
+        "values: numbers, words, true or false, lists"
     )
 
     def code(self, value: Any) -> float:
@@ -162,7 +163,7 @@ class _Listed(Variation):
 class Choice(_Listed):
     """One of several values with equal probability."""
 
-    kind: Literal["choice"] = Field(description="one of several values with equal probability")
+    kind: Literal["choice"] = key("one of several values with equal probability")
 
     def quantile(self, u: float) -> Any:
         """Value at the fraction u."""
@@ -172,7 +173,7 @@ class Choice(_Listed):
 class Grid(_Listed, Gridded):
     """A grid of listed values."""
 
-    kind: Literal["grid"] = Field(description="grid of listed values")
+    kind: Literal["grid"] = key("grid of listed values")
 
     @property
     def grid(self) -> tuple[Any, ...]:
@@ -183,17 +184,17 @@ class Grid(_Listed, Gridded):
 class _Spaced(Gridded):
     """A grid of spaced numbers, both ends included."""
 
-    count: Annotated[int, Strict(), Field(ge=2, le=10**6)] = Field(
-        description="number of values, both ends included, >= 2"
+    count: Annotated[int, Strict(), Field(ge=2, le=10**6)] = key(
+        "number of values, both ends included, >= 2"
     )
 
 
 class Linspace(_Spaced):
     """A grid with equal differences."""
 
-    kind: Literal["linspace"] = Field(description="grid with equal differences")
-    low: Number = Field(description="first value")
-    high: Number = Field(description="last value")
+    kind: Literal["linspace"] = key("grid with equal differences")
+    low: Number = key("first value")
+    high: Number = key("last value")
 
     @property
     def grid(self) -> tuple[float, ...]:
@@ -204,9 +205,9 @@ class Linspace(_Spaced):
 class Geomspace(_Spaced):
     """A grid with equal ratios."""
 
-    kind: Literal["geomspace"] = Field(description="grid with equal ratios")
-    low: Positive = Field(description="first value, > 0")
-    high: Positive = Field(description="last value, > 0")
+    kind: Literal["geomspace"] = key("grid with equal ratios")
+    low: Positive = key("first value, > 0")
+    high: Positive = key("last value, > 0")
 
     @property
     def grid(self) -> tuple[float, ...]:
@@ -216,13 +217,8 @@ class Geomspace(_Spaced):
 
 #: Models of variations by `kind`.
 KINDS: dict[str, type[Variation]] = {
-    "normal": Normal,
-    "uniform": Uniform,
-    "log-uniform": LogUniform,
-    "choice": Choice,
-    "grid": Grid,
-    "linspace": Linspace,
-    "geomspace": Geomspace,
+    get_args(model.model_fields["kind"].annotation)[0]: model
+    for model in (Normal, Uniform, LogUniform, Choice, Grid, Linspace, Geomspace)
 }
 #: Keys of a variation in the order of a line; those that are missing here take a list of values.
 _KEYS = {
@@ -296,9 +292,3 @@ def _parse_word(word: str) -> Any:
         except (ValueError, RecursionError):
             continue
     return word.strip("'\"")
-
-
-def _order_error(low: float, high: float) -> tuple[str, str, str] | None:
-    if low < high:
-        return None
-    return "high", f"must be above low = {low:g}", "swap the two, or set a single value by grid"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.toml import to_toml
+from rigidfleet._common.toml import text_says, to_toml
 from rigidfleet.math import lqr, pid
 from rigidfleet.math.margins import Loop, LoopGains, Margins, margins
 from rigidfleet.mission import Mission
@@ -207,11 +207,7 @@ def with_gains(text: str, gains: Gains) -> str:
     for table, key, value in _entries(document, gains):
         wanted.setdefault(table, {})[key] = value
         new = _replace_line(new, table, key, to_toml({key: value}).strip())
-    try:
-        same = tomllib.loads(new) == wanted
-    except tomllib.TOMLDecodeError:
-        same = False
-    return new if same else digest_lines(text) + to_toml(wanted)
+    return new if text_says(new, wanted) else digest_lines(text) + to_toml(wanted)
 
 
 def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:

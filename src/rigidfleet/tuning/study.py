@@ -215,9 +215,11 @@ class _StudySweeps:
     ) -> None:
         self.paths, self.total, self.count, self.progress = paths, total, count, progress
         self.begun = perf_counter()
-        self.done = self.flown = self.failed = 0
+        #: Numbers of runs that are done, flown and failed: of the sweeps before, and of the present one.
+        self.before = self.now = np.zeros(3, dtype=np.int64)
         self.first = True
-        self.stack, self.pool = ExitStack(), None
+        self.stack = ExitStack()
+        self.pool: Executor | None = None
 
     def fly(
         self, mission: Mission, candidates: Sequence[Gains], seeds: range, folder: Path
@@ -232,34 +234,22 @@ class _StudySweeps:
             for path in self.paths
         ]
         sweep = Sweep.of(mission, vary, name=folder.name, origin="rigidfleet tune")
-        last = SweepProgress(0, sweep.runs, 0, 0, 0.0, 1)
-
-        def tell(now: SweepProgress) -> None:
-            nonlocal last
-            last = now
-            self._tell(now)
-
         # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
         first, self.first = self.first, False
-        pool = self._processes() if self.count > 1 and not first else None
-        table = fly(sweep, folder, workers=self.count if pool else 1, progress=tell, pool=pool)
-        self.done, self.flown, self.failed = (
-            self.done + last.done, self.flown + last.flown, self.failed + last.failed
-        )  # fmt: skip
+        if self.count > 1 and not first and self.pool is None:
+            self.pool = self.stack.enter_context(processes(self.count))
+        workers = self.count if self.pool else 1
+        table = fly(sweep, folder, workers=workers, progress=self._tell, pool=self.pool)
+        self.before, self.now = self.before + self.now, self.now * 0
         if first and np.median(table.wall) * self.total < _WORTH:
             self.count = 1
         return _measurements(table, candidates, len(seeds))
 
-    def _processes(self) -> Executor:
-        if self.pool is None:
-            self.pool = self.stack.enter_context(processes(self.count))
-        return self.pool
-
     def _tell(self, now: SweepProgress) -> None:
+        self.now = np.array([now.done, now.flown, now.failed])
         if self.progress is not None:
+            done, flown, failed = (self.before + self.now).tolist()
             wall = perf_counter() - self.begun
-            done, flown = self.done + now.done, self.flown + now.flown
-            failed = self.failed + now.failed
             self.progress(SweepProgress(done, self.total, flown, failed, wall, self.count))
 
 
@@ -340,7 +330,7 @@ class _Study:
             return
         every, judged = list(self.flown), []
         pair = {_gain_values(f.gains): f.gains for f in (tuned.before, tuned.after)}
-        self.flights.total = self.flights.done + len(pair) * len(seeds)
+        self.flights.total = int(self.flights.before[0]) + len(pair) * len(seeds)
         for key, gains in pair.items():
             folder = self.folder / _VALIDATION / f"{every.index(key):04}"
             judged += self.flights.fly(self.mission, [gains], seeds, folder)

@@ -27,7 +27,6 @@ overload(distance.choose, jit_options=OPTIONS)(
 )
 overload(distance.some, jit_options=OPTIONS)(lambda test: lambda test: test)
 overload(distance.floor, jit_options=OPTIONS)(lambda x: _floor)
-overload(distance.zero, jit_options=OPTIONS)(lambda x: lambda x: 0.0)
 
 for _function in distance.ELEMENTWISE:
     _known(_function)

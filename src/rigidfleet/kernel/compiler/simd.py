@@ -233,17 +233,9 @@ def root(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Valu
     return builder.select(zero, x, builder.fmul(x, inverse_of_it))
 
 
-def _quotient(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
-    return builder.fmul(a, inverse(builder, b), flags=_FAST)
-
-
 def _llvm(builder: ir.IRBuilder, name: str, arity: int) -> ir.Function:
     kind = ir.FunctionType(VECTOR, [VECTOR] * arity)
     return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{WIDTH}f64")
-
-
-def _where_positive(builder: ir.IRBuilder, x: ir.Value, a: ir.Value, b: ir.Value) -> ir.Value:
-    return builder.select(builder.fcmp_ordered(">", x, number(0.0)), a, b)
 
 
 #: Builder of each operation.
@@ -258,15 +250,15 @@ BUILD: dict[str, Any] = {
     "abs": absolute,
     "max": larger,
     "min": smaller,
-    "where_positive": _where_positive,
+    "where_positive": lambda builder, x, a, b: builder.select(
+        builder.fcmp_ordered(">", x, number(0.0)), a, b
+    ),
 }
 _register((operator.add, operator.iadd), 2, BUILD["add"])
 _register((operator.sub, operator.isub), 2, BUILD["sub"])
 _register((operator.mul, operator.imul), 2, BUILD["mul"])
-_register((operator.truediv, operator.itruediv), 2, _quotient)
 _register((abs,), 1, BUILD["abs"])
 _register((max,), 2, BUILD["max"])
-_register((min,), 2, BUILD["min"])
 
 
 @intrinsic
@@ -277,18 +269,6 @@ def fill_lanes(_context, x):
         return in_all(builder, context.cast(builder, args[0], sig.args[0], types.float64))
 
     return lanes(x), generate
-
-
-@intrinsic
-def inverse_root_of(_context, x):
-    """Lanes of 1/sqrt(x), exact to the last bit but one."""
-    return lanes(x), lambda _context, builder, _sig, args: inverse_root(builder, args[0])
-
-
-@intrinsic
-def where_positive(_context, x, a, b):
-    """Lanes of a where those of x are positive, of b elsewhere."""
-    return lanes(x, a, b), lambda _context, builder, _sig, args: _where_positive(builder, *args)
 
 
 @intrinsic
@@ -321,17 +301,6 @@ def spread(_context, x, addresses, offset):
         return context.get_dummy_value()
 
     return types.void(lanes, addresses, types.int64), generate
-
-
-@intrinsic
-def put(_context, x, address, offset):
-    """Store a number at an address, plus an offset in numbers."""
-
-    def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
-        place = builder.inttoptr(args[1], ir.DoubleType().as_pointer())
-        return builder.store(args[0], builder.gep(place, [args[2]]))
-
-    return types.void(types.float64, types.int64, types.int64), generate
 
 
 @intrinsic

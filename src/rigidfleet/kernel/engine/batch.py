@@ -13,9 +13,10 @@ from rigidfleet._common.kept import same
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
-from rigidfleet.kernel.engine import lane_bounds, lane_steps, native
+from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
     Tables,
+    addresses,
     integrate,
     packed,
     unrolled,
@@ -45,8 +46,6 @@ from rigidfleet.kernel.records import (
     TIME,
     TRAILED,
     IntegratorState,
-    Monitor,
-    Trail,
     integrator,
 )
 from rigidfleet.typing import Bools, Floats, Ints
@@ -177,13 +176,11 @@ class Vector:
 
     def __init__(self, disturbances: Sequence[Disturbance]) -> None:
         self._tables = Tables(disturbances)
-        self._trails: list[Trail] = []
 
     def begin(
         self,
         problems: Sequence[Problem],
         states: Sequence[IntegratorState],
-        monitors: Sequence[Monitor],
         t_end: float,
         times: Floats,
         samples: Sequence[Floats],
@@ -194,7 +191,6 @@ class Vector:
         ----------
         problems : of eight flights, which `fit_together`
         states : of their integrators, at one time; their trails have the same number of rows
-        monitors : of their extremes, for the same pairs; the steps to search are listed in them
         times, samples : times (K,) [s] to record, and an array (K, n) for each flight
 
         Raises
@@ -202,43 +198,31 @@ class Vector:
         UnfitError
             The problems take different branches.
         """
-        self._states, self._monitors, self._t_end, self._times = states, monitors, t_end, times
-        if len(self._trails) != len(states) or any(
-            state.trail is not trail for state, trail in zip(states, self._trails, strict=True)
-        ):
-            self._allocate(problems)
+        self._states, self._t_end, self._times = states, t_end, times
         tables = self._tables.between(float(states[0].clock[TIME]), t_end)
         ready = unrolled_together(problems, tables)
-        lane_bounds.begin(self._search, monitors)
-        places = np.array([x.ctypes.data for x in samples])
-        self._problem = ready._replace(samples=places, search=self._search)
         first = states[0]
-        K, n = self._K, len(first.y)
+        n, (rows, forces) = len(first.y), first.trail.gauge.shape
+        trails = [addresses([getattr(x.trail, name) for x in states]) for name in lane_steps.TRAIL]
+        self._problem = ready._replace(
+            samples=addresses(samples), trails=np.array(trails), halves=empty((2, 5, n))
+        )
+        K = empty((lane_steps.ROWS, n))
         unpack(K)[: lane_steps.STAGES] = 0.0
         unpack(K)[lane_steps.ATOL] = np.stack([state.K[ATOL, :n] for state in states], axis=-1)
         clock = np.array([first.clock[TIME], _FIRST_STEP_IN_VECTORS, LEAST_ERROR])
         y, count = packed([state.y for state in states]), np.zeros_like(first.count)
-        self._state = IntegratorState(y, K, clock, count, first.rtol, self._length)
+        trail = NO_TRAIL._replace(clock=np.empty((rows, 2)), gauge=np.empty((0, forces)))
+        self._state = IntegratorState(y, K, clock, count, first.rtol, trail)
         self._fresh = True
-
-    def _allocate(self, problems: Sequence[Problem]) -> None:
-        """Arrays for these trails, monitors and vehicles, which are those of the phases to come, too."""
-        states, monitors = self._states, self._monitors
-        self._trails = trails = [state.trail for state in states]
-        n, rows = len(states[0].y), len(trails[0].clock)
-        self._K = empty((lane_steps.ROWS, n))
-        self._length = NO_TRAIL._replace(clock=np.empty((rows, 2)))
-        limits = np.minimum([p.vehicles.thrust_limit for p in problems], _NO_LIMIT)
-        self._search = lane_bounds.search(monitors, trails, self._length.clock, pack(limits.T))
 
     def __call__(self, max_steps: int) -> int:
         """Go on to the end of the phase; return what `dopri5.integrate` returns.
 
-        States and samples are then known, and the steps that monitors have to search.
+        States, samples and trails are then known.
         """
         state = self._state
         state.count[TRAILED:] = self._states[0].count[TRAILED:]
-        before = int(state.count[TRAILED])
         status = fly_on(
             self._problem, state, self._t_end, self._fresh, self._times, _UNSAMPLED, max_steps
         )
@@ -247,15 +231,9 @@ class Vector:
         for lane, own in enumerate(self._states):
             own.y[:] = y[:, lane]
             own.clock[:], own.count[:] = state.clock, state.count
-        steps = range(before, int(state.count[TRAILED]))
-        if steps:
-            search, first = self._problem.search, int(state.count[FIRST_ROW])
-            lane_bounds.list_steps(search, first, steps, self._monitors)
         return int(status)
 
 
-#: Thrust that stands for no limit [N].
-_NO_LIMIT = 1e150
 _UNSAMPLED = pack(np.zeros((0, 1, WIDTH)))
 
 

@@ -22,8 +22,7 @@ from rigidfleet.kernel.compiler import simd
 from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, jit, jit_inline
 from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, gather, unpack
 from rigidfleet.kernel.disturbances import spline_weights
-from rigidfleet.kernel.engine import lane_bounds, lane_steps
-from rigidfleet.kernel.engine.lane_bounds import Search
+from rigidfleet.kernel.engine import lane_steps
 from rigidfleet.kernel.engine.tracer import (
     MOMENT,
     SOURCES,
@@ -44,8 +43,8 @@ from rigidfleet.typing import Floats, Ints
 class UnrolledProblem(NamedTuple):
     """A problem in the form that straight-line code reads; arrays of lanes hold a number of each of eight flights.
 
-    ``before``, ``time``, ``known``, ``gauge``, ``stage`` and what ``search`` holds are overwritten in flight. Tables
-    over time have no rows if there are none.
+    ``before``, ``time``, ``known``, ``gauge``, ``stage`` and ``halves`` are overwritten in flight. Tables over time
+    have no rows if there are none.
     """
 
     address: int  # of the code
@@ -70,7 +69,8 @@ class UnrolledProblem(NamedTuple):
     noise_r: LaneArray  # (K, 3N)
     noise_v: LaneArray  # (K, 3N)
     samples: Ints  # (8,) addresses of each flight's samples
-    search: Search
+    trails: Ints  # (4, 8) of the arrays `lane_steps.TRAIL` of each flight
+    halves: LaneArray  # (2, 5, n) control points of the two halves of the last step
 
 
 def unrolled(problem: Problem) -> UnrolledProblem:
@@ -97,9 +97,7 @@ def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> Un
     turns = values[TURN].any(axis=0)
     if turns.any():  # slots that do not turn, where others do
         values[TURN, ~turns] = _BARELY
-    motion = interleaved(
-        [p.motion.coefficients for p in problems], (len(first.motion.coefficients), 36)
-    )
+    motion = packed([p.motion.coefficients.reshape(-1, 36) for p in problems])
     sizes = np.abs(unpack(motion)).reshape(-1, 6, 6 * WIDTH).max(axis=(0, 2))
     moves = (sizes > _STILL).tolist()
     description = flight_structure(first, values, moves)
@@ -120,7 +118,7 @@ _STILL = 1e-30
 class Tables:
     """Gusts and noise of eight flights, of which a phase needs some rows.
 
-    These rows alone become lanes, in the same memory for each phase: they stay in the cache while it is flown.
+    These rows alone become lanes: they stay in the cache while it is flown.
     """
 
     def __init__(self, disturbances: Sequence[Disturbance]) -> None:
@@ -128,8 +126,7 @@ class Tables:
         self._whole = {
             name: [np.ascontiguousarray(getattr(x, name)) for x in disturbances] for name in _TABLES
         }
-        self._addresses = {name: _addresses(parts) for name, parts in self._whole.items()}
-        self._lanes = dict.fromkeys(_TABLES, simd.empty((0,)))
+        self._addresses = {name: addresses(parts) for name, parts in self._whole.items()}
 
     def between(self, begin: float, end: float) -> dict[str, Any]:
         """Fields of an `UnrolledProblem` for a phase from ``begin`` to ``end`` [s]."""
@@ -141,36 +138,23 @@ class Tables:
             # A row more on both sides than counts by `spline_weights`, whose rounding is not looked at here.
             first = max(min(int(begin / step) - 1, rows - 4), 0)
             count = min(int(end / step) + 5, rows) - first
-            made = self._room(name, count * 3 * agents)
+            made = simd.empty((count * 3 * agents,))
             _interleave(self._addresses[name], first * 3 * agents, made)
             fields |= {f"{kind}_step": step, f"{kind}_first": first, f"{kind}_rows": rows}
             fields[name] = made.reshape(count, 3 * agents)
         return fields
-
-    def _room(self, name: str, size: int) -> Any:
-        """Lanes (size,) of a table."""
-        if len(self._lanes[name]) < size:
-            self._lanes[name] = simd.empty((size,))
-        return self._lanes[name][:size]
 
 
 _TABLES = "gust", "noise_r", "noise_v"
 
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
-    """Lanes (...) of eight small arrays of one shape (...)."""
+    """Lanes (...) of eight arrays of one shape (...)."""
     return simd.pack(np.stack(parts, axis=-1))
 
 
-def interleaved(parts: Sequence[Floats], shape: tuple[int, ...]) -> LaneArray:
-    """Lanes of eight large arrays, in C order, as an array of some shape."""
-    parts = [np.ascontiguousarray(x) for x in parts]
-    made = simd.empty(shape)
-    _interleave(_addresses(parts), 0, made.reshape(-1))
-    return made
-
-
-def _addresses(arrays: Sequence[Floats]) -> Ints:
+def addresses(arrays: Sequence[Floats]) -> Ints:
+    """Addresses of the numbers of some arrays."""
     return np.array([x.ctypes.data for x in arrays])
 
 
@@ -198,7 +182,8 @@ def _prepare(
     return UnrolledProblem(
         address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
         lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,
-        1.0, 0, 0, none, 1.0, 0, 0, none, none, np.zeros(WIDTH, dtype=np.int64), lane_bounds.NO_SEARCH,
+        1.0, 0, 0, none, 1.0, 0, 0, none, none, np.zeros(WIDTH, dtype=np.int64),
+        np.zeros((len(lane_steps.TRAIL), WIDTH), dtype=np.int64), simd.empty((2, 5, 0)),
     )  # fmt: skip
 
 

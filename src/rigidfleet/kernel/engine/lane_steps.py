@@ -23,14 +23,16 @@ from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.compiler.simd import spread
 from rigidfleet.kernel.dopri5 import step_to_knot
 from rigidfleet.kernel.dynamics import closed_loop
-from rigidfleet.kernel.engine.lane_bounds import begin_forces, bound_forces, bound_step
-from rigidfleet.kernel.records import EVALUATIONS, FIRST_ROW, SAMPLES, TIME, TRAILED
+from rigidfleet.kernel.records import EVALUATIONS, FIRST_ROW, SAMPLES, TRAILED
 from rigidfleet.kernel.vectors import fill_lanes, rough_inverse
 
 #: Number of stages; rows of `IntegratorState.K` after them: the last ones are the state halfway, and its derivative.
 STAGES = 9
 STATE, TRIAL, ATOL, MIDDLE, SLOPE = range(STAGES, STAGES + 5)
 ROWS = STAGES + 5
+#: Arrays of each flight's trail, whose addresses are rows of `UnrolledProblem.trails`.
+TRAIL = "clock", "points", "gauge", "start"
+CLOCK, POINTS, GAUGE, START = range(len(TRAIL))
 
 # Only the third stage needs the second one, and neither the end nor the error needs the third.
 A = np.zeros((STAGES, STAGES))
@@ -229,59 +231,62 @@ def _put_halves(k, q, slopes, h, early, late):
 
 
 @jit
+def keep_forces(p, state, array, row):
+    """Write the forces that the code has evaluated into a row of an array of each flight's trail."""
+    forces, addresses = state.trail.gauge.shape[1], p.trails[array]
+    for g in range(forces):
+        spread(p.gauge[g], addresses, forces * row + g)
+
+
+@jit
 def keep_step(t, h, p, w, state):
-    """As `dopri5.keep_step`, for all flights; `lane_bounds.list_steps` hands them the steps to search.
+    """As `dopri5.keep_step`, for each flight into its own trail.
 
     The halves of the step are kept as two.
     """
-    k, search, rows = state.K, p.search, state.trail.clock.shape[0]
-    coordinates = _coordinates(k, p)
+    k, trails, rows = state.K, p.trails, state.trail.clock.shape[0]
+    coordinates, n = _coordinates(k, p), k.shape[1]
     # The first half goes to the next row of the trail, the second to the one after it. The forces of the end are there
     # already, as those of the last stage; the code for the middle overwrites them, so they are stored first.
     row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
-    before, after = (row + rows - 1) % rows, (row + 1) % rows
-    for g in range(search.gauge.shape[1]):
-        search.gauge[after, g] = p.gauge[g]
+    after = (row + 1) % rows
+    keep_forces(p, state, GAUGE, after)
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
     _to_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
     state.count[EVALUATIONS] += 1
-    for g in range(search.gauge.shape[1]):
-        search.gauge[row, g] = p.gauge[g]
-    search.clock[row, 0], search.clock[row, 1] = t, 0.5 * h
-    search.clock[after, 0], search.clock[after, 1] = t + 0.5 * h, 0.5 * h
-    early, late = search.points[row], search.points[after]
+    keep_forces(p, state, GAUGE, row)
+    early, late = p.halves[0], p.halves[1]
     for q in range(coordinates):
         i = coordinates + q
         _put_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
-    for q in range(coordinates, k.shape[1]):
+    for q in range(coordinates, n):
         _put_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
-    bound_step(search, row)
-    bound_forces(t + 0.5 * h, search, row, before)
-    bound_step(search, after)
-    bound_forces(t + h, search, after, row)
+    for half in range(2):
+        place = row if half == 0 else after
+        spread(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)
+        spread(fill_lanes(0.5 * h), trails[CLOCK], 2 * place + 1)
+        for i in range(5):
+            for q in range(n):
+                spread(p.halves[half, i, q], trails[POINTS], (5 * place + i) * n + q)
     state.count[TRAILED] += 2
 
 
 @jit
 def keep_start(p, w, state):
     """As `dopri5.keep_start`, for each flight into its own trail."""
-    for g in range(p.search.gauge.shape[1]):
-        spread(p.gauge[g], p.search.trails[2], g)
-    begin_forces(state.clock[TIME], p.gauge, p.search)
+    keep_forces(p, state, START, 0)
 
 
 @jit
 def keep_samples(t, h, t_new, times, samples, p, state):
-    """As `dopri5.keep_samples`, for each flight into its own samples, from the rows of a step that is kept."""
-    search, count = p.search, state.count
-    n, rows = state.K.shape[1], state.trail.clock.shape[0]
+    """As `dopri5.keep_samples`, for each flight into its own samples, from the halves of a step that is kept."""
+    count, n = state.count, state.K.shape[1]
     while count[SAMPLES] < times.shape[0] and times[count[SAMPLES]] <= t_new:
-        # By the halves that were just written, which `keep_step` has counted.
         x = 2.0 * (times[count[SAMPLES]] - t) / h
         half = 1 if x > 1.0 else 0
-        points = search.points[(count[FIRST_ROW] + count[TRAILED] - 2 + half) % rows]
+        points = p.halves[half]
         x -= half
         z = 1.0 - x
         for q in range(n):

@@ -74,14 +74,7 @@ def integrate(
     max_steps: int,
 ) -> int:
     """Integrate to ``t_end`` [s], see `rigidfleet.kernel.dopri5.integrate`."""
-    segment = pack_anew(Segment(t_end, fresh, max_steps, times, samples, NOTHING))
-    return _call(
-        _integrator(problem, workspace),
-        pack(problem),
-        pack(workspace),
-        pack(state),
-        segment,
-    )
+    return Integration(problem, workspace, state, t_end, times, samples)(fresh, max_steps)
 
 
 class Integration:
@@ -99,18 +92,15 @@ class Integration:
         self._segment = pack_anew(Segment(t_end, False, 0, times, samples, NOTHING))
         self._kept = pack(problem), pack(workspace), pack(state), self._segment
         self._addresses = [x.address for x in self._kept]
-        self._integrate = _integrator(problem, workspace)
+        code, graph = _code(), problem.graph
+        sizes = len(problem.vehicles.m), len(graph.edges), len(graph.pairs), len(workspace.A)
+        three = sizes == (3, 3, 3, 3)
+        self._integrate = code.integrate_three if three else code.integrate
 
     def __call__(self, fresh: bool, max_steps: int) -> int:
         """Go on; ``fresh`` as in `Segment`. Returns what `rigidfleet.kernel.dopri5.integrate` returns."""
         self._segment.words[1], self._segment.words[2] = int(fresh), max_steps
         return self._integrate(*self._addresses)
-
-
-def _integrator(problem: Problem, workspace: Workspace) -> Any:
-    code, graph = _code(), problem.graph
-    sizes = len(problem.vehicles.m), len(graph.edges), len(graph.pairs), len(workspace.A)
-    return code.integrate_three if sizes == (3, 3, 3, 3) else code.integrate
 
 
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
@@ -168,25 +158,8 @@ class Watch:
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
-    call = _own.segment
-    if call is None or len(call.of.dy) != len(y):
-        call = pack_anew(
-            Segment(0.0, False, 0, np.empty(1), np.empty((1, len(y))), np.empty(len(y)))
-        )
-        _own.segment = call
-    segment: Segment = call.of
-    segment.times[0], segment.samples[0] = t, y
-    _call(_code().record, pack(problem), pack(workspace), call, pack(UNRECORDED))
-    dy[:] = segment.dy
-
-
-class _Own(threading.local):
-    """The segment of one state with which a thread has called `closed_loop` last."""
-
-    segment: Packed | None = None
-
-
-_own = _Own()
+    segment = pack_anew(Segment(0.0, False, 0, np.array([t]), np.array([y]), dy))
+    _call(_code().record, pack(problem), pack(workspace), segment, pack(UNRECORDED))
 
 
 def _call(function: Any, *arguments: Packed) -> int:

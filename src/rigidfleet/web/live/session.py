@@ -64,6 +64,33 @@ class Session:
         self.pilot = Pilot(self.mission)
         self.flights += 1
         self.result = self.pilot.step()
+        columns = observe(self.result, self.shown, self.tension)
+        start = self.mission.fleet.position
+        ends = start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND
+        near = sight_points(self.mission, *ends)
+        #: Columns are those of the beginning: pages read numbers one after the other.
+        widths = {name: math.prod(c.values.shape[1:]) for name, c in columns.items()}
+        widths |= {"target": 7, "balls": 4 * AT_ONCE}
+        self.info: dict[str, Any] = describe(self.result, self.shown, self.tension) | {
+            "columns": [{"name": name, "width": width} for name, width in widths.items()],
+            "count": 0,
+            "start": 0.0,
+            "step": TICK,
+            "beyond": True,
+            "note": "",
+            "middle": (near.min(axis=0) + near.max(axis=0)) / 2,
+            "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2,
+            "path": False,
+            "forces": True,
+            "camera": "follow",
+            "sight": near,
+            "azimuth": -1.1,
+            "formations": self.pilot.formations,
+            "unguarded": self.unguarded,
+            "ball": {"radius": [SMALLEST, LARGEST], "speed": FASTEST},
+            "speeds": SPEEDS,
+            "loss": None if self.mission.network is None else self.mission.network.loss,
+        }
 
     def land(self) -> None:
         """Pass the flight to ``landed``."""
@@ -75,39 +102,7 @@ class Session:
     def html(self) -> str:
         """The page."""
         with self.lock:
-            columns = observe(self.result, self.shown, self.tension)
-            widths = [
-                {"name": name, "width": c.values[0].size if c.values.ndim > 1 else 1}
-                for name, c in columns.items()
-            ]
-            start = self.mission.fleet.position
-            near = sight_points(
-                self.mission, start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND
-            )
-            info = describe(self.mission, self.mission.edges[self.shown], self.tension) | {
-                "columns": [
-                    *widths,
-                    {"name": "target", "width": 7},
-                    {"name": "balls", "width": 4 * AT_ONCE},
-                ],
-                "count": 0,
-                "start": 0.0,
-                "step": TICK,
-                "beyond": True,
-                "note": "",
-                "middle": (near.min(axis=0) + near.max(axis=0)) / 2,
-                "extent": float(np.linalg.norm(np.ptp(near, axis=0))) / 2,
-                "path": False,
-                "camera": "follow",
-                "sight": near,
-                "azimuth": -1.1,
-                "formations": self.pilot.formations,
-                "unguarded": self.unguarded,
-                "ball": {"radius": [SMALLEST, LARGEST], "speed": FASTEST},
-                "speeds": SPEEDS,
-                "loss": None if self.mission.network is None else self.mission.network.loss,
-                **self.story(),
-            }
+            info = self.info | self.story()
         return page(info, start="live/live.js", style=read("live/live.css"), connect="'self'")
 
     def story(self) -> dict[str, Any]:
@@ -156,24 +151,16 @@ class Session:
 
     def _sample_event(self) -> bytes:
         """The last sample as numbers: time and the columns of the page, one after the other."""
-        target = self.pilot.target
-        columns = observe(self.result, self.shown, self.tension).values()
-        values = [
-            [self.result.time[-1]],
-            *(c.values.ravel() for c in columns),
-            target.r,
-            att.quaternion_from_dcm(target.attitude),
-            self._ball_numbers(),
-        ]
-        numbers = np.concatenate(values).astype("<f4")
-        return _event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
-
-    def _ball_numbers(self) -> np.ndarray:
-        """Place and radius of each ball of the page; nan where there is none."""
-        numbers = np.full((AT_ONCE, 4), np.nan)
+        target, balls = self.pilot.target, np.full((AT_ONCE, 4), np.nan)
         for ball in self.pilot.flying:
-            numbers[ball.slot] = *ball.place, ball.radius
-        return numbers.ravel()
+            balls[ball.slot] = *ball.place, ball.radius
+        pose = np.concatenate([target.r, att.quaternion_from_dcm(target.attitude)])
+        samples = observe(self.result, self.shown, self.tension)
+        values = {name: c.values.ravel() for name, c in samples.items()}
+        values |= {"time": self.result.time[-1:], "target": pose, "balls": balls.ravel()}
+        names = ["time", *(column["name"] for column in self.info["columns"])]
+        numbers = np.concatenate([values[name] for name in names]).astype("<f4")
+        return _event("sample", base64.b64encode(numbers.tobytes()).decode("ascii"))
 
     # -- commands ---------------------------------------------------------------------------------
 

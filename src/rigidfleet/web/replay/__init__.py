@@ -17,6 +17,7 @@ import numpy as np
 from rigidfleet._common.arguments import as_path
 from rigidfleet._common.files import write_file
 from rigidfleet.math.piecewise import piece_at
+from rigidfleet.plotting.logged import off_plan
 from rigidfleet.result import Result, as_result
 from rigidfleet.result.lights import has_lights, view
 from rigidfleet.typing import Floats, Ints
@@ -32,7 +33,7 @@ _SAMPLES = 3_000_000
 _HEIGHT = 600  # height in a notebook [px]
 _EDGES = 3000  # greatest number of edges drawn; more would hide the vehicles
 #: Number of vehicles beyond which each is a dot, unless it is near; columns that dots do without.
-_SWARM, _SHAPES = 3000, ("thrust", "turn", "rotors", "slot")
+_SWARM, _SHAPES = 3000, ("thrust", "turn", "rotors", "slot", "fall", "doubt")
 #: Least and greatest tension that the full colour of an edge stands for, as a share of a vehicle's weight.
 _IDLE, _HEAVY = 0.005, 2.0
 
@@ -103,9 +104,7 @@ def html_page(result: Result) -> str:
             for name, c in columns.items()
         }
     )
-    info = describe(result.mission, result.edges[shown], tension) | _story(result, time)
-    if result.interpolation is not None:  # nobody knows the thrust
-        info["plots"] = [plot for plot in info["plots"] if plot["column"] != "thrust plot"]
+    info = describe(result, shown, tension) | _story(result, time)
     if has_lights(result):
         azimuth, elevation = view(result)
         info |= {"night": True, "azimuth": azimuth, "elevation": elevation}
@@ -176,9 +175,13 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
         "middle": (least + most) / 2,
         "extent": max(float(np.linalg.norm(most - least)) / 2, reach, 1e-6),
         "path": far,
+        "forces": bool(np.isfinite(result.multiplier).any()),
         # Seen obliquely from behind, if the formation moves.
         "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,
     }
+    if (off := off_plan(result)) is not None:
+        story["drifts"] = [x._asdict() for x in off.drifts(result.time)]
+        story["off"] = off.limit
     if not np.isfinite(result.mission.ground):
         # A grid to see motion against; high above the ground, it moves along with the flight.
         lowest = float(low[2])
@@ -195,8 +198,12 @@ def _note(result: Result, shown: Ints, tension: float, most: float) -> str:
             words.append(f"At {x.time:.2f} s, agent {x.who + 1} first hits {other}.")
     if result.n_agents > _SWARM:
         words.append("Vehicles are dots, without trails and slots.")
+    if result.mission.fences or result.mission.people:
+        words.append("Crosses: where vehicles fall that fail now.")
+    if off_plan(result) is not None:
+        words.append("Thin black lines are the plan; a halo is where a vehicle may be.")
     if len(shown) < len(result.edges):
         words.append(f"Only the {len(shown)} shortest of {len(result.edges)} edges are drawn.")
-    if len(shown) and most < tension:
+    if len(shown) and most < tension and np.isfinite(result.multiplier).any():
         words.append(f"No edge carries a force above {max(most, 0.001):.2g} N.")
     return " ".join(words)

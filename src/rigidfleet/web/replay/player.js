@@ -1,7 +1,7 @@
 // The page around the picture: timeline, speed, cameras, plots, keys.
 
 import { Renderer } from "./gl.js";
-import { CAMERAS, LEAST_EFFORT, Scene, tensionColour } from "./scene.js";
+import { CAMERAS, LEAST_EFFORT, Scene, offSlot, tensionColour } from "./scene.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4, 8, 16];
 const KEYS = [
@@ -16,7 +16,7 @@ const KEYS = [
   ["drag", "rotate the view; with Shift or the right button, move it"],
   ["wheel", "zoom; on a touch screen, use two fingers"],
 ];
-const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names" };
+const SHOWN = { edges: "edges", trails: "trails", slots: "slots", axes: "body axes", names: "names", areas: "fences, falls" };
 const ALERT = "#b00020";
 const SLOW = 1 / 31; // seconds per picture above which the resolution is lowered
 
@@ -175,6 +175,14 @@ class Plot {
       pen.stroke();
       pen.setLineDash([]);
     }
+    if (plot.band) { // what the line may be, from the second to the third
+      const [low, high] = lines.splice(1).map(([, points]) => points);
+      pen.fillStyle = "rgb(11 98 168 / 28%)";
+      pen.beginPath();
+      low.forEach(([x, y]) => pen.lineTo(x, place(y)));
+      high.reverse().forEach(([x, , y]) => pen.lineTo(x, place(y)));
+      pen.fill();
+    }
     for (const [line, points] of lines) {
       pen.strokeStyle = plot.colours[line % plot.colours.length];
       pen.lineWidth = 1.2;
@@ -191,7 +199,7 @@ class Plot {
   }
 
   point(share, state) {
-    const { plot } = this, all = Array.from(state[plot.column]), values = all.filter(Number.isFinite);
+    const { plot } = this, all = Array.from(state[plot.column]).slice(0, plot.band ? 1 : undefined), values = all.filter(Number.isFinite);
     this.cursor.style.transform = `translateX(${(share * this.area.clientWidth).toFixed(1)}px)`;
     const worst = values.length ? (plot.worst === "least" ? Math.min(...values) : Math.max(...values)) : NaN;
     const text = withUnit(plot.log ? Math.max(worst, plot.floor) : worst, plot.unit);
@@ -244,6 +252,7 @@ export class Player {
         .addEventListener("click", () => this.look(mode));
     }
     for (const [name, text] of Object.entries(SHOWN)) {
+      if (name === "areas" && !info.areas.length) continue;
       const label = element("label", part("show")), box = element("input", label, { type: "checkbox", "data-show": name });
       box.checked = this.scene.show[name];
       label.append(text);
@@ -252,7 +261,7 @@ export class Player {
         this.stale = true;
       });
     }
-    if (info.edges.length) this.writeScale(info);
+    if (info.edges.length && info.forces) this.writeScale(info);
     for (const [keys, deed] of this.keys()) {
       element("dt", part("help-list"), {}, keys);
       element("dd", part("help-list"), {}, deed);
@@ -283,6 +292,20 @@ export class Player {
       button.style.flexGrow = String(Math.max(phase.end - phase.start, 1e-3));
       button.addEventListener("click", () => this.seek(phase.start));
     });
+    this.writeDrifts(info);
+  }
+
+  /** When vehicles of a log are off their slots: a mark over the slider for each, short ones before long ones. */
+  writeDrifts({ drifts = [], colours }) {
+    const { start, end } = this.recording, share = (time) => `${(100 * (time - start)) / (end - start)}%`;
+    for (const drift of drifts.sort((a, b) => b.end - b.start - (a.end - a.start))) {
+      const worst = `at most ${withUnit(drift.worst, "m")}, at ${digits(drift.at)} s`;
+      const title = `Agent ${drift.who + 1} is off its slot (${digits(drift.start)} to ${digits(drift.end)} s): ${worst}`;
+      const mark = element("button", part("drifts"), { type: "button", title, "aria-label": title });
+      Object.assign(mark.style, { left: share(drift.start), width: share(start + drift.end - drift.start), background: colours[drift.who] });
+      mark.addEventListener("click", () => this.seek(drift.at));
+    }
+    part("drifts").hidden = !drifts.length;
   }
 
   writeScale(info) {
@@ -532,7 +555,7 @@ export class Player {
     for (const plot of this.plots) plot.point(share, state);
     const much = scene.enlarged > 1e6 ? "Vehicles have no size; they are drawn as if." : `Vehicles are drawn ${digits(scene.enlarged)} times their size.`;
     const larger = scene.enlarged > 1.15 && !scene.night ? much : "";
-    write("notes", [info.note, larger, overworked(state), avoiding(state), unheard(state)].filter(Boolean).join("\n"));
+    write("notes", [info.note, larger, overworked(state), adrift(state, info), avoiding(state), unheard(state)].filter(Boolean).join("\n"));
   }
 }
 
@@ -547,6 +570,12 @@ function named(values, test) {
 function overworked({ saturated }) {
   const who = named(saturated, (share) => share > 0.5);
   return who && `${who} cannot give all that is asked.`;
+}
+
+/** Which vehicles of a log are surely off their slots, in words. */
+function adrift(state, { off }) {
+  const who = named(Array.from(state.doubt ?? [], (_, i) => offSlot(state, i)), (by) => by > off);
+  return who && `${who} off the plan by more than ${withUnit(off, "m")} (red).`;
 }
 
 /** What the layers of avoidance do, in words. */

@@ -10,8 +10,9 @@ export const LEAST_EFFORT = 0.5; // least share of the resolution
 
 const AXES = [[0.84, 0.15, 0.16], [0.13, 0.58, 0.22], [0.12, 0.36, 0.86]];
 const IDLE = [0.42, 0.47, 0.53], PULL = [0.80, 0.11, 0.09], PUSH = [0.10, 0.33, 0.75];
-const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], LIMIT = [0.86, 0.05, 0.10], YIELDS = [0.90, 0.60, 0.0];
+const INK = [0.13, 0.15, 0.18], BOX = [0.88, 0.88, 0.87], RIM = [0.50, 0.56, 0.63], FENCE = [0.69, 0, 0.13], SOLID = [0.80, 0.77, 0.72], PEOPLE = [0.42, 0.24, 0.60], FALL = [0.90, 0.62, 0], LIMIT = [0.86, 0.05, 0.10], YIELDS = [0.90, 0.60, 0.0];
 const SMALLEST = 6, DETAILED = 12; // radius of a vehicle on the screen: the least, and that from which all detail is drawn [px]
+const HATCHES = 14; // lines over an area where nobody may be, or where people are
 const HEARD = 0.5; // share of the silence that lets go of an edge from which it is drawn broken
 const TRAIL = 8; // length of trails [s]
 const FULL = 0.98; // share of its limit from which a rotor is drawn as being at it
@@ -27,6 +28,9 @@ const CROWD = 60; // number of vehicles beyond which each is drawn less prominen
 export function tensionColour(share) {
   return mixed(IDLE, share < 0 ? PUSH : PULL, Math.sqrt(Math.min(Math.abs(share), 1)));
 }
+
+/** How far a vehicle is off its slot at least [m], as far as this is known. */
+export const offSlot = (state, i) => length(state.slot.subarray(3 * i, 3 * i + 3)) - (state.doubt?.[i] ?? 0);
 
 const bytes = (colours) => Uint8Array.from(colours.flatMap((c) => [...c.map((x) => 255 * x), 255]));
 const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16) / 255);
@@ -164,7 +168,7 @@ export class Scene {
     renderer.night = this.night;
     document.documentElement.classList.toggle("night", this.night);
     const day = !this.night;
-    this.show = { edges: day, trails: day, slots: day, axes: day, names: day };
+    this.show = { edges: day, trails: day, slots: day, axes: day, names: day, areas: true };
     this.camera = new Camera(recording);
     this.crowd = this.n > CROWD;
     const plain = this.crowd && renderer.software; // many triangles are slow without a graphics card
@@ -189,6 +193,7 @@ export class Scene {
     this.lines = { ground: new Lines(), world: new Lines() };
     this.fade = info.boxes.map(() => 1);
     this.solids = (info.solids ?? []).map((solid) => new Solid(solid, upload));
+    this.areas = info.areas.map((area) => new Area(area, info, upload));
     this.enlarged = 1;
     // Grid lines 1, 10, ... m apart, so that the formation covers some.
     const size = Math.max(...recording.columns.position ? [recording.reachAt(0)] : [1], 1e-3);
@@ -211,7 +216,9 @@ export class Scene {
 
     moving = this.placeBoxes(wait) || moving;
     for (const solid of this.solids) moving = solid.place(this, time, wait) || moving;
+    if (this.show.areas) for (const area of this.areas) area.place(this);
     this.placeVehicles(state);
+    if (state.fall && this.show.areas) this.placeFalls(state);
     if (this.show.trails && !this.info.swarm) this.placeTrails(time);
     if (this.show.edges) this.placeEdges(state);
     if (this.show.axes) this.placeAxes(state);
@@ -246,6 +253,7 @@ export class Scene {
     renderer.meshes(meshes.rotor, places.vehicles);
     renderer.meshes(meshes.disc, places.discs);
     renderer.meshes(meshes.box, places.veils);
+    if (this.show.areas) for (const area of this.areas) renderer.meshes(area.mesh, area.veil);
     renderer.meshes(meshes.ball, places.ballVeils);
     for (const solid of this.solids) renderer.meshes(solid.mesh, solid.veil);
     if (this.night) renderer.dots(this.swarm, this.far, pixels, this.n > MANY ? SMALL_LIGHT : LIGHT, null, bytes(this.colours));
@@ -353,14 +361,17 @@ export class Scene {
       const own = info.rotors?.[i]; // vehicles turn as they are, points along their thrust
       const q = own ? normal(state.turn.subarray(4 * i, 4 * i + 4)) : leaning(state.thrust.subarray(3 * i, 3 * i + 3), heading);
       (near ? (own ? places.turned : places.vehicles) : places.small).add(p, size, q, this.colours[i], 1);
-      const acts = state.acts?.[i] ?? 0; // barriers, from 1.5 on the guard
+      const error = state.slot.subarray(3 * i, 3 * i + 3), doubt = state.doubt?.[i] ?? 0;
+      if (doubt > 0) places.ballVeils.add(p, size + doubt, NO_TURN, this.colours[i], 0.18); // where it may be
+      // Barriers, from 1.5 on the guard; of a log, who is surely off its slot.
+      const acts = offSlot(state, i) > info.off ? 2 : state.acts?.[i] ?? 0;
       if (acts > 0.5) places.discs.add(p, 5 * size, NO_TURN, acts > 1.5 ? LIMIT : YIELDS, 0.55);
       if (own) {
         places.noses.add(p, size, q, this.colours[i], 1);
         this.placeRotors(p, size, q, state.rotors.subarray(4 * i, 4 * i + 4), near, i);
       }
-      if (this.show.slots && !Number.isNaN(state.slot[3 * i])) {
-        this.placeGhost(near ? places.ghosts : places.smallGhosts, p, size, q, state.slot.subarray(3 * i, 3 * i + 3), i);
+      if (this.show.slots && !Number.isNaN(error[0])) {
+        this.placeGhost(near ? places.ghosts : places.smallGhosts, p, size, q, error, i);
       }
       const height = p[2] - info.ground;
       if (height > 0) {
@@ -381,6 +392,14 @@ export class Scene {
       if (!this.night) this.far[at] = AWAY;
     }
     this.enlarged = Math.max(1, (DOT * this.sized(state.cm, 1)) / Math.max(info.radius[0], 1e-9));
+  }
+
+  /** Where vehicles fall that fail now. */
+  placeFalls(state) {
+    for (let i = 0; i < this.n; i++) {
+      const p = [state.fall[2 * i], state.fall[2 * i + 1], this.info.ground], size = Math.max(0.7 * this.info.radius[i], this.sized(p, 4));
+      for (const s of [size, -size]) this.lines.ground.add(add(p, [size, s, 0]), add(p, [-size, -s, 0]), 2, FALL, 0.9);
+    }
   }
 
   /** Rotors of a vehicle, the denser the more they give, red at their limit; from afar only these. */
@@ -428,12 +447,13 @@ export class Scene {
 
   /** The last seconds of every vehicle's path. */
   placeTrails(time) {
-    const { recording, lines, n, state } = this, { position } = recording.columns;
+    const { recording, lines, n, state } = this, { position, slot } = recording.columns;
     const [k] = recording.place(time), step = recording.info.step;
     if (!(step > 0)) return;
     const first = Math.max(0, k - Math.floor(TRAIL / step));
     const every = Math.max(1, Math.ceil(((k - first) * n) / (12000 * this.renderer.effort ** 3)), Math.round(0.06 / step));
-    const at = (j, i) => position.subarray(3 * (j * n + i), 3 * (j * n + i) + 3);
+    const of = (column, j, i) => column.subarray(3 * (j * n + i), 3 * (j * n + i) + 3), at = (j, i) => of(position, j, i);
+    const planned = (j, i) => add(at(j, i), of(slot, j, i));
     // Points at fixed times, or the trail would flicker.
     const begin = Math.ceil(first / every) * every;
     const full = this.crowd ? 0.3 : 0.6;
@@ -441,7 +461,10 @@ export class Scene {
     for (let i = 0; i < n; i++) {
       const colour = this.colours[i];
       let j = begin;
-      for (; j + every <= k; j += every) lines.world.add(at(j, i), at(j + every, i), 2, colour, fresh(j), fresh(j + every));
+      for (; j + every <= k; j += every) {
+        lines.world.add(at(j, i), at(j + every, i), 2, colour, fresh(j), fresh(j + every));
+        if (state.doubt) lines.world.add(planned(j, i), planned(j + every, i), 1.2, INK, fresh(j), fresh(j + every)); // a ghost
+      }
       if (j <= k) lines.world.add(at(j, i), state.position.subarray(3 * i, 3 * i + 3), 2, colour, fresh(j), full);
     }
   }
@@ -568,6 +591,55 @@ class Solid {
   }
 }
 
+/** A fence or a place with people: walls that fade upwards where they have no end, and hatches where nobody may be. */
+class Area {
+  constructor({ name, kind, hatched, rings, heights }, info, upload) {
+    const all = rings.flat(), low = heights[0] ?? info.ground;
+    const wide = [0, 1].map((a) => Math.max(...all.map((p) => p[a])) - Math.min(...all.map((p) => p[a])));
+    const high = heights[1] ?? low + 0.5 * Math.max(...wide), full = { soft: 0.05, fence: 0.09, people: 0.13 }[kind];
+    const at = ([x, y], z) => [x, y, z], mesh = new Mesh();
+    const [far, near] = [heights[1] === null ? 0 : full, full];
+    this.name = name;
+    this.colour = mixed(kind === "people" ? PEOPLE : FENCE, [1, 1, 1], info.night ? 0.25 : 0);
+    this.lines = []; // [from, to, width, opacity]
+    for (const ring of rings) {
+      ring.forEach((a, k) => {
+        const b = ring[(k + 1) % ring.length];
+        mesh.triangle(at(a, low), at(b, low), at(b, high), OWN, [near, near, far]);
+        mesh.triangle(at(a, low), at(b, high), at(a, high), OWN, [near, far, far]);
+        const edge = (z, width, alpha) => this.lines.push(...dashes(at(a, z), at(b, z), kind === "soft" ? 12 : 1).map((line) => [...line, width, alpha]));
+        edge(low, 1.8, 0.8);
+        if (heights[1] !== null) edge(high, 1, 0.5);
+      });
+    }
+    if (hatched) for (const line of hatches(rings, Math.max(...wide) / HATCHES)) this.lines.push([...line.map((p) => at(p, low)), 1, 0.5]);
+    this.top = at(rings[0].reduce((a, b) => (a[1] < b[1] ? a : b)), low);
+    this.mesh = upload(mesh);
+    this.veil = new Places();
+    this.veil.add([0, 0, 0], 1, NO_TURN, this.colour, 1);
+  }
+
+  place(scene) {
+    for (const [a, b, width, alpha] of this.lines) scene.lines.world.add(a, b, width, this.colour, alpha);
+    if (scene.show.names) scene.labels.add(scene.renderer.project(this.top), this.name, "place", 8);
+  }
+}
+
+/** Pieces of the segment from a to b: one, or `n` with gaps between them. */
+const dashes = (a, b, n) => Array.from({ length: n }, (_, k) => [mixed(a, b, k / n), mixed(a, b, (k + (n > 1 ? 0.6 : 1)) / n)]);
+
+/** Slanted lines `step` apart inside rings, where a line has crossed them an odd number of times. */
+function hatches(rings, step) {
+  const edges = rings.flatMap((ring) => ring.map((a, k) => [a, ring[(k + 1) % ring.length]])), lines = [];
+  const level = ([x, y]) => y - x, levels = rings.flat().map(level);
+  for (let c = Math.min(...levels) + step / 2; c < Math.max(...levels); c += step) {
+    const cut = edges.filter(([a, b]) => level(a) > c !== level(b) > c).map(([a, b]) => mixed(a, b, (c - level(a)) / (level(b) - level(a))));
+    cut.sort((a, b) => a[0] - b[0]);
+    for (let k = 0; k + 1 < cut.length; k += 2) lines.push([cut[k], cut[k + 1]]);
+  }
+  return lines;
+}
+
 /** Whether the segment from a to b meets a box. */
 function meets(a, b, low, high) {
   let from = 0, to = 1;
@@ -609,7 +681,7 @@ class Labels {
     wanted.sort((a, b) => rank(a) - rank(b) || a.far - b.far);
     let used = 0;
     for (const label of wanted) {
-      const half = 3.4 * label.text.length + 3, wide = box.clientWidth;
+      const half = (label.kind === "now" ? 4.2 : 3.4) * label.text.length + 3, wide = box.clientWidth;
       if (label.x < -half || label.x > wide + half || label.y < 0 || label.y > box.clientHeight + 9) continue;
       // Labels of visible things are kept inside the picture, too.
       if (label.x > 0 && label.x < wide && wide > 2 * half) label.x = Math.max(half, Math.min(label.x, wide - half));

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rigidfleet.math import attitude as att
 from rigidfleet.plotting import agent_colours
+from rigidfleet.plotting.areas import falls_of
+from rigidfleet.plotting.logged import off_plan
 from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits
 from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, lights
@@ -19,6 +22,7 @@ from rigidfleet.web.replay.pack import PackedColumn
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission, Obstacle
+    from rigidfleet.mission.fences import Fence, People
     from rigidfleet.result import Result
 
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
@@ -29,27 +33,30 @@ _BESIDE, _PLACES = 0.15, 100
 _FLOOR = 1e-6  # least constraint error that is distinguished from zero [m]
 
 
-def describe(mission: Mission, edges: Ints, tension: float) -> dict[str, Any]:
-    """Description of obstacles, vehicles, edges (m, 2) and plots.
+def describe(result: Result, shown: Ints, tension: float) -> dict[str, Any]:
+    """Description of obstacles, fences, people, vehicles, the edges ``shown``, and plots.
 
     Full colour of an edge stands for ``tension`` [N].
     """
+    mission = result.mission
     boxes = [(o.name, o.corners) for o in mission.obstacles if is_plain_box(o) and o.corners]
     fence = mission.limits.geofence
+    rotors = np.isfinite(rotor_limits(mission))  # of a fleet of points, nothing
     return {
         "name": mission.name,
         "title": mission.title,
         "radius": mission.agents.radius,
         "colours": agent_colours(mission.n_agents),
-        **_rotors(mission),
-        "edges": edges,
+        **({"rotors": rotors.tolist()} if rotors.any() else {}),
+        "edges": result.edges[shown],
         "tension": tension,
         "boxes": [{"name": name, "min": ends[:3], "max": ends[3:]} for name, ends in boxes],
         "solids": [_solid(o) for o in mission.solids if not is_plain_box(o)],
         "fence": None if fence is None else {"min": fence.min, "max": fence.max},
+        "areas": _areas(mission),
         "ground": mission.ground if np.isfinite(mission.ground) else 0.0,
         "solid": bool(np.isfinite(mission.ground)),
-        "plots": _plots(mission),
+        "plots": [plot for plot, _ in _plots(result)],
     }
 
 
@@ -76,6 +83,21 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
     }
 
 
+def _areas(mission: Mission) -> list[dict[str, Any]]:
+    """Fences and places with people: their rings (m, 2) [m], and their heights [m], None where they have no end."""
+
+    def entry(area: Fence | People, kind: str, *, hatched: bool) -> dict[str, Any]:
+        rings = [ring for rings in area.polygons(mission.geodetic_origin) for ring in rings]
+        heights = [x if np.isfinite(x) else None for x in area.heights(mission.ground)]
+        return {"name": area.name, "kind": kind, "hatched": hatched, "rings": rings, "heights": heights}  # fmt: skip
+
+    fences = [
+        entry(x, "soft" if x.soft else "fence", hatched=x.kind == "exclusion")
+        for x in mission.fences
+    ]
+    return [*fences, *(entry(x, "people", hatched=True) for x in mission.people)]
+
+
 def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
     """Samples for the page, at the result's times; ``shown`` are the edges drawn."""
     mission = result.mission
@@ -87,19 +109,21 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
         **_avoidance_columns(result),
         **_light_columns(result),
         **_silence_columns(result, shown),
+        **_boundary_columns(result, fine),
+        **_doubt_columns(result, fine),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
         "reference": PackedColumn(result.attitude_reference, 1e-4),
-        "tension": PackedColumn(-result.multiplier[:, shown], tension / 1000),
-        **_plot_columns(result),
+        "tension": PackedColumn(_tensions(result, shown), tension / 1000),
+        **{plot["column"]: samples for plot, samples in _plots(result)},
     }
 
 
-def _rotors(mission: Mission) -> dict[str, Any]:
-    """Which vehicles have rotors of their own, whose forces are known; nothing for a fleet of points."""
-    known = np.isfinite(rotor_limits(mission))
-    return {"rotors": known.tolist()} if known.any() else {}
+def _tensions(result: Result, shown: Ints) -> Floats:
+    """Tension (K, m) [N] of the edges shown, NaN while they are not active; 0 of a log, which tells no forces."""
+    tension = -result.multiplier[:, shown]
+    return np.where(np.isfinite(result.constraint[:, shown]), np.nan_to_num(tension), tension)
 
 
 def _attitude_columns(result: Result) -> dict[str, PackedColumn]:
@@ -144,6 +168,20 @@ def _silence_columns(result: Result, shown: Ints) -> dict[str, PackedColumn]:
     return {"silent": PackedColumn(np.minimum(oldest / net.silence, 1.0), 0.01)}
 
 
+def _boundary_columns(result: Result, fine: float) -> dict[str, PackedColumn]:
+    """Samples of places beside fences and people: where each vehicle falls that fails then."""
+    mission = result.mission
+    if not (mission.fences or mission.people):
+        return {}
+    return {"fall": PackedColumn(falls_of(result), fine)}
+
+
+def _doubt_columns(result: Result, fine: float) -> dict[str, PackedColumn]:
+    """Samples of a log beside its plan: how far the place of each vehicle is in doubt."""
+    off = off_plan(result)
+    return {} if off is None else {"doubt": PackedColumn(off.doubt, fine)}
+
+
 def _light_columns(result: Result) -> dict[str, PackedColumn]:
     """Samples of each vehicle's light: red, green and blue; nothing by day."""
     if not has_lights(result):
@@ -170,6 +208,12 @@ def sight_points(
         if box.solid.moves:
             ends, far = _box_of_passing(box.solid, low, high, begin, end), _BESIDE * reach
         near = np.maximum(ends[0], low - far), np.minimum(ends[1], high + far)
+        seen += [near] if (near[0] <= near[1]).all() else []
+    for area in _areas(mission):
+        flat, (floor, ceiling) = np.concatenate(area["rings"]), area["heights"]
+        heights = low[2] if floor is None else floor, high[2] if ceiling is None else ceiling
+        ends = np.column_stack([[flat.min(axis=0), flat.max(axis=0)], heights])
+        near = np.maximum(ends[0], low - reach), np.minimum(ends[1], high + reach)
         seen += [near] if (near[0] <= near[1]).all() else []
     if len(seen) > _BOXES:
         seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]
@@ -213,34 +257,6 @@ def weight(mission: Mission) -> float:
     return float(np.mean(mission.agents.mass)) * max(mission.gravity, 1.0)
 
 
-def _plots(mission: Mission) -> list[dict[str, Any]]:
-    """Quantities drawn over time; each has its samples in ``column``."""
-    n, limits = mission.n_agents, mission.limits
-    basic = {
-        "unit": "m",
-        "colours": ["#20262D"],
-        "worst": "greatest",
-        "limits": [None],
-        "least": None,
-        "log": False,
-        "floor": _FLOOR,
-    }
-    plots = [{"column": "thrust plot", **_thrust_plot(mission)}]
-    if np.isfinite(rotor_limits(mission)).any():
-        plots = [{"column": "rotor plot", **_rotor_plot(n)}]
-        plots.append(
-            {"column": "off plot", "title": "Tracking error", "limits": [limits.tracking_error]}
-        )
-    if len(mission.edges):
-        plots.append({"title": "Constraint error", "column": "error plot", "log": True})
-    least = {"worst": "least", "least": limits.separation_always}
-    if n > 1:
-        plots.append({"title": "Separation", "column": "separation plot", **least})
-    if mission.obstacles:
-        plots.append({"title": "Clearance", "column": "clearance plot", **least, "least": 0.0})
-    return [basic | plot for plot in plots]
-
-
 def _line_colours(n: int) -> list[str]:
     """Colours of `_lines` of n vehicles."""
     return agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
@@ -253,47 +269,44 @@ def _lines(values: Floats) -> Floats:
     return np.stack([np.fmin.reduce(values, axis=1), np.fmax.reduce(values, axis=1)], axis=1)
 
 
-def _thrust_in_shares(mission: Mission) -> bool:
-    """Whether thrust is drawn as a share of its limit: that of many vehicles with different ones."""
-    return mission.n_agents > _LINES and len(set(mission.agents.thrust_limit)) > 1
+def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
+    """Quantities drawn over time, as the page knows them, each with its samples."""
+    mission, off, n = result.mission, off_plan(result), result.n_agents
+    limits, rotors, colours = mission.limits, rotor_limits(mission), _line_colours(n)
 
+    def plot(name: str, title: str, values: Floats, step: float, **look: Any) -> Any:
+        basic = {
+            "column": f"{name} plot", "title": title, "unit": "m", "colours": ["#20262D"], "worst": "greatest",
+            "limits": [None], "least": None, "log": False, "floor": _FLOOR, "band": False,
+        }  # fmt: skip
+        return basic | look, PackedColumn(values, step)
 
-def _thrust_plot(mission: Mission) -> dict[str, Any]:
-    """Lines of thrust with their limits."""
-    title, limits = "Greatest thrust", mission.agents.thrust_limit
-    plot = {"title": title, "unit": "N", "colours": _line_colours(len(limits)), "limits": limits}
-    if _thrust_in_shares(mission):
-        plot |= {"title": f"{title}, as share of limit", "unit": "%", "limits": [None, 100.0]}
-    elif len(limits) > _LINES:
-        plot["limits"] = [None, limits[0]]
-    return plot
-
-
-def _rotor_plot(n: int) -> dict[str, Any]:
-    """Lines of the greatest rotor force of each vehicle, as shares of its limit."""
-    colours = _line_colours(n)
-    limits = [100.0] * len(colours)
-    return {"title": "Rotors, share of limit", "unit": "%", "colours": colours, "limits": limits}
-
-
-def _plot_columns(result: Result) -> dict[str, PackedColumn]:
-    """Samples of each plot."""
-    mission, thrust = result.mission, result.thrust
-    if _thrust_in_shares(mission):
-        thrust = 100.0 * thrust / mission.fleet.thrust_limit
-    # Without active edges there is no error.
-    error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
-    error = error.max(axis=1, initial=-1.0)
-    samples = {
-        "thrust plot": PackedColumn(_lines(thrust), 1e-3),
-        "error plot": PackedColumn(np.where(error < 0.0, np.nan, error), _FLOOR),
-        "separation plot": PackedColumn(result.separation, 1e-3),
-        "clearance plot": PackedColumn(result.clearance, 1e-3),
-    }
-    limits = rotor_limits(mission)
-    if np.isfinite(limits).any():
-        share = 100.0 * rotor_forces(result).max(axis=2) / limits
-        samples["rotor plot"] = PackedColumn(_lines(share), 0.1)
-        off = quantities.samples(result, "tracking_error").worst
-        samples["off plot"] = PackedColumn(off, 1e-4)
-    return {plot["column"]: samples[plot["column"]] for plot in _plots(mission)}
+    if off is None and np.isfinite(rotors).any():
+        share = 100.0 * rotor_forces(result).max(axis=2) / rotors
+        look: dict[str, Any] = {"unit": "%", "colours": colours, "limits": [100.0] * len(colours)}
+        yield plot("rotor", "Rotors, share of limit", _lines(share), 0.1, **look)
+    elif off is None and result.interpolation is None:  # else nobody knows the thrust
+        title, thrust, most = "Greatest thrust", result.thrust, mission.fleet.thrust_limit
+        look = {"unit": "N", "colours": colours, "limits": mission.agents.thrust_limit}
+        if n > _LINES:  # with different limits, thrust is drawn as a share of them
+            look["limits"] = [None, most[0]]
+            if len(set(mission.agents.thrust_limit)) > 1:
+                title, thrust = f"{title}, as share of limit", 100.0 * thrust / most
+                look |= {"unit": "%", "limits": [None, 100.0]}
+        yield plot("thrust", title, _lines(thrust), 1e-3, **look)
+    if off is not None or np.isfinite(rotors).any():
+        worst, limit = quantities.samples(result, "tracking_error").worst, limits.tracking_error
+        if off is not None:  # beside the line, the band that it may be in
+            worst = np.stack([worst, *np.fmax.reduce(off.interval, axis=2)], axis=1)
+        yield plot("off", "Tracking error", worst, 1e-4, limits=[limit], band=off is not None)
+    if len(mission.edges):
+        # Without active edges there is no error.
+        error = np.where(np.isnan(result.constraint), -1.0, np.abs(result.constraint))
+        error = error.max(axis=1, initial=-1.0)
+        error = np.where(error < 0.0, np.nan, error)
+        yield plot("error", "Constraint error", error, _FLOOR, log=True)
+    least = {"worst": "least", "least": limits.separation_always}
+    if n > 1:
+        yield plot("separation", "Separation", result.separation, 1e-3, **least)
+    if mission.obstacles:
+        yield plot("clearance", "Clearance", result.clearance, 1e-3, **least | {"least": 0.0})
