@@ -9,13 +9,13 @@ kind of log is made of so many flights; its row says in which share of them an i
 from __future__ import annotations
 
 import argparse
-import re
 import resource
 from pathlib import Path
 from time import process_time
 from typing import Any
 
 import numpy as np
+from pages import splice
 from scipy.signal import butter, lfilter
 
 import rigidfleet as rf
@@ -43,7 +43,6 @@ SHARE = 0.9
 _WIDE = 1.96
 #: Drag [N s/m] by which gusts push, small enough to damp nothing.
 _DRAG = 1e-3
-_BEGIN, _END = "<!-- evening -->", "<!-- end -->"
 
 
 def mission(seed: int | None, separation: float = 0.1) -> rf.Mission:
@@ -248,11 +247,7 @@ def main() -> int:
     text = table({kind: [judge(kind, k) for k in range(options.flights)] for kind in kinds}, cost)
     print(text)
     if options.write:
-        page = options.write.read_text(encoding="utf-8")
-        page = re.sub(
-            f"{_BEGIN}.*?{_END}", lambda _: f"{_BEGIN}\n{text}\n\n{_END}", page, flags=re.DOTALL
-        )
-        options.write.write_text(page, encoding="utf-8")
+        splice(options.write, {"evening": text})
     return int("**no**" in text)
 
 

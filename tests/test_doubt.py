@@ -290,3 +290,12 @@ def test_without_doubt_nothing_changes(capsys: pytest.CaptureFixture[str]) -> No
     data = verdict.to_dict()
     assert not {"doubt", "verdict"} & set(data)
     assert not any({"interval", "undecided"} & set(check) for check in data["checks"])
+
+
+def test_the_flights_of_the_page_are_judged(benchmark_named: Any) -> None:
+    """Of a flight of `make evening`, intervals hold; a clean one is not failed, and one that collides is not passed."""
+    evening = benchmark_named("evening")
+    rows = [evening.judge("white", seed) for seed in (0, 1)]
+    assert min(row[key] for row in rows for key in evening.HELD) > 0.9
+    assert rows[0]["clean flights failed"] == rows[1]["collisions passed"] == 0.0
+    assert evening.rows_of("white", rows).endswith("| 0 | 0 | yes |")

@@ -112,12 +112,12 @@ def _likely_flight(
     """The likely flight of a log, how ways drawn differ from it, and what is known of noise, clock and set-up."""
     logs = [Positions(c.time, c.at(c.time)[:, :3], np.ones(len(c.time))) for c in read.curves]
     sizes = [x.deviation for x in read.measured if x.deviation is not None]
-    told = len(sizes) == len(logs) and all((x > 0.0).all() for x in sizes)
-    if doubts.noise == "log" and not told:
+    known = len(sizes) == len(logs) and all((x > 0.0).all() for x in sizes)
+    if doubts.noise == "log" and not known:
         raise TrajectoryError(
             f"{read.names[0]}: the log does not say its noise. State it: --noise."
         )
-    if doubts.noise in ("log", "") and told:
+    if doubts.noise in ("log", "") and known:
         # The least of a log is the unit.
         least = float(min(x.min() for x in sizes))
         doubts = doubts._replace(noise=least)
