@@ -2,13 +2,13 @@
 
 import itertools
 import json
-import lzma
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from test_logs import log as log_file
 
 import rigidfleet as rf
 from rigidfleet._common.facts import FactTable
@@ -18,6 +18,7 @@ from rigidfleet.sweep.faults import Drill, Show
 from rigidfleet.sweep.run import fly_runs
 from rigidfleet.sweep.summary import summarise
 
+log = log_file  # the fixture
 #: Least distance of the shows here, and radius of their vehicles [m].
 SEPARATION, RADIUS = 0.6, 0.1
 
@@ -444,17 +445,11 @@ def test_trajectories_of_others_are_drilled_by_the_command(kind, tmp_path, capsy
     assert sum(case["failed"]["of"] for case in out["drill"]) == out["flown"] == 34
 
 
-def xz(name, folder):
-    """A log of the test data, unpacked into a folder."""
-    packed = Path(__file__).parent / "data" / "logs" / f"{name}.xz"
-    (folder / name).write_bytes(lzma.decompress(packed.read_bytes()))
-
-
 @pytest.mark.parametrize(
     "name", ["show-2.csv", "folder", "copter.tlog", "plane.bin", "odometry.mcap", "transforms.db3"]
 )
 def test_what_assess_reads_is_drilled_or_refused_with_the_reason(
-    name, tmp_path, capsys, monkeypatch
+    name, tmp_path, log, capsys, monkeypatch
 ):
     """What `assess` passes is drilled, what it does not read or pass is refused for the same reason; .nc: mission."""
     monkeypatch.chdir(tmp_path)
@@ -464,7 +459,7 @@ def test_what_assess_reads_is_drilled_or_refused_with_the_reason(
         (tmp_path / name / "a.csv").write_text("time,x,y,z\n0,0,0,1\n1,0,0,2\n2,1,0,2\n")
         (tmp_path / name / "b.csv").write_text("time,x,y,z\n0,3,0,1\n1,3,0,2\n2,4,0,2\n")
     elif not Path(name).exists():
-        xz(name, tmp_path)
+        log(name)
     passed = main(["assess", name, "--separation", "0.5"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     drill = [
