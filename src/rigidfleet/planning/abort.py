@@ -192,9 +192,9 @@ def _clock(begin: float, time: float, progress: Floats) -> Piecewise:
     return Piecewise(np.array([0.0, time]), piece[None])
 
 
-def _at_rates(x: Floats, clock: Floats) -> Floats:
-    """Position and three derivatives (4, K, N, 3) by the time, from those along a path and of its clock (4, K)."""
-    first, second, third = clock[1:, :, None, None]  # and the chain rule
+def _at_rates(x: Floats, rates: Floats) -> Floats:
+    """Position and three derivatives (4, K, N, 3) by the time, from those along a path and those of its clock (3, K)."""
+    first, second, third = rates[:, :, None, None]  # and the chain rule
     jerk = x[3] * first**3 + 3.0 * x[2] * first * second + x[1] * third
     return np.stack([x[0], x[1] * first, x[2] * first**2 + x[1] * second, jerk])
 
@@ -305,10 +305,10 @@ class Aborts:
         plan, x = self.plan, np.linspace(0.0, 1.0, _LOOKS)
 
         def excess(time: float) -> Floats:
-            clock = _clock(begins, time, _SLOWING).states(time * x, 4)
-            states = plan.states(clock[0], 4)
+            at, *rates = _clock(begins, time, _SLOWING).states(time * x, 4)
+            states = plan.states(at, 4)
             allowed = np.maximum(self._shares(self.limits, states), 1.0)
-            return self._shares(self.limits, _at_rates(states, clock)) / allowed
+            return self._shares(self.limits, _at_rates(states, np.array(rates))) / allowed
 
         v = plan.states(np.array([begins]), 2)[1, 0, self.left]
         speed = float(np.linalg.norm(v, axis=1).max())
