@@ -193,7 +193,7 @@ def _clock(begin: float, time: float, progress: Floats) -> Piecewise:
 
 
 def _at_rates(x: Floats, rates: Floats) -> Floats:
-    """Position and three derivatives (4, K, N, 3) by the time, from those along a path and those of its clock (3, K)."""
+    """Position and three derivatives (4, K, N, 3) by the time, along a path and its clock (3, K)."""
     first, second, third = rates[:, :, None, None]  # and the chain rule
     jerk = x[3] * first**3 + 3.0 * x[2] * first * second + x[1] * third
     return np.stack([x[0], x[1] * first, x[2] * first**2 + x[1] * second, jerk])
@@ -281,7 +281,7 @@ class Aborts:
         time = refine(time, np.interp(inside, clock.at(fine)[turn], fine[turn]), _NEAR)
         s = clock.states(time, 4)
         ends = tuple(x[:, turn] for x in plan.on(s[0, turn]).ends(4))[turn]
-        rates = s[:, :-1], s[:, 1:]
+        rates = s[1:, :-1], s[1:, 1:]
         way = Piecewise.of_ends(time, *map(_at_rates, ends, rates))
         least = _APART_FOR_EVER
         for leg in self.legs[self.leg_at(first) : self.leg_at(last) + 1]:
