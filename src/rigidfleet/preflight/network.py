@@ -120,19 +120,28 @@ def growth_at(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]) -> f
 
     every, tick = flight.radio.every, flight.radio.tick
     ticks = max(1, round(_PERIOD / tick / every)) * every
-    messages = (delay, *flight.shape, 1)
+    messages = (delay, *flight.shape)
     size = flight.size + math.prod(messages)
-    drift = np.linalg.qr(flight.drift(delay))[0] if flight.is_free else np.zeros((size, 0))
+    drift = np.zeros((size, 0))
 
     def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
         return news(0) if (k - delay) % every == 0 else 0.0
 
+    def later(z: Floats, ticks: int, grip: Floats | None = None) -> Floats:
+        sent = z[flight.size :].reshape(*messages, -1).copy()
+        _, x = flight.fly(z[: flight.size], sent, ticks, delay, arrive, grip)
+        sent = np.roll(sent, -(ticks % delay), axis=0)
+        return np.concatenate([x, sent.reshape(-1, x.shape[1])])
+
     def period_later(z: Floats) -> Floats:
-        sent = z[flight.size :].reshape(messages).copy()
-        _, x = flight.fly(z[: flight.size].reshape(-1, 1), sent, ticks, delay, arrive)
-        z = np.concatenate([x.ravel(), np.roll(sent, -(ticks % delay), axis=0).ravel()])
+        z = later(z.reshape(-1, 1), ticks)[:, 0]
         return z - drift @ (drift.T @ z)  # motions of the whole formation are projected out
 
+    if flight.is_free:
+        # No vehicle feels them once all it holds is of them: until then, nobody pulls.
+        start = np.concatenate([x := flight.free_motions(), np.zeros((size - len(x), x.shape[1]))])
+        known = math.ceil((delay + every + flight.waits) / every) * every
+        drift = np.linalg.qr(later(start, known, np.zeros((len(flight.links), x.shape[1]))))[0]
     # No class of its own: what scipy declares of this one is not how it is made.
     operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
     try:
@@ -152,9 +161,7 @@ def last_stable_delay(flight: LinearFlight) -> int:
     return _last_delay(flight, roughly, roughly, *_FINE) if roughly else 0
 
 
-def _last_delay(
-    flight: LinearFlight, first: int, most: int, accuracy: float, growth: float
-) -> int:
+def _last_delay(flight: LinearFlight, first: int, most: int, accuracy: float, growth: float) -> int:
     """Last delay in ticks up to ``most`` at which motions grow by less, looked for from ``first`` on."""
     low, high = 0, first
     while growth_at(flight, high, accuracy) < growth:
