@@ -37,20 +37,18 @@ class Area(Part):
 
     name: str = key("name; default: the kind and a number", "")
     polygon: _Ring | None = key(
-        "corners [x, y] [m], in order, either way round; the last one is joined to the first", None
+        "corners [x, y] [m], in order, either way round; the last one is joined to the first"
     )
     holes: tuple[_Ring, ...] = key("polygons that are cut out, each with corners [x, y] [m]", ())
     coordinates: Annotated[tuple[_Polygon, ...], Field(min_length=1)] | None = key(
         "instead of polygon: coordinates of a GeoJSON MultiPolygon, [longitude, latitude] [deg], WGS 84: a list of "
-        "polygons, each a list of rings: its border, then its holes; needs [geodetic_origin]",
-        None,
+        "polygons, each a list of rings: its border, then its holes; needs [geodetic_origin]"
     )
     file: str | None = key(
-        "instead of polygon: a GeoJSON file, relative to the mission file; the result holds its coordinates",
-        None,
+        "instead of polygon: a GeoJSON file, relative to the mission file; the result holds its coordinates"
     )
-    floor: Coordinate | None = key("height of the underside [m]", None)
-    ceiling: Coordinate | None = key("height of the upper side [m]", None)
+    floor: Coordinate | None = key("height of the underside [m]")
+    ceiling: Coordinate | None = key("height of the upper side [m]")
 
     def polygons(self, origin: Any) -> list[list[Floats]]:
         """Polygons, each its border and its holes, as corners (m, 2) [m]; ``origin`` is the mission's geodetic one.
