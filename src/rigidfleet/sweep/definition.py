@@ -453,12 +453,10 @@ class _Check:
                 self.add((name,), *unknown_key(name, known))
         own = {key: value for key, value in self.data.items() if key in SweepHeader.model_fields}
         header = self.collector.validate(SweepHeader, own, ())
-        drill = None if header is None else header.drill
-        variations: list[Variation] = []
         if "drill" not in self.data:
             variations = self._variations(header)
-        elif header is not None:
-            variations = self._cases(drill or Drill())
+        else:
+            variations = [] if header is None else self._cases(header.drill or Drill())
         if self.collector.findings or header is None:
             raise SweepError(self.collector.findings)
         return variations, header

@@ -10,6 +10,7 @@ constraint.solver = choice(iterated, exact)
 from __future__ import annotations
 
 import json
+import operator
 import re
 import sys
 from abc import abstractmethod
@@ -24,10 +25,9 @@ from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission.findings import suggest
 from rigidfleet.mission.values import Number, Part, Positive, key, required_key
 
-#: Signs in a line, and the change that each stands for.
-SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
-
-
+#: Signs in a line, and the change that each stands for; what each change makes of a number and a value.
+_SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
+_CHANGES = {"set": lambda _, value: value, "add": operator.add, "scale": operator.mul}
 #: Greatest number, as an integer may be beyond.
 _MOST = sys.float_info.max
 
@@ -52,12 +52,7 @@ class Variation(Part):
 
     def apply(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
-        match self.change:
-            case "add":
-                return there + value
-            case "scale":
-                return there * value
-        return value
+        return _CHANGES[self.change](there, value)
 
     def quantile(self, u: float) -> Any:
         """Value at the fraction u of a distribution, in (0, 1)."""
@@ -246,7 +241,7 @@ def from_line(line: str) -> dict[str, Any]:
     if match is None:
         raise NotationError("is not a valid variation", _FORM)
     path, sign, kind, inside = match.groups()
-    data = {"path": path, "change": SIGNS[sign], "kind": kind}
+    data = {"path": path, "change": _SIGNS[sign], "kind": kind}
     if kind not in KINDS:
         remedy = suggest(kind, KINDS) or f"use one of {', '.join(KINDS)}"
         raise NotationError(f"there is no distribution or grid '{kind}'", remedy)
