@@ -179,7 +179,9 @@ def test_files_of_vehicles_are_what_is_flown(tmp_path: Path, to: str, T: float) 
     """A vehicle that knows its trajectory and its file flies as `run --abort-at` does, which passes its verdict."""
     check_aborts(show(to=to, step=T)).write(tmp_path)
     result = rf.simulate(show(to=to, at=T))
-    assert rf.assess(result).passed
+    verdict = rf.assess(result)
+    assert verdict.passed
+    assert "phases abandoned after the order" in verdict.summary
     plain = rf.simulate(show(to=to))
     for i in (0, 7):
         table = json.loads((tmp_path / f"vehicle-{i + 1:04d}.json").read_text())
