@@ -399,9 +399,9 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
     when = mission.abandons_at
     if not when < measured.result.time[-1]:
         return
-    what, at = f"loss of {mission.first_lost}", mission.first_loss
+    who, what, at = "a loss", f"loss of {mission.first_lost}", mission.first_loss
     if mission.on_loss == "continue" or at > when:
-        what, at = "order to abort", when - mission.aborting.reaction
+        who, what, at = "the order", "order to abort", when - mission.aborting.reaction
     begun = sum(p.t_start < when for p in flown)
     left = [p.name for p in flown if p.abandoned]
     never = [phase.name for phase in mission.phases[begun:]]
@@ -414,7 +414,7 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
         )
     words = f"after the {what} at {at:.2f} s, {'; '.join(parts)}"
     yield CheckResult(
-        "abandoned", True, words, float(len(left + never)), None, "", when=when, judged=False
+        "abandoned", True, words, float(len(left + never)), when=when, who=who, judged=False
     )
 
 

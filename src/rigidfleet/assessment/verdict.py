@@ -33,7 +33,7 @@ _PRAISE = {
     "clearance_start": "agents start {worst} above an obstacle",
     "clearance_end": "agents land {worst} above an obstacle",
     "lost": "lost vehicles stay {worst} away from the others",
-    "abandoned": "phases abandoned after a loss: {worst}",
+    "abandoned": "phases abandoned after {who}: {worst}",
     "thrust_peak": "thrust peaks at {worst} ({who})",
     "thrust": "thrust peaks at {worst}",
     "rotor_force": "rotors peak at {worst} of {limit}",
