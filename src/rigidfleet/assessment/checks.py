@@ -158,7 +158,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         held = False
         if p.distances is not None:
             if p.formation not in limits:
-                shortest = float(measured.formation(p.formation)[2].min())
+                shortest = float(measured.mission.formation_distances(p.formation).min())
                 form = measured.mission.formations[p.formation]
                 limits[p.formation] = form.greatest_error(shortest)
             limit = limits[p.formation]
