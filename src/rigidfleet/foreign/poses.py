@@ -3,17 +3,20 @@
 Sources: the definitions of `geometry_msgs`, `nav_msgs`, `sensor_msgs` and `tf2_msgs` (ROS 2's common_interfaces and
 geometry2), `NamedPoseArray` of motion_capture_tracking_interfaces; CDR: after 4 bytes that say the order of bytes, each
 field is aligned to its size; rosbag2's tables (`rosbag2_storage_sqlite3`); and REP 103: frames are east, north, up, and
-one whose name ends in ``_ned`` is north, east, down.
+one whose name ends in ``_ned`` is north, east, down. Messages of `px4_msgs` are those of PX4's own logs. Their fields
+differ from version to version: the definition in the recording says where each is.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import sqlite3
 import struct
 from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +26,8 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import Channel, Log, choose
-from rigidfleet.typing import Floats
+from rigidfleet.foreign.logs import RANK, Channel, Log, channel_of_px4, choose
+from rigidfleet.typing import Floats, Ints
 
 MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _BILLION = 1_000_000_000
@@ -51,10 +54,18 @@ _NUMBERS = {
 }  # fmt: skip
 
 
+#: What is no log of places, and what to give instead.
+_PATH = "is a path that is planned, not a log: give poses, odometry or transforms of what flew"
+_UNDEFINED = (
+    "is of PX4, and the recording does not define it: record as MCAP, or give PX4's own log (.ulg)"
+)
+
+
 class _Rows(NamedTuple):
-    """Kind and frame of the first message of a vehicle; stamps [ns] and numbers of all."""
+    """Kind, names of fields if they are PX4's, and frame of the first message of a vehicle; stamps [ns] and numbers."""
 
     message: str
+    fields: tuple[str, ...]
     frame: str
     stamps: array[int]
     numbers: array[float]
@@ -71,13 +82,18 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         The package `mcap` is missing, the recording is damaged, or has no positions.
     """
     rows: dict[str, _Rows] = {}
+    unread: dict[str, str] = {}
     try:
-        for topic, kind, data, received in (each for path in paths for each in _messages(path)):
+        for topic, kind, definition, data, received in (
+            each for path in paths for each in _messages(path, unread)
+        ):
+            layout = _layout(definition, data[1:2] == b"\1") if definition else None
             try:
-                for who, frame, stamp, numbers in _decode(kind, data):
-                    own = rows.setdefault(
-                        f"{topic}{who}", _Rows(kind, frame, array("q"), array("d"))
-                    )
+                for who, frame, stamp, numbers in _decode(kind, layout, data):
+                    if (own := rows.get(f"{topic}{who}")) is None:
+                        fields = (layout.names or ()) if layout else ()
+                        own = _Rows(kind, fields, frame, array("q"), array("d"))
+                        rows[f"{topic}{who}"] = own
                     own.stamps.append(stamp or received)
                     own.numbers.extend(numbers)
             except struct.error:
@@ -92,7 +108,10 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
             raise
         reason = " ".join(str(error).split()) or type(error).__name__
         raise fault(f"the recording is damaged ({reason})", "Record again") from None
-    channels = [Channel(name, own.message, _columns(own), own.frame) for name, own in rows.items()]
+    if unread and not rows:
+        topic, why = next(iter(unread.items()))
+        raise fault(f"{topic}: {why}")
+    channels = [_channel(topic, own) for topic, own in rows.items()]
     chosen, notes = choose(channels, topics), []
     if not topics:
         chosen = [c for c in chosen if c.message == chosen[0].message]
@@ -102,30 +121,54 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         notes = [f"topics that are not read: {', '.join(others)}; --topic may name them"] * bool(
             others
         )
-    return Log({c.topic: [c] for c in chosen}, "that of the stamps in messages", None, tuple(notes))
+    clock = "that of the stamps in messages"
+    if any("received" in c.columns for c in chosen):
+        clock = "that of who recorded, less the shortest delay"
+    notes += [f"{topic} is not read: it {why}" for topic, why in unread.items()]
+    return Log({c.topic: [c] for c in chosen}, clock, None, tuple(notes))
 
 
-def _messages(path: Path) -> Iterator[tuple[str, str, bytes, int]]:
-    """Topic, kind, content and time of recording [ns] of each message with positions."""
+def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, str, bytes, int]]:
+    """Topic, kind, definition ("" but of PX4's), content and time of recording [ns] of each message with positions.
+
+    Topics that seem to have some and cannot be read get a reason in ``unread``.
+    """
     with path.open("rb") as stream:
         records = _records_of_sqlite if stream.read(16) == SQLITE else _records_of_mcap
-    for topic, name, code, data, received in records(path):
-        if (kind := name.rpartition("/")[2]) in _NUMBERS and topic != "/tf_static":
+    for topic, name, code, definition, data, received in records(path):
+        package, kind = name.partition("/")[0], name.rpartition("/")[2]
+        own = package == "px4_msgs"
+        if own:
+            kind = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind).lower()  # as PX4's logs name it
+        if name == "nav_msgs/msg/Path":
+            unread[topic] = _PATH
+        elif own and kind in RANK and not definition:
+            unread[topic] = _UNDEFINED
+        elif kind in (RANK if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
                 raise fault(f"{topic}: is encoded as {code!r}, not as CDR")
-            yield topic, kind, data, received
+            yield topic, kind, definition if own else "", data, received
 
 
-def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, bytes, int]]:
+def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, str, bytes, int]]:
+    """Topic, name and code of its messages, their definition, content and time of recording [ns]."""
     query = (
         "SELECT name, type, serialization_format, data, timestamp FROM messages JOIN topics ON topics.id = topic_id "
         f"WHERE length(data) < {_MESSAGE} ORDER BY timestamp"
     )
     with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)) as base:
-        yield from base.execute(query)
+        defined: dict[str, str] = {}
+        if base.execute(
+            "SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'"
+        ).fetchone():
+            columns = "topic_type, encoded_message_definition"
+            defined = dict(base.execute(f"SELECT {columns} FROM message_definitions"))
+        for topic, name, code, data, received in base.execute(query):
+            yield topic, name, code, defined.get(name, ""), data, received
 
 
-def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, bytes, int]]:
+def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, int]]:
+    """The same, of an MCAP."""
     if find_spec("mcap") is None:
         raise fault("needs the package 'mcap'", "Run: pip install rigidfleet[logs]")
     from mcap.reader import make_reader
@@ -139,12 +182,35 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, bytes, int]]:
                 raise fault(f"a chunk of it {more}", "Record poses")
         stream.seek(0)
         for schema, channel, message in make_reader(stream).iter_messages():
-            name = "" if schema is None else schema.name
-            yield channel.topic, name, channel.message_encoding, message.data, message.log_time
+            name, text = ("", b"") if schema is None else (schema.name, schema.data)
+            code, definition = channel.message_encoding, text.decode(errors="replace")
+            yield channel.topic, name, code, definition, message.data, message.log_time
 
 
-def _decode(kind: str, data: bytes) -> Iterator[tuple[str, str, int, Sequence[float]]]:
-    """Body ("" if the topic is of one), frame, stamp [ns] and numbers of each position in a message."""
+@lru_cache(100)
+def _layout(definition: str, little: bool) -> np.dtype[Any]:
+    """Where the fields of a message are after its first 4 bytes, if all have one size."""
+    fields, at = dict[str, tuple[np.dtype[Any], int]](), 0
+    line = r"(?m)^[ \t]*(\w+)(?:\[(\d+)\])?[ \t]+(\w+)[ \t]*(?:#.*)?$"
+    for kind, count, name in re.findall(line, definition.partition("\n===")[0]):
+        own = np.dtype(kind).newbyteorder("<" if little else ">")
+        at += -at % own.itemsize
+        for k in range(int(count or 1)):
+            fields[f"{name}[{k}]" if count else name] = own, at
+            at += own.itemsize
+    forms, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": [*fields], "formats": forms, "offsets": offsets, "itemsize": at})
+
+
+def _decode(
+    kind: str, layout: np.dtype[Any] | None, data: bytes
+) -> Iterator[tuple[str, str, int, Sequence[float]]]:
+    """Body ("" if the topic is of one), frame, stamp [ns] or 0, and numbers of each position in a message."""
+    if layout is not None:
+        if len(data) < 4 + layout.itemsize:
+            raise struct.error
+        yield "", "", 0, np.frombuffer(data, layout, 1, 4).item()
+        return
     order, at = "<" if data[1:2] == b"\1" else ">", 4
 
     def read(form: str) -> tuple[Any, ...]:
@@ -175,10 +241,17 @@ def _decode(kind: str, data: bytes) -> Iterator[tuple[str, str, int, Sequence[fl
         yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind]}d")
 
 
-def _columns(rows: _Rows) -> dict[str, Floats]:
+def _channel(topic: str, rows: _Rows) -> Channel:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
     table, time = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1), np.asarray(rows.stamps)
-    if rows.message == "NavSatFix":
+    if rows.fields:
+        columns = {"received": time} | dict(zip(rows.fields, table.T, strict=True))
+        return channel_of_px4(topic, rows.message, columns)
+    return Channel(topic, rows.message, _columns(rows.message, table, time), rows.frame)
+
+
+def _columns(message: str, table: Floats, time: Ints) -> dict[str, Any]:
+    if message == "NavSatFix":
         return dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
     known = np.asarray(np.abs(table[:, :7]).max(axis=1) < _FAR)
     columns: dict[str, Any] = {
