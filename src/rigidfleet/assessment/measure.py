@@ -110,11 +110,8 @@ class Measurements:
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
-        if quantity(name).by_phase:
-            every = [worst[name] for worst in self.worst_by_phase if name in worst]
-            rank = QUANTITIES[name].rank
-            return max(every, key=lambda e: rank(e.value), default=None)
-        return self.worst_among(name, self.samples_of(name) if name in SAMPLED else None)
+        known = quantity(name).by_phase or name in SAMPLED
+        return self.worst_among(name, self.samples_of(name) if known else None)
 
     def worst_among(self, name: str, values: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``values`` at samples, or between them."""

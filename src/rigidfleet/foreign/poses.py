@@ -38,6 +38,7 @@ _FAR = 1e9
 #: What reading a damaged recording raises, besides the errors of `mcap`.
 _DAMAGED = (
     ValueError,
+    TypeError,
     OverflowError,
     EOFError,
     KeyError,
