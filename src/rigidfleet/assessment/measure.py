@@ -96,12 +96,6 @@ class Measurements:
 
     # -- between samples ------------------------------------------------------------------------------
 
-    def recorded_extreme(self, name: str, index: int) -> Extreme | None:
-        """The recorded extreme of a phase in continuous time; None if the record has none."""
-        phase = self.result.phases[index]
-        x = phase.extremes.get(name)
-        return None if x is None else self.extreme_of(name, x, phase.name)
-
     def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
@@ -116,12 +110,12 @@ class Measurements:
     def worst_among(self, name: str, values: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``values`` at samples, or between them."""
         rank = quantity(name).rank
-        every = {
-            k: rank(p.extremes[name].value)
-            for k, p in enumerate(self.result.phases)
+        every = [
+            self.extreme_of(name, p.extremes[name], p.name)
+            for p in self.result.phases
             if name in p.extremes
-        }
-        between = self.recorded_extreme(name, max(every, key=every.__getitem__)) if every else None
+        ]
+        between = max(every, key=lambda e: rank(e.value), default=None)
         sampled = None if values is None else self.worst_sample(values, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
@@ -145,9 +139,9 @@ class Measurements:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
         if e.value > 0.0:
             return None
-        every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
-        if every:
-            return self.recorded_extreme(f"{name}_first", every[0])
+        for phase in self.result.phases:
+            if (x := phase.extremes.get(f"{name}_first")) is not None:
+                return self.extreme_of(f"{name}_first", x, phase.name)
         sampled = self.samples_of(name)
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
@@ -197,25 +191,17 @@ class Measurements:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
-        reach = float(max(r.max(initial=0.0), -r.min(initial=0.0)))
-        if math.isnan(reach):
-            reach = float(np.nanmax(np.abs(r), initial=0.0))
-        rounding = 1e-9 * (1.0 + reach)
+        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(r), initial=0.0)))
         stored = {}
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             for name in ("separation", "clearance"):
                 if name in vars(result):  # else it would be made of these very positions
-                    stored[name] = getattr(result, name) - getattr(self.close, name), "m"
-        stored |= {
-            "distance": (
-                np.abs(proximity.lengths(r, result.edges).T - result.distance),
-                "m",
-            ),
-            "thrust": (self.samples_of("thrust").values - result.thrust, "N"),
-        }
-        for name, (off, unit) in stored.items():
-            wrong = off > (rounding if unit == "m" else 1e-6)
-            if wrong.any():
+                    stored[name] = getattr(result, name) - getattr(self.close, name)
+        stored["distance"] = np.abs(proximity.lengths(r, result.edges).T - result.distance)
+        stored["thrust"] = self.samples_of("thrust").values - result.thrust
+        for name, off in stored.items():
+            unit, least = ("N", 1e-6) if name == "thrust" else ("m", rounding)
+            if (wrong := off > least).any():
                 k = int(np.argmax(wrong.reshape(len(time), -1).any(axis=1)))
                 worst = float(off[wrong].max())
                 words = (

@@ -97,11 +97,7 @@ def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
         )
     yield from result.statistics.get("notes", [])
     names = result.statistics.get("names", [])
-    known = (
-        [f"agent {k}" for k in range(1, len(names) + 1)],
-        [f"{k + 1}" for k in range(len(names))],
-    )
-    if names and names not in known:
+    if [name.removeprefix("agent ") for name in names] != [f"{k + 1}" for k in range(len(names))]:
         more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
         yield f"agents from 1 on are {', '.join(names[:_NAMED])}{more}"
 

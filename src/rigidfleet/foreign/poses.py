@@ -15,7 +15,7 @@ import sqlite3
 import struct
 from array import array
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,18 +35,6 @@ _BILLION = 1_000_000_000
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: What no position [m] or quaternion reaches.
 _FAR = 1e9
-#: What reading a damaged recording raises, besides the errors of `mcap`.
-_DAMAGED = (
-    ValueError,
-    TypeError,
-    OverflowError,
-    EOFError,
-    KeyError,
-    struct.error,
-    RuntimeError,
-    MemoryError,
-    sqlite3.Error,
-)
 #: Numbers of a message after its names: a position and a quaternion (7), the covariance of a pose (36, by rows), and a
 #: velocity in the vehicle's axes (3); or latitude, longitude [deg] and height [m] (3).
 _NUMBERS = {
@@ -63,10 +51,10 @@ _UNDEFINED = (
 
 
 class _Rows(NamedTuple):
-    """Kind, names of fields if they are PX4's, and frame of the first message of a vehicle; stamps [ns] and numbers."""
+    """Kind, layout if it is PX4's, and frame of the first message of a vehicle; stamps [ns] and numbers of all."""
 
     message: str
-    fields: tuple[str, ...]
+    layout: np.dtype[Any] | None
     frame: str
     stamps: array[int]
     numbers: array[float]
@@ -91,10 +79,8 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
             layout = _layout(definition, data[1:2] == b"\1") if definition else None
             try:
                 for who, frame, stamp, numbers in _decode(kind, layout, data):
-                    if (own := rows.get(f"{topic}{who}")) is None:
-                        fields = (layout.names or ()) if layout else ()
-                        own = _Rows(kind, fields, frame, array("q"), array("d"))
-                        rows[f"{topic}{who}"] = own
+                    new = _Rows(kind, layout, frame, array("q"), array("d"))
+                    own = rows.setdefault(f"{topic}{who}", new)
                     own.stamps.append(stamp or received)
                     own.numbers.extend(numbers)
             except struct.error:
@@ -104,9 +90,7 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         raise
     except ImportError as error:
         raise fault(f"is compressed, and a package is missing ({error})") from None
-    except Exception as error:
-        if not isinstance(error, _DAMAGED) and type(error).__module__ != "mcap.exceptions":
-            raise
+    except Exception as error:  # a damaged recording leads its packages to any
         reason = " ".join(str(error).split()) or type(error).__name__
         raise fault(f"the recording is damaged ({reason})", "Record again") from None
     if unread and not rows:
@@ -159,11 +143,9 @@ def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, str, bytes, 
     )
     with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)) as base:
         defined: dict[str, str] = {}
-        if base.execute(
-            "SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'"
-        ).fetchone():
+        with suppress(sqlite3.OperationalError):  # before ROS 2 Iron there is no such table
             columns = "topic_type, encoded_message_definition"
-            defined = dict(base.execute(f"SELECT {columns} FROM message_definitions"))
+            defined.update(base.execute(f"SELECT {columns} FROM message_definitions"))
         for topic, name, code, data, received in base.execute(query):
             yield topic, name, code, defined.get(name, ""), data, received
 
@@ -245,8 +227,8 @@ def _decode(
 def _channel(topic: str, rows: _Rows) -> Channel:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
     table, time = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1), np.asarray(rows.stamps)
-    if rows.fields:
-        columns = {"received": time} | dict(zip(rows.fields, table.T, strict=True))
+    if rows.layout is not None:
+        columns = {"received": time} | dict(zip(rows.layout.names or (), table.T, strict=True))
         return channel_of_px4(topic, rows.message, columns)
     return Channel(topic, rows.message, _columns(rows.message, table, time), rows.frame)
 
