@@ -233,17 +233,14 @@ class Measurements:
 
     def is_due(self, name: str, index: int) -> bool:
         """Whether a phase that has samples has a worst value of a quantity between them."""
-        match name:
-            case "thrust":
-                return self.rank(name, index) > -math.inf
-            case "separation":
-                return bool(np.count_nonzero(self.left[self.parts[index].start]) > 1)
-            case "clearance":
-                phase, every = self.result.phases[index], self.mission.obstacles
-                return any(_meets(*thing.solid.there[0].tolist(), phase) for thing in every)
-            case "geofence":
-                return self.mission.limits.geofence is not None
-        return True
+        if name == "geofence":
+            return self.mission.limits.geofence is not None
+        if name != "clearance":
+            return self.rank(name, index) > -math.inf
+        # An obstacle that is there at the start or the end of a phase alone is not in it.
+        phase = self.result.phases[index]
+        there = (thing.solid.there[0] for thing in self.mission.obstacles)
+        return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -367,11 +364,6 @@ class Measurements:
             miss, v = math.dist(result.cm[k].tolist(), point["position"]), point.get("velocity")
             off = None if v is None else math.dist(result.cm_velocity[k].tolist(), v)
             yield Waypoint(float(result.time[k]), miss, off, None, None)
-
-
-def _meets(since: float, until: float, phase: PhaseRecord) -> bool:
-    """Whether an obstacle that is there from when to when [s] is there during a phase, not only at its start or end."""
-    return since < phase.t_end - 1e-9 and until > phase.t_start + 1e-9
 
 
 def _greatest(values: Floats) -> float | None:

@@ -27,7 +27,6 @@ import numpy as np
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
 from rigidfleet.foreign.logs import RANK, Channel, Log, channel_of_px4, choose
-from rigidfleet.typing import Floats, Ints
 
 MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _BILLION = 1_000_000_000
@@ -230,14 +229,11 @@ def _channel(topic: str, rows: _Rows) -> Channel:
     if rows.layout is not None:
         columns = {"received": time} | dict(zip(rows.layout.names or (), table.T, strict=True))
         return channel_of_px4(topic, rows.message, columns)
-    return Channel(topic, rows.message, _columns(rows.message, table, time), rows.frame)
-
-
-def _columns(message: str, table: Floats, time: Ints) -> dict[str, Any]:
-    if message == "NavSatFix":
-        return dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
+    if rows.message == "NavSatFix":
+        columns = dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
+        return Channel(topic, rows.message, columns, rows.frame)
     known = np.asarray(np.abs(table[:, :7]).max(axis=1) < _FAR)
-    columns: dict[str, Any] = {
+    columns = {
         "time": time, "x": np.where(known, table[:, 0], np.nan),
         "y": table[:, 1], "z": table[:, 2], "yaw": yaws_of(np.where(known[:, None], table[:, 3:7], 0.0)),
     }  # fmt: skip
@@ -247,4 +243,4 @@ def _columns(message: str, table: Floats, time: Ints) -> dict[str, Any]:
         vector, scalar, v = table[:, 3:6], table[:, 6:7], table[:, 43:46]
         v = v + 2.0 * np.cross(vector, np.cross(vector, v) + scalar * v)
         columns |= {f"v{axis}": v[:, k] for k, axis in enumerate("xyz")}
-    return columns
+    return Channel(topic, rows.message, columns, rows.frame)
