@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -204,20 +205,11 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
 
 
 def _check_at_end(
-    p: PhaseVerdict,
-    check: str,
-    passed: bool,
-    words: str,
-    worst: float | None = None,
-    limit: float | None = None,
-    unit: str = "",
-    who: str = "",
+    p: PhaseVerdict, check: str, passed: bool, words: str, *judged: Any, who: str = ""
 ) -> CheckResult:
-    """A finding about the end of a phase."""
+    """A finding about the end of a phase; ``judged``: the worst value, its limit and their unit."""
     words = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {words}"
-    return CheckResult(
-        check, passed, words, worst, limit, unit, when=p.t_end, who=who, phase=p.name
-    )
+    return CheckResult(check, passed, words, *judged, when=p.t_end, who=who, phase=p.name)
 
 
 def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
@@ -438,15 +430,11 @@ def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]
     if beyond is None:
         yield limit_check(q, e, None)
         return
-
-    def limit(who: str) -> float:
-        return float(limits[int(who.removeprefix("agent ")) - 1])
-
-    if e.value - limit(e.who) < beyond.value:
+    own = {f"agent {i + 1}": most for i, most in enumerate(limits.tolist())}
+    if e.value - own[e.who] < beyond.value:
         yield limit_check(quantity("thrust_peak"), e, None)
-        most = limit(beyond.who)
-        e = replace(beyond, value=beyond.value + most)
-    yield limit_check(q, e, limit(e.who))
+        e = replace(beyond, value=beyond.value + own[beyond.who])
+    yield limit_check(q, e, own[e.who])
 
 
 def _rotor_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:

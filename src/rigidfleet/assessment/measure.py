@@ -35,6 +35,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 #: Quantities of which a phase between samples has a worst value.
 _DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geofence")
 
+#: What a verdict on a phase repeats of its record.
+_OF_RECORD = ("name", "kind", "control", "formation", "t_start", "t_end", "settled")
+
 
 class Measurements:
     """Measures a result phase by phase, at samples (recomputed from positions and forces) and between them."""
@@ -249,13 +252,7 @@ class Measurements:
         finished = finished and not record.abandoned
         fit = self.fits.get(index)
         return PhaseVerdict(
-            name=record.name,
-            kind=record.kind,
-            control=record.control,
-            formation=record.formation,
-            t_start=record.t_start,
-            t_end=record.t_end,
-            settled=record.settled,
+            **{key: getattr(record, key) for key in _OF_RECORD},
             finished=finished,
             constraint=_greatest(result.constraint[self.parts[index].stop - 1]) if flown else None,
             distances=self.edge_error(index),
