@@ -212,10 +212,9 @@ def trajectories_of(
                 reasons.append(str(error).rstrip("."))
         else:
             raise fault("; ".join(reasons[:_LISTED]), "Name a topic that has valid positions")
-        others = ", ".join([c.topic for c in channels if c is not channel and not topics][:_LISTED])
-        words = f"positions are those of {channel.topic}" + f"; --topic may name {others}" * bool(
-            others
-        )
+        words = f"positions are those of {channel.topic}"
+        if others := [c.topic for c in channels if c is not channel and not topics][:_LISTED]:
+            words += f"; --topic may name {', '.join(others)}"
         for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
             notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
@@ -227,9 +226,8 @@ def trajectories_of(
         where = lambda k, topic=track.topic: f"{topic}: message {k + 1}"  # noqa: E731
         curves.append(curve_through_samples(time, track.place, track.yaw, interpolation, where))
         size = len(curves[-1].time), 3  # a single sample stays for a second
-        each = (
-            None if x is None else np.resize(x, size) for x in (track.velocity, track.deviation)
-        )
+        both = track.velocity, track.deviation
+        each = (None if x is None else np.resize(x, size) for x in both)
         measured.append(LoggedStates(*each, track.resets))
     frames = [*dict.fromkeys(track.frame for track in tracks.values())]
     if len(frames) > 1:

@@ -102,9 +102,8 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         parts = {c.topic.rpartition(":")[2] for c in chosen if c.message == "TFMessage"}
         chosen = [c for c in chosen if c.frame not in parts]  # what moves in a body is a part of it
         others = sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]
-        notes = [f"topics that are not read: {', '.join(others)}; --topic may name them"] * bool(
-            others
-        )
+        if others:
+            notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")
     clock = "that of the stamps in messages"
     if any("received" in c.columns for c in chosen):
         clock = "that of who recorded, less the shortest delay"
