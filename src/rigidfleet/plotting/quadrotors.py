@@ -34,8 +34,9 @@ def rotor_limits(mission: Mission) -> Floats:
 
 
 def has_rotors(result: Result) -> bool:
-    """Whether a vehicle with rotors flies."""
-    return result.rotor_force is not None and bool(np.isfinite(rotor_limits(result.mission)).any())
+    """Whether a vehicle with rotors flies, and what they give is known: a log beside its plan does not say it."""
+    known = result.rotor_force is not None and "doubt" not in result.statistics
+    return known and bool(np.isfinite(rotor_limits(result.mission)).any())
 
 
 def rotor_forces(result: Result) -> Floats:
@@ -153,7 +154,7 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
 
 def _saturation_mask(result: Result) -> Bools:
     """Mask (K, N) of the vehicles that cannot give what is asked of them."""
-    if result.saturated is None:
+    if result.saturated is None or not has_rotors(result):
         return np.zeros(result.left.shape, dtype=np.bool_)
     return (result.saturated != 0) & result.left
 

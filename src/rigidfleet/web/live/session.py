@@ -9,6 +9,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -144,10 +145,8 @@ class Session:
     def _send_to_pages(self, message: bytes) -> None:
         with self.lock:
             for messages in self.pages:
-                try:
+                with suppress(queue.Full):
                     messages.put_nowait(message)
-                except queue.Full:
-                    continue
 
     def _sample_event(self) -> bytes:
         """The last sample as numbers: time and the columns of the page, one after the other."""
