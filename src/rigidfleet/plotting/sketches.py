@@ -81,12 +81,8 @@ def formations(result: Result) -> Figure:
         _draw_formation(fig, rect, result, name)
     if legend:
         entries = curves.edge_handles(result)
-        fig.legend(
-            handles=entries,
-            loc="lower center",
-            ncols=min(int(fig.get_figwidth() / 2.2), len(entries)),
-            borderaxespad=0.8,
-        )
+        columns = min(int(fig.get_figwidth() / 2.2), len(entries))
+        fig.legend(handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8)
     return fig
 
 
@@ -168,10 +164,7 @@ def draw_graph(
     ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
     ax.axis("off")
     if lights:
-        from matplotlib.patches import Rectangle
-
-        night: Any = {"facecolor": st.NIGHT, "linewidth": 0, "zorder": 0}
-        ax.add_patch(Rectangle((-room, -room), 2 * room, 2 * room, **night, gid="night"))
+        ax.axhspan(-room, room, facecolor=st.NIGHT, linewidth=0, zorder=0, gid="night")
     shown = lights or st.agent_colours(n)
     if n > st.MANY:
         _draw_mesh(ax, p, edges, colours, shown)
@@ -216,9 +209,8 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Seque
     from matplotlib.colors import to_rgba_array
 
     depth = p[:, 2] - p[:, 2].min()
-    depth = (
-        0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if np.ptp(p[:, 2]) else 1 + 0 * depth
-    )
+    # All are as near as the nearest if none is deeper.
+    depth = 0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if depth.any() else 1.0 + depth
     if len(edges):
         near = depth[edges].mean(axis=1)
         order = np.argsort(near)

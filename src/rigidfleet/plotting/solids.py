@@ -33,19 +33,21 @@ class DrawnObstacle:
     name: str
     zone: bool
     plain: bool  # whether it is a box along the axes, which is seen through
-    terrain: bool
     surface: Outline  # without motion
     at: Floats  # (M, 3) displacements at which it is drawn, in order of time [m]
     way: Floats  # (W, 3) displacements over the flight [m]
     grid: tuple[Floats, Floats, Floats] | None  # x, y and heights of a height map
 
     @property
+    def terrain(self) -> bool:
+        """Whether it is a height map."""
+        return self.grid is not None
+
+    @property
     def ends(self) -> Floats:
         """Lowest and highest corner (2, 3) [m] of all places at which it is drawn."""
         points = self.surface.triangles.reshape(-1, 3)
-        return np.array(
-            [points.min(axis=0) + self.at.min(axis=0), points.max(axis=0) + self.at.max(axis=0)]
-        )
+        return np.array([f(points, axis=0) + f(self.at, axis=0) for f in (np.min, np.max)])
 
 
 def drawn_obstacles(
@@ -67,15 +69,11 @@ def drawn_obstacles(
             way = places(solid, np.linspace(since, until, _WAY))
         grid = None
         if solid.kind[0] == HEIGHTS:
-            x, y = (
-                solid.origin[0, k] + np.linspace(0.0, solid.size[0, 3 + k], n)
-                for k, n in enumerate(solid.grid[0])
-            )
-            grid = x, y, solid.heights.reshape(solid.grid[0])
-        terrain = grid is not None
-        shape = DrawnObstacle(thing.name, thing.zone, plain, terrain, surface, at, way, grid)
-        near = (shape.ends[1] > low) & (shape.ends[0] < high)
-        if near.all():
+            (a, b), (wide, deep), (n, m) = solid.origin[0, :2], solid.size[0, 3:5], solid.grid[0]
+            x, y = a + np.linspace(0.0, wide, n), b + np.linspace(0.0, deep, m)
+            grid = x, y, solid.heights.reshape(n, m)
+        shape = DrawnObstacle(thing.name, thing.zone, plain, surface, at, way, grid)
+        if ((shape.ends[1] > low) & (shape.ends[0] < high)).all():
             near_obstacles.append(shape)
     return near_obstacles
 

@@ -18,7 +18,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import Pose
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble
 from rigidfleet.typing import Floats, Ints
@@ -143,19 +143,9 @@ class Pilot:
         return self.flight.t
 
     @property
-    def phases(self) -> list[PhaseRecord]:
-        """Records of the phases begun."""
-        return self.flight.phases
-
-    @property
-    def ending(self) -> str:
-        """Why the flight cannot go on, "" while it can."""
-        return self.flight.ending
-
-    @property
     def formation(self) -> str:
         """The current formation, or the one being formed."""
-        return self.phases[-1].formation or ""
+        return self.flight.phases[-1].formation or ""
 
     @property
     def busy(self) -> bool:
@@ -163,7 +153,7 @@ class Pilot:
         phase = self.commanded[-1]
         settle = _STEADY if phase.control == "open" else 0.0
         blend = phase.shaping.least_time if phase.shaping is not None else 0.0
-        return self.t < self.phases[-1].t_start + blend + settle - 1e-9
+        return self.t < self.flight.phases[-1].t_start + blend + settle - 1e-9
 
     # -- commands --------------------------------------------------------------------------------
 
@@ -197,7 +187,7 @@ class Pilot:
 
     def gust(self, direction: Floats, strength: float) -> None:
         """Send a gust along ``direction`` (3,), at most ``strength`` [N/kg]."""
-        if self.ending:
+        if self.flight.ending:
             return
         d = direction / np.linalg.norm(direction)
         self.gusted = True
@@ -273,7 +263,7 @@ class Pilot:
     def step(self) -> Result:
         """Fly one tick; return the record of its end alone.
 
-        A flight that cannot go on sets ``ending`` and stops.
+        A flight that cannot go on says why in ``flight.ending``, and stops.
         """
         flight = self.flight
         flight.pieces.clear()
@@ -302,7 +292,7 @@ class Pilot:
         if flight.pieces or self.last is None:
             end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
             # A record of one moment has no extremes
-            phases = [replace(p, extremes={}) for p in self.phases]
+            phases = [replace(p, extremes={}) for p in self.flight.phases]
             now: dict[str, Any] = {"ending": "", "statistics": {}, "network": flight.network}
             self.last = assemble(flight.mission, phases, end, **now)
             self.last.mission = flight.mission  # with the balls, and not parsed again
@@ -314,7 +304,7 @@ class Pilot:
 
         Its mission has the phases as they were flown.
         """
-        ending = self.ending
+        ending = self.flight.ending
         if not ending and self.busy:
             ending = f"ended by hand on the way to '{self.formation}'"
         flight, now = self.flight, self.flight.mission
@@ -350,7 +340,7 @@ class Pilot:
         step = self.archive.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.arange(low, high) * step
-        begun = self.archive.begun(len(self.phases) - 1)
+        begun = self.archive.begun(len(self.flight.phases) - 1)
         start = [] if begun else [t and np.nextafter(t, math.inf)]
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 

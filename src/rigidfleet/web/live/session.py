@@ -112,9 +112,9 @@ class Session:
         return {
             "phases": [
                 {"name": p.name, "start": p.t_start, "end": p.t_end, "position": None}
-                for p in pilot.phases
+                for p in pilot.flight.phases
             ],
-            "ending": pilot.ending,
+            "ending": pilot.flight.ending,
             "formation": pilot.formation,
             "waiting": pilot.waiting,
             "busy": pilot.busy,
@@ -246,7 +246,7 @@ class Session:
                 self.pace = round(flown * TICK / (now - measured) / self.speed, 1)
                 measured, flown = now, 0
             with self.lock:
-                if self.pages and not (self.paused or self.pilot.ending):
+                if self.pages and not (self.paused or self.pilot.flight.ending):
                     self.result = self.pilot.step()
                     flown += 1
                     self._send_to_pages(self._sample_event())

@@ -108,7 +108,7 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
     fine = max(typical_reach(result), *mission.agents.radius, 1e-9) / 20_000
     return {
         "position": PackedColumn(result.position, fine),
-        **_attitude_columns(result),
+        **dict(_attitude_columns(result)),
         **dict(_further_columns(result, shown, fine)),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
@@ -125,21 +125,20 @@ def _tensions(result: Result, shown: Ints) -> Floats:
     return np.where(np.isfinite(result.constraint[:, shown]), np.nan_to_num(tension), tension)
 
 
-def _attitude_columns(result: Result) -> dict[str, PackedColumn]:
+def _attitude_columns(result: Result) -> Iterator[tuple[str, PackedColumn]]:
     """Samples that turn vehicles: attitudes and shares of the rotors' limits, and of points the thrust's direction."""
-    mission, columns = result.mission, {}
+    mission = result.mission
     limits = rotor_limits(mission)
     known = np.isfinite(limits) & has_rotors(result)
     if not known.all():
         force = result.input_force + result.constraint_force
-        columns["thrust"] = PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
+        yield "thrust", PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
     q, force, saturated = result.vehicle_attitude, result.rotor_force, result.saturated
     if known.any() and q is not None and force is not None and saturated is not None:
         share = np.where(known[:, None], force / np.where(known, limits, 1.0)[:, None], 0.0)
-        columns["turn"] = PackedColumn(att.unwrap_quaternion(q.swapaxes(0, 1)).swapaxes(0, 1), 1e-3)
-        columns["rotors"] = PackedColumn(share, 0.01)
-        columns["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
-    return columns
+        yield "turn", PackedColumn(att.unwrap_quaternion(q.swapaxes(0, 1)).swapaxes(0, 1), 1e-3)
+        yield "rotors", PackedColumn(share, 0.01)
+        yield "saturated", PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
 
 
 def _further_columns(
@@ -233,11 +232,6 @@ def weight(mission: Mission) -> float:
     return float(np.mean(mission.agents.mass)) * max(mission.gravity, 1.0)
 
 
-def _line_colours(n: int) -> list[str]:
-    """Colours of `_lines` of n vehicles."""
-    return agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
-
-
 def _lines(values: Floats) -> Floats:
     """Lines (K, L) of a plot: the values (K, N) of each vehicle, or of many the least and the greatest."""
     if values.shape[1] <= _LINES:
@@ -248,7 +242,8 @@ def _lines(values: Floats) -> Floats:
 def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
     """Quantities drawn over time, as the page knows them, each with its samples."""
     mission, off, n = result.mission, off_plan(result), result.n_agents
-    limits, colours = mission.limits, _line_colours(n)
+    limits = mission.limits
+    colours = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
 
     def plot(name: str, title: str, values: Floats, step: float, **look: Any) -> Any:
         basic = {
