@@ -159,6 +159,8 @@ def draw_graph(
 
     With the colour of each agent's light, it is night.
     """
+    from matplotlib.colors import to_rgb
+
     n = len(p)
     room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
     ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
@@ -197,8 +199,9 @@ def draw_graph(
         x, y = p[i, :2]
         ax.plot(x, y, **marker_look(colour, size), zorder=5, gid=f"agent-{i + 1}")
         if size > 7:
+            light = float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
             ax.text(
-                x, y, str(i + 1), fontsize=0.6 * size, color=_letter_colour(colour), ha="center",
+                x, y, str(i + 1), fontsize=0.6 * size, color="white" if light < 0.6 else st.INK, ha="center",
                 va="center_baseline", zorder=6, fontweight="bold",
             )  # fmt: skip
 
@@ -257,9 +260,3 @@ def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:
     along = b - a
     s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
     return np.linalg.norm(points - a - s[:, None] * along, axis=1)
-
-
-def _letter_colour(colour: str) -> str:
-    from matplotlib.colors import to_rgb
-
-    return "white" if float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114))) < 0.6 else st.INK

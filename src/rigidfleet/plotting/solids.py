@@ -129,6 +129,7 @@ def _face_colours(shape: DrawnObstacle, faces: Floats, colour: str, opacity: flo
 
 def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     """Draw an obstacle from above: its outline at each place, its way, contours of a height map, and its name."""
+    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patches import Polygon
     from scipy.spatial import ConvexHull
 
@@ -137,25 +138,19 @@ def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     rim = flat[ConvexHull(flat).vertices]
     look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 1}
     dashed: dict[str, Any] = {"fill": False, "edgecolor": colour, "linestyle": (0, (4, 2))}
+    dashed |= {"linewidth": 0.8, "zorder": 1.1}
     if shape.grid is not None:
         x, y, z = shape.grid
-        ax.contourf(x, y, z.T, 8, cmap=_height_colours(), alpha=0.5, zorder=0.8)
+        low_to_high = LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])
+        ax.contourf(x, y, z.T, 8, cmap=low_to_high, alpha=0.5, zorder=0.8)
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
     for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
         patch = ax.add_patch(Polygon(rim + at[:2], **look, alpha=opacity * float(share)))
         if shape.zone:
-            border = Polygon(rim + at[:2], **dashed, linewidth=0.8, alpha=float(share), zorder=1.1)
-            ax.add_patch(border)
+            ax.add_patch(Polygon(rim + at[:2], **dashed, alpha=float(share)))
     if len(shape.way) > 1:
         way = shape.way[:, :2] + rim.mean(axis=0)
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=1.2)
     x, y = rim.mean(axis=0)[0], rim[:, 1].min()
     st.name_box(ax, patch, x + shape.at[-1, 0], y + shape.at[-1, 1], shape.name)
-
-
-def _height_colours() -> Any:
-    """Colours of a height map from its lowest to its highest."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])

@@ -245,6 +245,7 @@ class Result(Shown):
                 self._set(name, value, sizes)
         if not later:  # what a flight of this process has made is right
             self._check(sizes)
+        self._sizes = sizes
 
     def _check(self, sizes: dict[str, int]) -> None:
         """Check values: they come from somewhere else."""
@@ -304,16 +305,11 @@ class Result(Shown):
             if name in self.__dict__:  # another thread has just made it
                 return self.__dict__[name]
             raise AttributeError(f"a result has no {name!r}")
-        sizes = _LABELLED | {
-            "time": len(self.time),
-            "agent": self.n_agents,
-            "edge": len(self.edges),
-        }
         made = make()
         for key, value in made.items():
             if key in self._later and key not in self.__dict__:  # nor has somebody set it
                 if key in VARIABLES:
-                    self._set(key, value, sizes)
+                    self._set(key, value, self._sizes)
                 else:
                     setattr(self, key, value)
         # Another one, as a copy of this result may have to make the same.

@@ -370,7 +370,9 @@ class Pilot:
         r, v, a = _step_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _step_towards(away, pose.omega, self.alpha, h, _TURN)
         if self.commanded[-1].control != "open":
-            force = self._drop_passed_gusts()
+            places = self._positions() if self.gusts else np.zeros((0, 3))
+            self.gusts = [gust for gust in self.gusts if not gust.has_passed(self.t, places)]
+            force = bool(self.gusts)
             ends = (r, v, a), (phi, omega, alpha)
             self.flight.steer(h, pose, *ends, a=self.a, alpha=self.alpha, force=force)
             T = att.dcm_from_rotation_vector(phi) @ pose.T
@@ -428,10 +430,10 @@ class Pilot:
         """Tell the flight of balls that are new, gone, or fly another way."""
         for ball in self.flying:
             ball.follow_goal()
-        fresh = [ball for ball in self.flying if ball.changed]
-        for ball in fresh:
-            ball.note_turn(self.t)
-        if fresh or self.moved:
+            if ball.changed:
+                ball.note_turn(self.t)
+                self.moved = True
+        if self.moved:
             self.moved = False
             seen = [
                 ball.predicted_sphere(self.t) if ball.until is None else ball.flown_sphere(self.t)
@@ -441,17 +443,8 @@ class Pilot:
 
     # -- wind -------------------------------------------------------------------------------------
 
-    def _drop_passed_gusts(self) -> bool:
-        """Remove gusts that have passed; return whether one remains."""
-        r = self._positions() if self.gusts else np.zeros((0, 3))
-        self.gusts = [gust for gust in self.gusts if not gust.has_passed(self.t, r)]
-        return bool(self.gusts)
-
     def _wind_force(self, t: float, r: Floats, _v: Floats) -> Floats:
-        force = np.zeros_like(r)
-        for gust in self.gusts:
-            force += gust.force(t, r, self.masses)
-        return force
+        return sum((gust.force(t, r, self.masses) for gust in self.gusts), np.zeros_like(r))
 
 
 def _step_towards(

@@ -49,6 +49,7 @@ class Session:
     def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
         self.mission, self.unguarded = with_avoidance(mission)
         self.landed = landed
+        self.flown: Result | None = None  # the last flight that ended
         self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
         self.tension = _TENSION * weight(mission)
@@ -94,9 +95,10 @@ class Session:
         }
 
     def land(self) -> None:
-        """Pass the flight to ``landed``."""
-        if self.pilot.ticks > 1 and self.landed is not None:
-            self.farewell = self.landed(self.pilot.result())
+        """Keep the flight, and pass it to ``landed``."""
+        if self.pilot.ticks > 1:
+            self.flown = self.pilot.result()
+            self.farewell = self.landed(self.flown) if self.landed is not None else ""
 
     # -- pages ------------------------------------------------------------------------------------
 
@@ -186,10 +188,9 @@ class Session:
                 case {"ball": place, "radius": radius, "velocity": velocity}:
                     place, velocity = _vector(place, _FARTHEST), _vector(velocity, _FASTEST)
                     self.pilot.push_in(place, _number(radius, _FARTHEST), velocity)
-                case {"pull": int(slot), "to": None}:
-                    self.pilot.pull(slot, None)
                 case {"pull": int(slot), "to": place}:
-                    self.pilot.pull(slot, _vector(place, _FARTHEST))
+                    goal = None if place is None else _vector(place, _FARTHEST)
+                    self.pilot.pull(slot, goal)
                 case {"remove": int(slot)}:
                     self.pilot.take_out(slot)
                 case {"loss": share}:
