@@ -346,7 +346,7 @@ class Flight:
                     f"nothing of phase '{self.phases[-1].name}' has been flown: call advance before the next begin"
                 )
             if not self._reacted and self.t >= self.mission.abandons_at:
-                self._leave(changed=True)
+                self._leave_phase(changed=True)
                 self._react()
             if self._following >= len(self._route):
                 if self._unproved:
@@ -362,7 +362,7 @@ class Flight:
             phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
         else:
             check_formation(self.mission, phase)
-        self._leave(changed=True)
+        self._leave_phase(changed=True)
         if self.mission.on_loss == "continue" or not self._given(phase):
             self._now.blend = None
         if self._asked:
@@ -431,10 +431,10 @@ class Flight:
                 active.settle_by(t_end, settle, self.controller, self.rate, step)
         except StoppedError as stopped:
             self.ending = str(stopped)
-            self._leave()
+            self._leave_phase()
             return False
         except BaseException:
-            self._leave()
+            self._leave_phase()
             raise
         return self.arrive()
 
@@ -445,7 +445,7 @@ class Flight:
         self.phases[-1].t_end = active.t
         if active.has_settled or active.over:
             settled = active.has_settled
-            self._leave()
+            self._leave_phase()
             if settle is not None and not settled:
                 self.ending = (
                     f"phase '{plan.phase.name}' did not settle within {settle.timeout:g} s: at t ="
@@ -454,7 +454,7 @@ class Flight:
                 )
             return False
         if active.t >= loss:
-            self._leave(abandoned=True)
+            self._leave_phase(abandoned=True)
             return False
         return True
 
@@ -513,7 +513,7 @@ class Flight:
         FlightError
             Nothing has been flown.
         """
-        self._leave()
+        self._leave_phase()
         self.ending = ending or self.ending
         if not self.pieces:
             raise FlightError(self.ending or "the flight ended before the first time to record")
@@ -664,7 +664,7 @@ class Flight:
         k = self._following
         return plan + legs_from(self.mission, plan[-1].state_at(plan[-1].end), self._route[k:], k)
 
-    def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:
+    def _leave_phase(self, *, changed: bool = False, abandoned: bool = False) -> None:
         """End the phase under way.
 
         A target that was ``changed`` in flight, or ``abandoned`` because of a loss, is not judged as a waypoint. Points
