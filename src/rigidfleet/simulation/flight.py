@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,11 +20,12 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
+from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.legs import Leg, at_start
 from rigidfleet.planning.losses import answer_to, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
-from rigidfleet.planning.timing import timed_leg
+from rigidfleet.planning.timing import complete_times, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
@@ -38,7 +40,6 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.own_laws import Law
 from rigidfleet.simulation.point_phase import PointPhase
-from rigidfleet.simulation.preparation import preparation_of
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import FleetState, SampledPhase
 from rigidfleet.simulation.sampling import Sampling, times_asked
@@ -81,6 +82,19 @@ class Progress:
     phase: str
     wall: float
     planning: bool = False
+
+
+#: Missions flown last, as they were given and with their times known: to find ways takes longer than to fly them.
+_timed: deque[tuple[Mission, Mission]] = deque(maxlen=8)
+
+
+def _with_times(mission: Mission) -> Mission:
+    """A mission with its times known."""
+    if (timed := next((timed for own, timed in tuple(_timed) if own is mission), None)) is None:
+        timed = complete_times(mission)
+        if timed is not mission:
+            _timed.append((mission, timed))
+    return timed
 
 
 class FlightInterrupted(KeyboardInterrupt):
@@ -216,8 +230,7 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self._preparation = preparation_of(as_mission(mission))
-        self.mission = mission = self._preparation.mission
+        self.mission = mission = _with_times(as_mission(mission))
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (
@@ -249,12 +262,12 @@ class Flight:
         asked_for = None if times is None else times_asked(times, mission.latest_end)
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
-        self._begins = self._reached = at_start(mission)
+        self._reached = at_start(mission)
         self._vehicles = (
             FleetState(mission, self._push.max_step, agent) if mission.vehicle_models else None
         )
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = self._preparation.disturbance if self._vehicles is None else None
+        self._disturbance = disturbance(mission) if self._vehicles is None else None
         self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
@@ -368,7 +381,8 @@ class Flight:
         if self._asked:
             self._report(phase, planning=True)
         try:
-            plan = self._plan_from_now(phase)
+            leg = timed_leg(self.mission, phase, self._now, len(self._asked))
+            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
             stepper = PointPhase
@@ -597,14 +611,6 @@ class Flight:
         return self._extremes.contact()
 
     # -- inside -----------------------------------------------------------------------------------
-
-    def _plan_from_now(self, phase: Phase) -> PhasePlan:
-        """The plan of a phase from the state now, with its times known."""
-        now, air, push = self._now, self._disturbance, self._push
-        if now is self._begins and now.lost is None:
-            return self._preparation.first_plan(phase, now, air, push)
-        leg = timed_leg(self.mission, phase, now, len(self._asked))
-        return plan_phase(self.mission, leg, disturbance=air, external=push)
 
     @property
     def _now(self) -> PhaseState:

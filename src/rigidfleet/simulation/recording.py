@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.kept import same
+from rigidfleet._common.arrays import same
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.records import Record, recorder
