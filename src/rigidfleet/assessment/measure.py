@@ -129,12 +129,15 @@ class Measurements:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
         for name, sampled in self.of_phases.items():
-            alone = name not in self.names_recorded
+            rank, alone = sampled.quantity.rank, name not in self.names_recorded
             for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
-                x = phase.extremes.get(name)
-                if x is not None and self.rank(name, k) < sampled.quantity.rank(x.value):
-                    worst[name] = self.extreme_of(name, x, phase.name)
-                elif e := self.worst_sample(sampled, self.parts[k], alone=alone):
+                e, x = (
+                    self.worst_sample(sampled, self.parts[k], alone=alone),
+                    phase.extremes.get(name),
+                )
+                if x is not None and (e is None or rank(e.value) < rank(x.value)):
+                    e = self.extreme_of(name, x, phase.name)
+                if e is not None:
                     worst[name] = e
         return every
 
