@@ -263,6 +263,10 @@ def test_a_file_is_checked_like_a_mission(tmp_path):
         Sweep.load(file)
     assert [f.file for f in caught.value.findings] == [str(file)] * 2
     assert "did you mean 'seed'?" in str(caught.value)
+    file.write_text(good.partition("\n")[2])
+    with pytest.raises(SweepError) as caught:
+        Sweep.load(file)
+    assert [(f.key, f.problem) for f in caught.value.findings] == [("mission", "is missing")]
 
 
 # -- flying ------------------------------------------------------------------------------------------
