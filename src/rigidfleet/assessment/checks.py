@@ -76,7 +76,7 @@ def _quantity_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
             f"{q.name_in_words} cannot be judged (limit {limit:g} {q.unit}): straight lines between samples have none."
             " Assume cubics, or give velocities"
         )
-        yield CheckResult(q.name, False, words, None, limit, q.unit)
+        yield CheckResult(q.name, False, words, None, limit, q.unit, at_least=q.at_least)
     elif e is not None or limit is not None:
         yield limit_check(q, e, limit)
 
@@ -299,7 +299,7 @@ def _separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResu
             f" {'is one vehicle alone' if one else 'are never two vehicles at one time'}. Give the other vehicles, name"
             " the column that tells which vehicle a row is of, or ask for no separation"
         )
-        yield CheckResult(q.name, False, words, None, limit, q.unit)
+        yield CheckResult(q.name, False, words, None, limit, q.unit, at_least=q.at_least)
 
 
 def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
