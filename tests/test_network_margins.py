@@ -206,7 +206,9 @@ def test_motions_of_the_whole_formation_do_not_count(late):
     At seven ticks it grows.
     """
     hold = {"kind": "establish", "formation": "cube", "duration": 5.0, "control": "open"}
-    noise = {"disturbances": {"noise": {"delay": late, "rate": 50.0}}} if late else {}
+    noise: dict[str, Any] = (
+        {"disturbances": {"noise": {"delay": late, "rate": 50.0}}} if late else {}
+    )
     linear = linear_flight(still({"delay": 0.04}, phases=[hold], **noise))
     assert linear.is_free
     assert growth_at(linear, 1) < -1.0
