@@ -12,6 +12,7 @@ import rigidfleet as rf
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.mail import LOST, SENT
 from rigidfleet.math import pid
+from rigidfleet.math.margins import GROWTH
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.linear_flight import LinearFlight
@@ -196,6 +197,30 @@ def test_the_greatest_growth_is_that_of_the_whole_map(seed, delay):
     tick = np.concatenate([x, np.roll(sent, -1, axis=0).reshape(-1, whole)])
     radius = np.abs(np.linalg.eigvals(tick)).max()
     assert growth_at(linear, delay) == pytest.approx(np.log(radius) / linear.radio.tick, abs=1e-4)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.05])
+def test_motions_of_the_whole_formation_do_not_count(late):
+    """Nobody feels that a formation without slots moves as a whole: what is left decays at small delays, by 1 a second.
+
+    At seven ticks it grows.
+    """
+    hold = {"kind": "establish", "formation": "cube", "duration": 5.0, "control": "open"}
+    noise: dict[str, Any] = (
+        {"disturbances": {"noise": {"delay": late, "rate": 50.0}}} if late else {}
+    )
+    linear = linear_flight(still({"delay": 0.04}, phases=[hold], **noise))
+    assert linear.is_free
+    assert growth_at(linear, 1) < -1.0
+    assert growth_at(linear, 7) > 1.0
+
+
+@pytest.mark.parametrize("seed", [2, 48])
+def test_the_last_stable_delay_is_the_last_one(seed):
+    """Found roughly first, it is where the accurate growth begins: none at it, some at one tick more."""
+    linear = linear_flight(still({}, **random_formation(seed)))
+    last = last_stable_delay(linear)
+    assert growth_at(linear, last) < GROWTH <= growth_at(linear, last + 1)
 
 
 def test_the_last_stable_delay_flies():

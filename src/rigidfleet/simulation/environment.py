@@ -154,7 +154,7 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
 
     def observation(self, view: View) -> Vector:
         """The observation of what a vehicle knows."""
-        out, r, v = np.zeros(self.size, dtype=np.float32), view.position, view.velocity
+        out, r, v = np.zeros(self.size), view.position, view.velocity
         if not math.isnan(view.reference_position[0]):
             out[:3], out[3:_SELF] = r - view.reference_position, v - view.reference_velocity
         own, row = np.concatenate([r, v, self.silence]), _SELF
@@ -163,7 +163,7 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
                 out[row : row + 3] = 1.0, message.age, view.distance.get(j, 0.0)
                 out[row + 3 : row + self.width] = message.content - own
             row += self.width
-        return out
+        return out.astype(np.float32)
 
     def answer(self, view: View, action: Sequence[float] | Vector) -> tuple[Floats, Floats]:
         """Force [N] and message of a vehicle by an action."""
