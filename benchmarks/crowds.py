@@ -272,7 +272,7 @@ def main() -> None:
     parser.add_argument("--planned", type=int, default=1, help="swaps of each kind by the plan")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    native.avoidance_library()
+    native.library("avoidance")
     print(
         "| swap | least distance (0.5) | least margin | arrive | last at | barrier | guard | both cost |"
     )

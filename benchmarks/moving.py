@@ -175,7 +175,7 @@ def take_least(least: Floats, x: Floats, w: Floats, rise: Floats) -> None:
 def fly(scenes: list[Scene], method: str) -> Flown:
     """Fly scenes of one kind, tick by tick together; they know nothing of each other."""
     count, n, speed = len(scenes), len(scenes[0].slots), scenes[0].speed
-    made, avoid = [prepared(each, method) for each in scenes], native.avoidance_library().avoid
+    made, avoid = [prepared(each, method) for each in scenes], native.library("avoidance").avoid
     slots = np.array([each.slots for each in scenes])
     place, velocity = (np.array([each[k] for each in scenes])[:, None] for k in (2, 3))
     r, v = slots.copy(), np.zeros((count, n, 3)) + [speed, 0.0, 0.0]
@@ -232,7 +232,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=1000, help="scenes of each kind")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    native.avoidance_library()
+    native.library("avoidance")
     print(
         "| vehicles | speed [m/s] | obstacles' speed | feasible | flown with | contacts | of the infeasible"
         " | least distance [m] | arrive | median time [s] | cost [us] |"

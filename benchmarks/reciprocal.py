@@ -106,7 +106,7 @@ def main() -> None:
                         not bounded,
                     )
                 )
-    native.avoidance_library()
+    native.library("avoidance")
     print(
         f"| ring of | flown by | least distance ({APART}) | below it | all arrive | last at | cost |"
     )

@@ -456,7 +456,7 @@ def fly_with(plain: str) -> None:
 
     def record(_: int, p: Any, w: Any, segment: int, out: int) -> None:
         of = packing.pack(p).address, packing.pack(w).address
-        native._code().record(*of, segment, out)
+        native.library().record(*of, segment, out)
 
     def bound_moves(watch: Any, problem: Any, state: Any) -> None:
         monitor.bound_moves(problem, state, watch.monitor)
@@ -526,7 +526,7 @@ def test_in_processes(numbers: set[int], given: argparse.Namespace) -> None:
         }  # fmt: skip
         if plain:
             # What flies must be in the cache already: this process cannot compile.
-            build = "from rigidfleet.kernel.engine import native as n; n.sampled_library(); n.avoidance_library()"
+            build = "from rigidfleet.kernel.engine import native as n; n.library('sampled'); n.library('avoidance')"
             subprocess.run([sys.executable, "-c", build], check=True)
             env["NUMBA_DISABLE_JIT"] = "1"
         files = dict.fromkeys(f"tests/{name}" for k in targets for name in TARGETS[k].tests)

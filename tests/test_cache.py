@@ -17,7 +17,7 @@ import pytest
 
 from rigidfleet.kernel.compiler import jit
 from rigidfleet.kernel.compiler.cache import cache_directory
-from rigidfleet.kernel.engine import native, objects, packing
+from rigidfleet.kernel.engine import native, objects
 from rigidfleet.kernel.engine.native import is_compiled
 
 PLANTED, OWN = 666, 1
@@ -46,15 +46,6 @@ def answer() -> int:
 def forget() -> None:
     """Let the next warning be the first."""
     native.warned.clear()
-
-
-@pytest.fixture(autouse=True)
-def packs() -> Iterator[None]:
-    """Afterwards, what packs arguments is that of the kernel that was loaded before, not of one made here."""
-    before = list(packing._gather)
-    yield
-    if before:
-        packing.use(*before)
 
 
 @pytest.fixture
@@ -338,7 +329,7 @@ def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, mo
     monkeypatch.setattr(sys, "path", ["", *sys.path, given])
     monkeypatch.setattr(objects, "_BUILD", IMPORTS)
     done = run(
-        *objects.build_process(),
+        *objects.build_command(),
         cwd=hostile,
         **({"PYTHONPATH": given} if way == "PYTHONPATH" else {}),
     )
@@ -352,7 +343,7 @@ def test_a_build_process_imports_what_its_parent_does(way, hostile, tmp_path, mo
 
 def test_a_build_process_heeds_its_parents_flags():
     """A Python that leaves out the user's packages and the environment starts one that does, too."""
-    code = "from rigidfleet.kernel.engine import objects; print(objects.build_process()[1:-1])"
+    code = "from rigidfleet.kernel.engine import objects; print(objects.build_command()[1:-1])"
     done = subprocess.run(
         [sys.executable, "-sE", "-c", code], capture_output=True, text=True, check=True
     )
@@ -380,13 +371,13 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
     """Where nothing can be kept, processes that are started get the machine code from the one that compiled it."""
     (base / "rigidfleet").chmod(0o777)
     with pytest.warns(RuntimeWarning):
-        assert native._code().integrate(0, 0, 0, 0) == OWN
+        assert native.library().integrate(0, 0, 0, 0) == OWN
     given = pickle.loads(pickle.dumps(native.bequeath()))
     forget()
     monkeypatch.setattr(native, "_loaded", {})
     monkeypatch.setattr(native, "_compile", refused)
     native.inherit(given)
-    assert native._code().integrate(0, 0, 0, 0) == OWN
+    assert native.library().integrate(0, 0, 0, 0) == OWN
     assert jit.jit(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
     assert native.bequeath() == given
 

@@ -708,7 +708,7 @@ def test_interrupt():
     assert not Path("flights/long/figures").exists()
 
 
-@pytest.mark.parametrize("during", ["render_figure", "write"])
+@pytest.mark.parametrize("during", ["render_figure", "write_file"])
 def test_interrupt_of_drawing(capsys, monkeypatch, during: str):
     """Ctrl-C while figures are drawn or written leaves the flight as it is, and says so."""
 

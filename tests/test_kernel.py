@@ -831,7 +831,7 @@ import subprocess
 from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.engine import build, objects
 numba_internals.translate_only()
-second = subprocess.Popen(objects.build_process("apart"), stdout=subprocess.PIPE)
+second = subprocess.Popen(objects.build_command("apart"), stdout=subprocess.PIPE)
 if not {helped}:
     second.kill()
 made, apart = [], build.apart
@@ -948,7 +948,7 @@ def test_arrays_have_the_extents_that_the_kernel_is_compiled_for(mission, monkey
 def test_the_kernel_for_three_agents_is_the_kernel(monkeypatch):
     """Of the same source, but for the lengths of its loops: the same flight to rounding."""
     own = simulate("narrow-passage")
-    code = native._code()
+    code = native.library()
     monkeypatch.setitem(
         native._loaded, "flight", native.Library(**vars(code) | {"integrate_three": code.integrate})
     )
@@ -961,7 +961,7 @@ def test_the_kernel_for_three_agents_is_for_them_alone(monkeypatch):
     def refused(*_: int) -> int:
         raise AssertionError("called")
 
-    code = native._code()
+    code = native.library()
     monkeypatch.setitem(
         native._loaded, "flight", native.Library(**vars(code) | {"integrate_three": refused})
     )

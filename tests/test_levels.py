@@ -10,7 +10,7 @@ import warnings
 from pathlib import Path
 
 import pytest
-from test_cache import OWN, PLANTED, answer, base, packs  # noqa: F401 -- fixtures
+from test_cache import OWN, PLANTED, answer, base  # noqa: F401 -- fixtures
 
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes

@@ -414,7 +414,7 @@ assert "numba" not in sys.modules
 
 def test_points_do_not_load_the_code_of_quadrotors():
     """Point flights leave the second library alone; once it is compiled, quadrotors fly without the compiler."""
-    native.sampled_library()
+    native.library("sampled")
     subprocess.run([sys.executable, "-c", LIBRARIES, str(Path(__file__).parent)], check=True)
 
 
@@ -428,7 +428,7 @@ def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
     given = native.bequeath()
     monkeypatch.setattr(native, "_loaded", others)
     native.inherit(given)
-    assert native.sampled_library().unkept == code
+    assert native.library("sampled").unkept == code
 
 
 def test_a_flight_goes_on_under_another_problem():

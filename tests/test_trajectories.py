@@ -261,7 +261,7 @@ def test_to_judge_plans_nothing_and_writes_no_text(monkeypatch):
 
     for place in (
         "rigidfleet.planning.plan.plan_phase",
-        "rigidfleet.kernel.records.integrator_in",
+        "rigidfleet.kernel.records.integrator",
         "rigidfleet.mission.model.to_toml",
         "rigidfleet.mission.model.parse_toml",
     ):

@@ -202,7 +202,7 @@ def apply_Jt(u, edges, b, scale, out):
 
 
 @jit_inline
-def apply(u, edges, m, mbar, mu, a, out):
+def multiply(u, edges, m, mbar, mu, a, out):
     """out = K a for (N, 3) arrays."""
     for i in range(m.shape[0]):
         s = mu * m[i]
@@ -285,7 +285,7 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
     """
     r, z, q, Kq, w = work[0], work[1], work[2], work[3], work[4]
     n = m.shape[0]
-    apply(u, edges, m, mbar, mu, x, Kq)
+    multiply(u, edges, m, mbar, mu, x, Kq)
     for i in range(n):
         for s in range(3):
             r[i, s] = g[i, s] - Kq[i, s]
@@ -300,7 +300,7 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
             for s in range(3):
                 q[i, s] = z[i, s] + (rz / last) * q[i, s]
         last = rz
-        apply(u, edges, m, mbar, mu, q, Kq)
+        multiply(u, edges, m, mbar, mu, q, Kq)
         step = rz / inner(q, Kq)
         rest = 0.0
         for i in range(n):

@@ -275,16 +275,6 @@ def workspace(
     return w
 
 
-def cleared(w: Workspace) -> Workspace:
-    """The workspace as it was made; all its arrays lie in one memory."""
-    memory = w.r.base
-    assert memory is not None
-    memory.fill(0.0)
-    for T in (w.T, w.T_ref):
-        T[0, 0] = T[1, 1] = T[2, 2] = 1.0
-    return w
-
-
 def padded(count: int) -> int:
     """``count`` rounded up to a multiple of 8: the numbers in a cache line, and the lanes of a `lanes` value."""
     return -(-count // 8) * 8

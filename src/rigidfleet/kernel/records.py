@@ -184,22 +184,10 @@ def integrator(
     in the ``trail``.
     """
     n = len(y)
-    count = np.empty(FIRST_ROW + 1, dtype=np.int64)
-    state = IntegratorState(np.empty(n), zeros(10, padded(n)), np.empty(3), count, rtol, trail)
-    return integrator_in(state, y, t, rtol=rtol, atol=atol, step=step)
-
-
-def integrator_in(
-    state: IntegratorState, y: Floats, t: float, *, rtol: float, atol: Floats, step: float = 1e-3
-) -> IntegratorState:
-    """An `integrator` of as many states as another, in its memory and with its trail."""
-    n = len(y)
-    state.y[:] = y
-    state.K.fill(0.0)
-    state.K[ATOL, :n], state.K[ATOL, n:] = atol, 1.0
-    state.clock[:] = t, step, LEAST_ERROR
-    state.count.fill(0)
-    return state if state.rtol == rtol else state._replace(rtol=rtol)
+    K = zeros(10, padded(n))
+    K[ATOL, :n], K[ATOL, n:] = atol, 1.0
+    clock, count = np.array([t, step, LEAST_ERROR]), np.zeros(FIRST_ROW + 1, dtype=np.int64)
+    return IntegratorState(np.array(y, dtype=float), K, clock, count, rtol, trail)
 
 
 class Segment(NamedTuple):

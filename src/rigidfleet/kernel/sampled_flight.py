@@ -171,7 +171,7 @@ def take_force(k, i, dt, p, w, flight, state):
         state.force[i, q] = w.f_u[i, q] + w.f_C[i, q]
         pull += w.f_C[i, q] * w.f_C[i, q]
     if not vehicles.lost[i]:
-        worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
+        record_if_worse(i, CONSTRAINT_FORCE, math.sqrt(pull), state.work.law_time[0], state)
     if p.control.kind == TRACKING:
         if guidance.drag[i] > 0.0 and not own:
             expect_drag(i, w.v_ref[i], guidance.drag[i], vehicles, state)
@@ -184,11 +184,11 @@ def take_force(k, i, dt, p, w, flight, state):
             e = 0.0
             for q in range(3):
                 e += (state.S[i, q] - w.r_ref[i, q]) ** 2
-            worse(i, ERROR, math.sqrt(e), state.work.law_time[0], state)
+            record_if_worse(i, ERROR, math.sqrt(e), state.work.law_time[0], state)
 
 
 @jit
-def worse(i, kind, value, t, state):
+def record_if_worse(i, kind, value, t, state):
     """Keep a value of vehicle i and its time if it is the greatest so far."""
     if value > state.worst[i, kind]:
         state.worst[i, kind], state.worst_time[i, kind] = value, t
@@ -302,7 +302,7 @@ def is_foreseen(j, k, p, w, flight, mail):
 
 
 @jit
-def fall_silent(k, p, w, flight, state):
+def release_silent_edges(k, p, w, flight, state):
     """Decide which vehicles do not broadcast what they have posted at tick k; keep what the others send."""
     mail = state.mail
     for j in range(state.S.shape[0]):
@@ -381,7 +381,7 @@ def tick(k, t, p, w, flight, state, call):
     if flight.network.every > 0:
         post(k, p, w, flight, state)
         if k % flight.network.every == 0:
-            fall_silent(k, p, w, flight, state)
+            release_silent_edges(k, p, w, flight, state)
             send(k, state.S, flight.network, state.mail)
     return True
 
@@ -500,13 +500,13 @@ def take_extremes(i, t, h, vehicles, state):
     own = slice(17 * i, 17 * i + 17)
     rate, end = state.work.y[2, own], state.work.y[6, own]
     across = rate[3] ** 2 + rate[4] ** 2
-    worse(i, ACCELERATION, math.sqrt(across + rate[5] ** 2), t, state)
-    worse(i, HORIZONTAL, math.sqrt(across), t, state)
-    worse(i, VERTICAL, abs(rate[5]), t, state)
+    record_if_worse(i, ACCELERATION, math.sqrt(across + rate[5] ** 2), t, state)
+    record_if_worse(i, HORIZONTAL, math.sqrt(across), t, state)
+    record_if_worse(i, VERTICAL, abs(rate[5]), t, state)
     command, load = state.command[i], 0.0
     if vehicles.point[i]:
         load = math.sqrt(command[0] ** 2 + command[1] ** 2 + command[2] ** 2)
-        worse(i, LOAD, load, t, state)
+        record_if_worse(i, LOAD, load, t, state)
         return
     for j in range(4):
         w = end[13 + j]
@@ -514,7 +514,7 @@ def take_extremes(i, t, h, vehicles, state):
         load += force
         if force > state.peak[i, j]:
             state.peak[i, j], state.peak_time[i, j] = force, t + h
-    worse(i, LOAD, load, t + h, state)
+    record_if_worse(i, LOAD, load, t + h, state)
     upright = 1.0 - 2.0 * (end[7] * end[7] + end[8] * end[8])
     if upright < state.worst[i, UPRIGHT]:
         state.worst[i, UPRIGHT], state.worst_time[i, UPRIGHT] = upright, t + h

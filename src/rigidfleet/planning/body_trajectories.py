@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.kept import kept
 from rigidfleet.kernel.problem import Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr, series, splines
@@ -50,8 +49,6 @@ def regulated_motion(
     return as_motion(t0 + times, pieces, goal.T)
 
 
-# Saves a quarter of a short flight with regulated ways, such as narrow-passage.
-@kept
 def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
     """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.
 

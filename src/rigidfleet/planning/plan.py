@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.kept import kept
 from rigidfleet.errors import StoppedError
 from rigidfleet.formation import distance_geometry, graphs
 from rigidfleet.kernel.problem import (
@@ -318,8 +317,6 @@ def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
         )
 
 
-# With `_agree`, `_pair_lengths` and `reference._leads`, saves a twentieth of a short flight, such as narrow-passage.
-@kept
 def _vehicles(masses: Floats, limit: Floats, saturate: bool, gravity: float) -> Vehicles:
     return Vehicles(
         masses.copy(), 1.0 / masses, float(masses.sum()), float(masses.mean()), limit.copy(), saturate, gravity
@@ -347,7 +344,6 @@ def _formation_in_shape(mission: Mission, name: str | None, now: PhaseState) -> 
     return name if (off <= most).all() else None
 
 
-@kept
 def _pair_lengths(slots: Floats) -> tuple[Ints, Floats, float]:
     """All pairs of slots, their distances [m], and the greatest error [m] at which they count as held."""
     pairs = graphs.complete_graph(len(slots))
@@ -355,7 +351,6 @@ def _pair_lengths(slots: Floats) -> tuple[Ints, Floats, float]:
     return pairs, wanted, _NEAR * float(wanted.min())
 
 
-@kept
 def _agree(lengths: Floats, slots: Floats, edges: Ints) -> bool:
     """Whether the edges (m, 2) of slots have the lengths (m,) asked for, to rounding [m]."""
     own = distance_geometry.distances(slots, edges)

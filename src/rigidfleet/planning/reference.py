@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.kept import kept, same
+from rigidfleet._common.arrays import same
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -133,8 +133,6 @@ class PhaseState:
     rates: Floats | None = None
 
 
-# Saves 3 to 7 % of a short flight, such as narrow-passage.
-@kept
 def nearest_rotation(before: Floats, after: Floats, masses: Floats) -> Floats:
     """The rotation (3, 3) that brings slots (N, 3) nearest to those before: Kabsch, weighted by mass."""
     return rigid_body.kabsch(before, after, masses)
@@ -162,7 +160,6 @@ def reference_kind(
     return _leads(before, target, edges, lengths)
 
 
-@kept
 def _leads(
     before: Floats, target: Floats, edges: Ints, lengths: Floats
 ) -> Literal["shape", "squares"]:

@@ -359,20 +359,16 @@ class Extremes(CurveWatch):
 
     def __init__(self, mission: Mission) -> None:
         super().__init__(mission)
-        self.state: records.IntegratorState | None = None  # of the integrator that is monitored
-        #: States, states in its trail, edges, for which there is a monitor.
-        self.size: tuple[int, int, int] | None = None
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
-        self._touching: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
         self.avoidance: avoidance.AvoidanceArrays | None = None  # that of the phase under way
-        self.led: dict[str, Extremum] = {}  # what its clock and its body layer did
+        self.of_layers: dict[str, Extremum] = {}  # what its clock and its body layer did
 
     def among(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
         self._take_obstacles(obstacles)
-        if self.size is not None:
+        if "monitor" in vars(self):
             arrays = self.monitor.monitor
             self.monitor = native.Watch(
                 arrays._replace(boxes=self.boxes, count=arrays.count.copy())
@@ -387,41 +383,14 @@ class Extremes(CurveWatch):
         rtol: float,
         atol: Floats,
         states: int | None = None,
-        aside: bool = False,
     ) -> records.IntegratorState:
         """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
 
-        ``states``: how many the trail records, by default all; ``aside``: the steps will be handed over to another
-        thread.
+        ``states``: how many the trail records, by default all.
         """
-        size = len(y), states or len(y), edges
-        state = self.state
-        if state is not None and size == self.size:
-            self.state = records.integrator_in(state, y, t, rtol=rtol, atol=atol)
-        else:
-            trail = records.trail(size[1], self.n, edges, self.directed)
-            self.state = state = records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
-            self.size = size
-            self._begin_monitor(size[1], state.trail.gauge.shape[1])
-            if aside:
-                # Memory costs far more time when it is first touched than ever after. The rows that the integrator
-                # reaches after it has handed over steps are touched while it flies these.
-                half = self._half(state)
-                self._touching = self._beside().submit(state.trail.points[half:].fill, 0.0)
-        return self.state
-
-    @staticmethod
-    def _half(state: records.IntegratorState) -> int:
-        """Steps that fit into the trail beside as many others and one that has stayed."""
-        return (len(state.trail.clock) - 1) // 2
-
-    def _beside(self) -> ThreadPoolExecutor:
-        """The other thread."""
-        if self._thread is None:
-            from concurrent.futures import ThreadPoolExecutor
-
-            self._thread = ThreadPoolExecutor(1)
-        return self._thread
+        trail = records.trail(states or len(y), self.n, edges, self.directed)
+        self._begin_monitor(states or len(y), trail.gauge.shape[1])
+        return records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
 
     def lose(self, lost: Bools) -> None:
         """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
@@ -437,7 +406,6 @@ class Extremes(CurveWatch):
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
         self._list_all()
-        self.state = self.size = None  # other vehicles are monitored from now on
 
     def take(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
@@ -457,13 +425,9 @@ class Extremes(CurveWatch):
 
     def room(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
-        half, steps = self._half(state), int(state.count[records.TRAILED])
-        if self._touching is not None:
-            if not steps:
-                return half
-            self._touching.result()
-            self._touching = None
-        return half + 1 - steps  # at first, or after one that has stayed
+        # Beside as many others, and one that has stayed.
+        half = (len(state.trail.clock) - 1) // 2
+        return half + 1 - int(state.count[records.TRAILED])
 
     def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
         """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
@@ -474,7 +438,11 @@ class Extremes(CurveWatch):
         # The last step stays, until its neighbour is known.
         row = _rows(state, count[records.TRAILED] - 1)
         count[records.TRAILED], count[records.FIRST_ROW] = 1, row
-        self._taking = self._beside().submit(self._take_aside, problem, work, taken)
+        if self._thread is None:
+            from concurrent.futures import ThreadPoolExecutor
+
+            self._thread = ThreadPoolExecutor(1)
+        self._taking = self._thread.submit(self._take_aside, problem, work, taken)
 
     def _take_aside(self, *given: Any) -> None:
         self.take(*given, last=False)
@@ -559,13 +527,13 @@ class Extremes(CurveWatch):
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         extremes = super().so_far()
-        extremes.update(self.of_vehicles, **self._of_avoidance(), **self.led)
+        extremes.update(self.of_vehicles, **self._of_avoidance(), **self.of_layers)
         return extremes
 
     def phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
         extremes = super().phase()
-        self.of_vehicles, self.avoidance, self.led = {}, None, {}
+        self.of_vehicles, self.avoidance, self.of_layers = {}, None, {}
         return extremes
 
 

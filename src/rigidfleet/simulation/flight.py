@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time as clock
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,11 +20,12 @@ from rigidfleet.kernel.problem import TRACKING, External, Motion
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
+from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.legs import Leg, at_start
 from rigidfleet.planning.losses import answer_to, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
-from rigidfleet.planning.timing import timed_leg
+from rigidfleet.planning.timing import complete_times, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
 from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
@@ -38,7 +40,6 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.own_laws import Law
 from rigidfleet.simulation.point_phase import PointPhase
-from rigidfleet.simulation.preparation import preparation_of
 from rigidfleet.simulation.recording import Piece, assemble
 from rigidfleet.simulation.sampled_phase import FleetState, SampledPhase
 from rigidfleet.simulation.sampling import Sampling, times_asked
@@ -81,6 +82,19 @@ class Progress:
     phase: str
     wall: float
     planning: bool = False
+
+
+#: Missions flown last, as they were given and with their times known: to find ways takes longer than to fly them.
+_timed: deque[tuple[Mission, Mission]] = deque(maxlen=8)
+
+
+def _with_times(mission: Mission) -> Mission:
+    """A mission with its times known."""
+    if (timed := next((timed for own, timed in tuple(_timed) if own is mission), None)) is None:
+        timed = complete_times(mission)
+        if timed is not mission:
+            _timed.append((mission, timed))
+    return timed
 
 
 class FlightInterrupted(KeyboardInterrupt):
@@ -216,8 +230,7 @@ class Flight:
         ``sampler`` chooses the times to record (`rigidfleet.simulation.sampling`); ``flips`` allows a formation to
         flip over.
         """
-        self._preparation = preparation_of(as_mission(mission))
-        self.mission = mission = self._preparation.mission
+        self.mission = mission = _with_times(as_mission(mission))
         if not (isinstance(rate, int | float | np.number) and rate > 0.0):
             raise ValueError(f"the control rate must be positive [Hz], not {rate!r}")
         for name, function in (
@@ -249,12 +262,12 @@ class Flight:
         asked_for = None if times is None else times_asked(times, mission.latest_end)
         self.sampler = sampler or Sampling(mission.output_step, asked_for).between
         self.flips = flips
-        self._begins = self._reached = at_start(mission)
+        self._reached = at_start(mission)
         self._vehicles = (
             FleetState(mission, self._push.max_step, agent) if mission.vehicle_models else None
         )
         # Vehicles meet their disturbances in their own equations of motion.
-        self._disturbance = self._preparation.disturbance if self._vehicles is None else None
+        self._disturbance = disturbance(mission) if self._vehicles is None else None
         self._extremes = Extremes(mission)
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
@@ -346,7 +359,7 @@ class Flight:
                     f"nothing of phase '{self.phases[-1].name}' has been flown: call advance before the next begin"
                 )
             if not self._reacted and self.t >= self.mission.abandons_at:
-                self._leave(changed=True)
+                self._leave_phase(changed=True)
                 self._react()
             if self._following >= len(self._route):
                 if self._unproved:
@@ -362,13 +375,14 @@ class Flight:
             phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
         else:
             check_formation(self.mission, phase)
-        self._leave(changed=True)
+        self._leave_phase(changed=True)
         if self.mission.on_loss == "continue" or not self._given(phase):
             self._now.blend = None
         if self._asked:
             self._report(phase, planning=True)
         try:
-            plan = self._plan_from_now(phase)
+            leg = timed_leg(self.mission, phase, self._now, len(self._asked))
+            plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
             stepper = PointPhase
@@ -431,10 +445,10 @@ class Flight:
                 active.settle_by(t_end, settle, self.controller, self.rate, step)
         except StoppedError as stopped:
             self.ending = str(stopped)
-            self._leave()
+            self._leave_phase()
             return False
         except BaseException:
-            self._leave()
+            self._leave_phase()
             raise
         return self.arrive()
 
@@ -445,7 +459,7 @@ class Flight:
         self.phases[-1].t_end = active.t
         if active.has_settled or active.over:
             settled = active.has_settled
-            self._leave()
+            self._leave_phase()
             if settle is not None and not settled:
                 self.ending = (
                     f"phase '{plan.phase.name}' did not settle within {settle.timeout:g} s: at t ="
@@ -454,7 +468,7 @@ class Flight:
                 )
             return False
         if active.t >= loss:
-            self._leave(abandoned=True)
+            self._leave_phase(abandoned=True)
             return False
         return True
 
@@ -513,7 +527,7 @@ class Flight:
         FlightError
             Nothing has been flown.
         """
-        self._leave()
+        self._leave_phase()
         self.ending = ending or self.ending
         if not self.pieces:
             raise FlightError(self.ending or "the flight ended before the first time to record")
@@ -598,14 +612,6 @@ class Flight:
 
     # -- inside -----------------------------------------------------------------------------------
 
-    def _plan_from_now(self, phase: Phase) -> PhasePlan:
-        """The plan of a phase from the state now, with its times known."""
-        now, air, push = self._now, self._disturbance, self._push
-        if now is self._begins and now.lost is None:
-            return self._preparation.first_plan(phase, now, air, push)
-        leg = timed_leg(self.mission, phase, now, len(self._asked))
-        return plan_phase(self.mission, leg, disturbance=air, external=push)
-
     @property
     def _now(self) -> PhaseState:
         """The state from which the next phase starts, evaluated when it is asked for: none follows the last."""
@@ -664,7 +670,7 @@ class Flight:
         k = self._following
         return plan + legs_from(self.mission, plan[-1].state_at(plan[-1].end), self._route[k:], k)
 
-    def _leave(self, *, changed: bool = False, abandoned: bool = False) -> None:
+    def _leave_phase(self, *, changed: bool = False, abandoned: bool = False) -> None:
         """End the phase under way.
 
         A target that was ``changed`` in flight, or ``abandoned`` because of a loss, is not judged as a waypoint. Points

@@ -17,7 +17,7 @@ from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Unevaluated
-from rigidfleet.simulation.solver_setup import first_step, give_back, solved_by
+from rigidfleet.simulation.solver_setup import first_step, solved_by
 from rigidfleet.typing import Floats
 
 #: Greatest number of steps, and greatest wall time [s], after which the integrator returns to Python. For any
@@ -53,7 +53,7 @@ class PointPhase(Stepper):
         phase, plan = self.phase, self.phase.plan
         self.aside = plan.large and phase.external is None
         phase.state = phase.extremes.begin(
-            y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances, aside=self.aside
+            y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances
         )
         if self.steps:  # after a loss
             return
@@ -154,8 +154,7 @@ class PointPhase(Stepper):
         )
 
     def release(self) -> None:
-        """Give the workspace back."""
-        give_back(self.phase.plan.problem, self.phase.workspace)
+        """Let go of what a large formation has packed."""
         if self.phase.solver is not None:
             packing.forget()
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.kept import same
+from rigidfleet._common.arrays import same
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.records import Record, recorder
@@ -23,12 +23,7 @@ from rigidfleet.planning.derivatives import (
     yaw_derivatives,
 )
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
-from rigidfleet.simulation.solver_setup import (
-    give_back,
-    large_solver,
-    small_workspace,
-    solved_by,
-)
+from rigidfleet.simulation.solver_setup import large_solver, solved_by, workspace_of
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -167,9 +162,7 @@ class Piece:
             renewed.evaluate_into(out, first, self.time, solver.workspace)
             solver.check()
         else:
-            work = small_workspace(source.planned)
-            source.evaluate_into(out, first, self.time, work)
-            give_back(source.planned, work)
+            source.evaluate_into(out, first, self.time, workspace_of(source.planned))
 
 
 def assemble(
@@ -314,7 +307,7 @@ def _forces_and_references(
         "distance_rate_reference": record.d_dot,
         "constraint": constraint,
         "multiplier": record.multiplier,
-        "integral": _integral(pieces, mission.edges),
+        "integral": _constraint_integral(pieces, mission.edges),
     }
 
 
@@ -498,7 +491,7 @@ def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) ->
     return out
 
 
-def _integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
+def _constraint_integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
     """Integrals of the constraint errors (K, m); NaN while an edge is not active."""
     columns = [_columns(p.edges, edges) for p in pieces]
     if all(isinstance(places, slice) for places in columns):

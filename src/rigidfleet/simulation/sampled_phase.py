@@ -112,9 +112,9 @@ class SampledPhase(Stepper):
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
             vehicles.avoidance = avoidance.of_next_phase(vehicles.avoidance)
-        self.led = False  # whether the reference is given piece by piece
+        self.by_pieces = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
-        self.led_until = -math.inf  # end of what the leader has decided [s]
+        self.decided_until = -math.inf  # end of what the leader has decided [s]
         self.unjudged = False  # whether steps were flown since the extremes of vehicles were taken
         self.first_tick: int | None = None
         self.leader: Leader | None = None
@@ -177,12 +177,12 @@ class SampledPhase(Stepper):
             return math.inf
         t = self.phase.t
         end = leader.next_end(t, self.vehicles.output_step)
-        if t >= self.led_until:
-            self.led_until = end
+        if t >= self.decided_until:
+            self.decided_until = end
             if (problem := leader.lead(t, end, arrays)) is not None:
                 self._renew(problem)
-                self.led = leader.leads
-        return self.led_until
+                self.by_pieces = leader.leads
+        return self.decided_until
 
     @property
     def delay(self) -> float:
@@ -243,7 +243,7 @@ class SampledPhase(Stepper):
         if tables.yaw.kind == "along":
             now = tables.yaw_at(self.phase.plan.problem, t, self.turn)
             self.turn = turn_from(problem, t, tables.yaw, now)
-        self.led = True
+        self.by_pieces = True
 
     def seen_by_controller(self, observation: Observation) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
@@ -306,10 +306,10 @@ class SampledPhase(Stepper):
         phase = self.phase
         phase.extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
-            phase.extremes.led = self.leader.extremes(phase.t)
+            phase.extremes.of_layers = self.leader.extremes(phase.t)
         if self.slowed is not None:
             time, who = self.slowed
-            phase.extremes.led = {"clock": Extremum(self.delay, time, who, -1)}
+            phase.extremes.of_layers = {"clock": Extremum(self.delay, time, who, -1)}
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
@@ -394,8 +394,8 @@ class SampledPhase(Stepper):
             before = source.start_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
         until = self.phase.plan.t_end
-        if self.led:
-            until = min(until, self.led_until if not self.steered else self.phase.stop)
+        if self.by_pieces:
+            until = min(until, self.decided_until if not self.steered else self.phase.stop)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn, tau)
         if before is not None:  # states that were measured about another path

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import RIGID, Problem, Workspace, cleared, workspace
+from rigidfleet.kernel.problem import RIGID, Problem, Workspace, workspace
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
@@ -19,15 +18,10 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import LargeSolver, Setup
 
 
-#: Workspaces that no phase uses, by agents, edges, whether they have H, and solver; how many, and of how many agents.
-_idle: dict[tuple[int, int, bool, int], list[Workspace]] = {}
-_KEPT, _SMALL = 8, 200
-
-
 def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
     if not plan.large:
-        return small_workspace(plan.problem), None
+        return workspace_of(plan.problem), None
     from rigidfleet.kernel.large import ordering
     from rigidfleet.kernel.large.solver import Setup
 
@@ -48,11 +42,7 @@ def large_solver(problem: Problem, setup: Setup) -> LargeSolver:
     """A solver for the multipliers of a large formation, with a workspace."""
     from rigidfleet.kernel.large.solver import LargeSolver
 
-    size, with_h = (
-        (len(problem.vehicles.m), len(problem.graph.edges)),
-        problem.control.allocation != RIGID,
-    )
-    work = workspace(*size, with_h=with_h, solver=problem.law.solver, large=True)
+    work = workspace_of(problem, large=True)
     return LargeSolver(problem.vehicles, problem.graph.edges, problem.law, work, setup)
 
 
@@ -62,23 +52,12 @@ def solved_by(solver: LargeSolver, problem: Problem) -> Problem:
     return problem._replace(graph=graph)
 
 
-def small_workspace(problem: Problem) -> Workspace:
-    """A workspace for a problem whose multipliers the kernel itself solves for: an idle one, or a new one."""
-    size = len(problem.vehicles.m), len(problem.graph.edges)
-    with_h, solves = problem.control.allocation != RIGID, problem.law.solver
-    with suppress(KeyError, IndexError):  # none is idle
-        return cleared(_idle[*size, with_h, solves].pop())
-    return workspace(*size, with_h=with_h, solver=solves)
-
-
-def give_back(problem: Problem, work: Workspace) -> None:
-    """Let others use the workspace of a problem that is done with."""
-    if problem.graph.solver or len(problem.vehicles.m) > _SMALL:
-        return
-    kind = (*work.p.shape[:1], *work.L.shape, work.H.size > 0, problem.law.solver)
-    idle = _idle.setdefault(kind, [])
-    if len(idle) < _KEPT:
-        idle.append(work)
+def workspace_of(problem: Problem, *, large: bool = False) -> Workspace:
+    """A workspace for a problem; that of a ``large`` formation has no room for a dense solve of its multipliers."""
+    size, with_h = problem.graph.edges.shape[0], problem.control.allocation != RIGID
+    return workspace(
+        len(problem.vehicles.m), size, with_h=with_h, solver=problem.law.solver, large=large
+    )
 
 
 def first_step(plan: PhasePlan, work: Workspace, state: records.IntegratorState) -> float:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.kept import same
+from rigidfleet._common.arrays import same
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack

@@ -3,7 +3,7 @@
 Numba translates the integrator, the recorder, the monitor and all functions that they call to LLVM's intermediate
 representation. Functions that are not called from outside become internal, and all are optimised once, together.
 
-In a process of its own (`objects.build_process`) it writes the code to standard output. A second process makes what
+In a process of its own (`objects.build_command`) it writes the code to standard output. A second process makes what
 shares little with the integrator meanwhile.
 """
 
@@ -27,7 +27,7 @@ from rigidfleet.kernel import (
     recursion,
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
-from rigidfleet.kernel.compiler import gathering, numba_internals
+from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
 from rigidfleet.kernel.engine import objects, packing
@@ -94,7 +94,7 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
 
 
 def apart() -> list[bytes]:
-    """Object codes of monitor, measurement, clearances, recursions and packing, which share little with the rest."""
+    """Object codes of monitor, measurement, clearances and recursions, which share little with the rest."""
     problem, workspace, integrator, watching = map(
         _at, (Problem, Workspace, IntegratorState, Monitor)
     )
@@ -118,16 +118,12 @@ def apart() -> list[bytes]:
 
         return call
 
-    def gather(of, count, expected, words):
-        return gathering.gather(of, count, expected, words)
-
     functions = (
         bound_moves,
         watch_distances,
         watch_forces,
         caller(measurement.measure, _at(Measured)),
         caller(recursion.follow, _at(Recursion)),
-        gather,
     )
     entries = list(objects.ENTRIES["flight"].items())[2:-1]
     return [
@@ -283,7 +279,7 @@ def main(part: str) -> None:
         codes = LIBRARIES[part]()
     else:
         second = subprocess.Popen(
-            objects.build_process("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
+            objects.build_command("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
         codes = machine_code(second)
     sys.stdout.buffer.write(objects.concatenate(codes))

@@ -44,7 +44,6 @@ from rigidfleet.kernel.engine.packing import (
     Packed,
     pack,
     pack_anew,
-    use,
 )
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import (
@@ -92,7 +91,7 @@ class Integration:
         self._segment = pack_anew(Segment(t_end, False, 0, times, samples, NOTHING))
         self._kept = pack(problem), pack(workspace), pack(state), self._segment
         self._addresses = [x.address for x in self._kept]
-        code, graph = _code(), problem.graph
+        code, graph = library(), problem.graph
         sizes = len(problem.vehicles.m), len(graph.edges), len(graph.pairs), len(workspace.A)
         three = sizes == (3, 3, 3, 3)
         self._integrate = code.integrate_three if three else code.integrate
@@ -115,7 +114,7 @@ def record_into(
 ) -> None:
     """`record` into a `Record` from row ``first`` on; it and the problem are packed."""
     segment = Segment(0.0, False, 0, times, samples, np.empty(samples.shape[1]), first)
-    _call(_code().record, problem, pack(workspace), pack_anew(segment), out)
+    _call(library().record, problem, pack(workspace), pack_anew(segment), out)
 
 
 class Watch:
@@ -134,32 +133,32 @@ class Watch:
 
     def bound_moves(self, problem: Problem, state: IntegratorState) -> None:
         """Bound how far distances change over the first step, into ``monitor.moves``."""
-        _code().bound_moves(pack(problem).address, pack(state).address, self.address)
+        library().bound_moves(pack(problem).address, pack(state).address, self.address)
 
     def distances(self, problem: Problem, state: IntegratorState, first: int, end: int) -> None:
         """Search the steps from ``first`` to before ``end`` for extremes of distances and speeds."""
         of = pack(problem).address, pack(state).address, self.address
-        _code().watch_distances(first, end, *of)
+        library().watch_distances(first, end, *of)
 
     def clearances(
         self, problem: Problem, state: IntegratorState, first: int, end: int, solids: Solids
     ) -> None:
         """Search the same steps for clearances to all ``solids``, see `rigidfleet.kernel.obstacles`."""
         of = pack(problem).address, pack(state).address, self.address
-        _library("solids").watch_solids(first, end, *of, pack(solids).address)
+        library("solids").watch_solids(first, end, *of, pack(solids).address)
 
     def forces(
         self, problem: Problem, workspace: Workspace, state: IntegratorState, *, last: bool
     ) -> None:
         """Search all steps for extremes of forces; ``last``: no further step of the segment follows."""
         of = [pack(x).address for x in (problem, workspace, state)]
-        _code().watch_forces(int(last), *of, self.address)
+        library().watch_forces(int(last), *of, self.address)
 
 
 def closed_loop(t: float, y: Floats, dy: Floats, problem: Problem, workspace: Workspace) -> None:
     """Right-hand side dy (n,) at time t [s] and state y (n,), see `rigidfleet.kernel.dynamics.closed_loop`."""
     segment = pack_anew(Segment(0.0, False, 0, np.array([t]), np.array([y]), dy))
-    _call(_code().record, pack(problem), pack(workspace), segment, pack(UNRECORDED))
+    _call(library().record, pack(problem), pack(workspace), segment, pack(UNRECORDED))
 
 
 def _call(function: Any, *arguments: Packed) -> int:
@@ -168,22 +167,22 @@ def _call(function: Any, *arguments: Packed) -> int:
 
 def measure(measured: Measured) -> None:
     """Measure the samples of a flight, see `rigidfleet.kernel.measurement.measure`."""
-    _call(_code().measure, pack_anew(measured))
+    _call(library().measure, pack_anew(measured))
 
 
 def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
     """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
-    _call(_code().follow, pack_anew(Recursion(x, a, backward)))
+    _call(library().follow, pack_anew(Recursion(x, a, backward)))
 
 
 def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
     """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
-    _call(_code().follow, pack_anew(Recursion(x, a, False, y, first, b)))
+    _call(library().follow, pack_anew(Recursion(x, a, False, y, first, b)))
 
 
 def call_large(name: str, *arguments: Any) -> float:
     """Call a function of `rigidfleet.kernel.elimination` or `rigidfleet.kernel.block_cholesky` with its arguments."""
-    return _call(getattr(_library("large"), name), pack_anew(OF_LARGE[name]._make(arguments)))
+    return _call(getattr(library("large"), name), pack_anew(OF_LARGE[name]._make(arguments)))
 
 
 class Library(SimpleNamespace):
@@ -198,27 +197,13 @@ _loading = threading.RLock()
 _loaded: dict[str, Library] = {}
 
 
-def _code() -> Library:
-    """The kernel's machine code: from the cache, or compiled."""
-    return _library("flight")
-
-
-def sampled_library() -> Library:
-    """The machine code of sampled flights: from the cache, or compiled."""
-    return _library("sampled")
-
-
-def avoidance_library() -> Library:
-    """The machine code of avoidance in flight: from the cache, or compiled."""
-    return _library("avoidance")
-
-
 def recorder_address() -> int:
     """Address of the recorder, which other libraries and the monitor call."""
-    return _code().addresses["record"]
+    return library().addresses["record"]
 
 
-def _library(part: str) -> Library:
+def library(part: str = "flight") -> Library:
+    """The machine code of a part of the kernel: from the cache, or compiled."""
     if part not in _loaded:
         with _loading:
             if part not in _loaded:
@@ -252,8 +237,6 @@ def _link(
         name: ctypes.CFUNCTYPE(result, *(word,) * words)(addresses[name])
         for name, words in ENTRIES[part].items()
     }
-    if part == "flight":
-        use(calls["gather"], engine)
     return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 

@@ -26,7 +26,6 @@ ENTRIES = {
         "watch_forces": 5,  # last, problem, workspace, integrator, monitor
         "measure": 1,
         "follow": 1,
-        "gather": 4,  # objects, count, asked, words
         "integrate_three": 4,  # the first, for three agents with three edges
     },
     "sampled": {"fly_ticks": 5, "evaluate": 2},
@@ -56,7 +55,7 @@ _BUILD = "import sys; sys.path[:] = sys.argv[1:]; from rigidfleet.kernel.engine 
 _FLAGS = {"isolated": "-I", "ignore_environment": "-E", "no_user_site": "-s", "no_site": "-S"}
 
 
-def build_process(part: str = "flight") -> list[str]:
+def build_command(part: str = "flight") -> list[str]:
     """Command of a process that compiles a part (see `build.main`), with the import path of this one.
 
     The current folder is left out.
@@ -87,7 +86,7 @@ def objects_of(part: str, of: str) -> list[bytes] | None:
     if sys.executable:
         with suppress(OSError):
             done = subprocess.run(
-                build_process(part), env=os.environ | settings, cwd=ELSEWHERE, capture_output=True, check=False
+                build_command(part), env=os.environ | settings, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
             if done.returncode == 0:
                 return separate(done.stdout)

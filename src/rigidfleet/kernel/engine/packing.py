@@ -6,9 +6,7 @@ import ctypes
 import struct
 import threading
 from collections import namedtuple
-from collections.abc import Callable, Iterator
 from functools import cache
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,114 +58,22 @@ class Packed(NamedTuple):
         return pack_anew, (self.of,)
 
 
-#: The compiled function `rigidfleet.kernel.compiler.gathering.gather`, once it is loaded, and what keeps its code.
-_gather: list[Any] = []
-
-
-def use(gather: Callable[..., int], code: Any) -> None:
-    """Pack with a compiled function from now on, whose machine code lives as long as ``code`` does."""
-    _gather[:] = [gather, code]
-    _layout.cache_clear()
-
-
-_ARRAYS = {np.ndarray}
-
-
-class _Layout:
-    """Memory layout of a type of named tuple, learnt from an example."""
-
-    def __init__(self, example: Any) -> None:
-        code: list[str] = []
-        self.arrays: list[tuple[str, int]] = []
-        words: list[Any] = []
-        _flatten(example, code, words, self.arrays)
-        self.code = struct.Struct("=" + "".join(code))
-        places = list(_places(example, ""))
-        size = len(words)
-        starts = np.cumsum([0, *(1 if ndim is None else 1 + ndim for _, _, ndim in places)])
-        arrays = [
-            (name, int(k))
-            for (name, kind, _), k in zip(places, starts, strict=False)
-            if kind is np.ndarray
-        ]
-        self.of_arrays = _getter([name for name, _ in arrays])
-        self.of_numbers = _getter([name for name, kind, _ in places if kind is not np.ndarray])
-        #: Numbers at their words, with gaps for the arrays' words; then the addresses of the arrays.
-        gaps: dict[type, str] = {np.ndarray: "{}x", float: "d", int: "q"}
-        self.numbers = struct.Struct(
-            "=" + "".join(gaps[kind].format(8 * (1 + (ndim or 0))) for _, kind, ndim in places)
-        )
-        self.floats = [kind is float for _, kind, _ in places if kind is not np.ndarray]
-        self.kinds: set[tuple[type, ...]] = set()  # of numbers that are as in the example
-        self.objects = struct.Struct(f"={len(arrays)}q")
-        self.memory = ctypes.c_int64 * (size + len(arrays))
-        self.after, self.count = 8 * size, len(arrays)
-        kinds = [id(x.dtype) for x in self.of_arrays(example)]
-        #: (arrays, 3) first word, dimensions, address of the type of the numbers.
-        self.expected = np.array(
-            [[k, n, kind] for (_, k), (_, n), kind in zip(arrays, self.arrays, kinds, strict=True)], dtype=np.int64
-        ).reshape(-1, 3)  # fmt: skip
-        self.expected_at = self.expected.__array_interface__["data"][0]
-        #: Whether `gather` finds what `_flatten` finds: else arrays are not laid out as expected there.
-        self.known = (words_gathered := self.gather(example)) is not None and (
-            bytes(words_gathered.words)[: 8 * size] == self.code.pack(*words)
-        )
-
-    def gather(self, x: Any) -> Packed | None:
-        """The words of a named tuple; None if a number or array is not as in the example."""
-        arrays, numbers = self.of_arrays(x), self.of_numbers(x)
-        kinds = tuple(map(type, numbers))
-        if kinds not in self.kinds:
-            if np.bool_ in kinds or [isinstance(x, float) for x in numbers] != self.floats:
-                return None
-            self.kinds.add(kinds)
-        if not _gather or set(map(type, arrays)) != _ARRAYS:
-            return None
-        words = self.memory()
-        at = ctypes.addressof(words)
-        self.numbers.pack_into(words, 0, *numbers)
-        self.objects.pack_into(words, self.after, *map(id, arrays))
-        if _gather[0](at + self.after, self.count, self.expected_at, at):
-            return None
-        return Packed(x, words, at)
-
-
-def _places(x: Any, prefix: str) -> Iterator[tuple[str, type, int | None]]:
-    """Name, kind and dimensions of each field of a named tuple and of those inside it."""
-    for name, value in zip(x._fields, x, strict=True):
-        if isinstance(value, np.ndarray):
-            yield prefix + name, np.ndarray, value.ndim
-        elif isinstance(value, tuple):
-            yield from _places(value, f"{prefix}{name}.")
-        else:
-            yield prefix + name, float if isinstance(value, float) else int, None
-
-
-def _getter(names: list[str]) -> Callable[[Any], tuple[Any, ...]]:
-    """A function that returns the fields with these names."""
-    if not names:
-        return lambda _: ()
-    get = attrgetter(*names)
-    return get if len(names) > 1 else lambda x: (get(x),)
-
-
-def _flatten(x: Any, code: list[str], words: list[Any], arrays: list[tuple[str, int]]) -> None:
-    """Append the words of a named tuple, their kinds, and those of its arrays."""
+def _flatten(x: Any, kinds: list[Any], words: list[Any]) -> None:
+    """Append the words of a named tuple, and the kinds of its numbers and arrays."""
     for value in x:
         if isinstance(value, np.ndarray):
             if not value.flags.c_contiguous:
                 raise TypeError("the kernel takes only C-contiguous arrays")
-            code.append("q" * (1 + value.ndim))
             words += (value.__array_interface__["data"][0], *value.shape)
-            arrays.append((value.dtype.char, value.ndim))
+            kinds.append((value.dtype.char, value.ndim))
         elif isinstance(value, tuple):
-            _flatten(value, code, words, arrays)
+            _flatten(value, kinds, words)
         elif isinstance(value, float):
-            code.append("d")
             words.append(value)
+            kinds.append(float)
         else:
-            code.append("q")
             words.append(int(value))
+            kinds.append(int)
 
 
 def pack_anew(x: Any) -> Packed:
@@ -178,18 +84,15 @@ def pack_anew(x: Any) -> Packed:
     TypeError
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
-    layout = _layout(type(x))
-    if layout.known and (words := layout.gather(x)) is not None:
-        return words
-    code: list[str] = []
+    kinds: list[Any] = []
     values: list[Any] = []
-    arrays: list[tuple[str, int]] = []
-    _flatten(x, code, values, arrays)
-    if arrays != layout.arrays or "".join(code) != layout.code.format[1:]:
+    _flatten(x, kinds, values)
+    expected, code = _layout(type(x))
+    if kinds != expected:
         raise TypeError(
             f"this {type(x).__name__} has arrays or numbers of types that the kernel does not take"
         )
-    words = (ctypes.c_int64 * (layout.code.size // 8)).from_buffer_copy(layout.code.pack(*values))
+    words = (ctypes.c_int64 * len(values)).from_buffer_copy(code.pack(*values))
     return Packed(x, words, ctypes.addressof(words))
 
 
@@ -223,8 +126,12 @@ def forget() -> None:
 
 
 @cache
-def _layout(kind: type) -> _Layout:
-    return _Layout(example_of(kind))
+def _layout(kind: type) -> tuple[list[Any], struct.Struct]:
+    """Kinds of the numbers and arrays of a type of named tuple, and how its words are stored."""
+    kinds: list[Any] = []
+    words: list[Any] = []
+    _flatten(example_of(kind), kinds, words)
+    return kinds, struct.Struct("=" + "".join("d" if type(x) is float else "q" for x in words))
 
 
 def example_of(kind: type) -> Any:

@@ -35,7 +35,7 @@ def fly_ticks(
         a is not b for a, b in zip(arguments, _last.arguments, strict=True)
     ):
         _last.packed, _last.arguments = _pack(*arguments), arguments
-    return native.sampled_library().fly_ticks(*(a.address for a in _last.packed[:5]))
+    return native.library("sampled").fly_ticks(*(a.address for a in _last.packed[:5]))
 
 
 class _LastCall(threading.local):
@@ -74,7 +74,7 @@ def _pack(
         return *states, pack_anew(call), law, recorded
     kept = _of(avoidance, problem, workspace)
     call = call._replace(
-        guard=native.avoidance_library().addresses["avoid"], avoidance=kept.address
+        guard=native.library("avoidance").addresses["avoid"], avoidance=kept.address
     )
     return *states, pack_anew(call), law, recorded, kept
 
@@ -88,7 +88,7 @@ def avoid(
 ) -> int:
     """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
     kept = _of(avoidance, problem, workspace)
-    return native.avoidance_library().avoid(
+    return native.library("avoidance").avoid(
         pack(flight).address, pack(state).address, kept.address, 0
     )
 
@@ -145,5 +145,5 @@ def derivatives(
             S, command, none if air is None else air, none if push is None else push, np.eye(3), out
         )
     )
-    native.sampled_library().evaluate(pack(flight).address, call.address)
+    native.library("sampled").evaluate(pack(flight).address, call.address)
     return out
