@@ -568,6 +568,7 @@ class Aborts:
         begins, end, who = ordered + self.options.reaction, self.end, self._alone.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
+        plan = self.along("", _clock(begins, max(end - begins, SHORTEST), _ON)).least
         for waits in np.arange(0.0, end - begins, self.options.step).tolist():
             alone = self._alone._of_all(ordered + waits)
             if alone.reason:
@@ -577,17 +578,14 @@ class Aborts:
             way = make()
             proved = of_ways(way.time, way.pieces[:, order], self.radius[order], len(who))
             proved = proved._replace(agents=tuple(order[list(proved.agents)].tolist()))
-            off = self._off(way)
-            if proved.separation - off < max(self.need, 1e-6):
-                problem = f"{agent_names(proved.agents)} come within {max(proved.separation - off, 0.0):.2f} m"
+            step = self._step("leave", make, min(proved, plan), 0.0)
+            if (apart := proved.separation - step.off) < max(self.need, 1e-6):
+                problem = f"{agent_names(proved.agents)} come within {max(apart, 0.0):.2f} m"
                 continue
             words = f"{agent_names(who.tolist())} {'leaves' if len(who) == 1 else 'leave'}"
             words += f" after {waits:g} s" if waits else ""
-            least = min(proved, self.along("", _clock(begins, end - begins, _ON)).least)
             slow, *steps = alone.steps
             home = Home(tuple(steps), words, "", round(ordered / self.options.step))
-            last = way.at(way.time[-1:])[0]
-            step = Step("leave", make, float(way.time[-1]), last, least, off)
             return Abort(ordered, begins, (step,), home, waits, slow.duration)
         return Abort(ordered, begins, (), Home(reason=problem))
 
