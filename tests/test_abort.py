@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +180,9 @@ def test_files_of_vehicles_are_what_is_flown(tmp_path: Path, to: str, T: float) 
     """A vehicle that knows its trajectory and its file flies as `run --abort-at` does, which passes its verdict."""
     check_aborts(show(to=to, step=T)).write(tmp_path)
     result = rf.simulate(show(to=to, at=T))
-    assert rf.assess(result).passed
+    verdict = rf.assess(result)
+    assert verdict.passed
+    assert "phases abandoned after the order" in verdict.summary
     plain = rf.simulate(show(to=to))
     for i in (0, 7):
         table = json.loads((tmp_path / f"vehicle-{i + 1:04d}.json").read_text())
@@ -359,6 +362,23 @@ def test_equal_stopped_places_are_planned_once() -> None:
     aborts = aborts_of(show())
     numbers = [aborts.at(t).home.number for t in (8.0, 8.25, 8.5, 8.75, 9.0)]
     assert len(set(numbers)) < 5
+
+
+def test_ways_are_made_again_and_not_kept() -> None:
+    """Aborts keep less than a quarter of the size of their ways, which are the same each time, and end where said."""
+    aborts = aborts_of(show(step=0.25))
+    aborts.at(3.0)  # what all share
+    tracemalloc.start()
+    every = list(aborts.every())
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    steps = [step for abort in every for step in abort.steps]
+    assert kept < 0.25 * sum(step.way.pieces.nbytes for step in steps)
+    for step in steps[::7]:
+        way, again = step.way, step.way
+        assert np.array_equal(way.pieces, again.pieces)
+        assert way.time[-1] == step.duration
+        assert np.array_equal(way.at(way.time[-1:])[0], step.end)
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

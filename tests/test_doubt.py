@@ -292,10 +292,13 @@ def test_without_doubt_nothing_changes(capsys: pytest.CaptureFixture[str]) -> No
     assert not any({"interval", "undecided"} & set(check) for check in data["checks"])
 
 
-def test_the_flights_of_the_page_are_judged(benchmark_named: Any) -> None:
-    """Of a flight of `make evening`, intervals hold; a clean one is not failed, and one that collides is not passed."""
+@pytest.mark.parametrize("count", [3, pytest.param(20, marks=pytest.mark.long)])
+def test_the_flights_of_the_page_are_judged(benchmark_named: Any, count: int) -> None:
+    """Of flights of `make evening`, intervals hold in nine of ten; no clean one fails, none that collides passes."""
     evening = benchmark_named("evening")
-    rows = [evening.judge("white", seed) for seed in (0, 1)]
-    assert min(row[key] for row in rows for key in evening.HELD) > 0.9
-    assert rows[0]["clean flights failed"] == rows[1]["collisions passed"] == 0.0
+    rows = [evening.judge("white", seed) for seed in range(1, 1 + count)]
+    shares = {key: np.mean([row[key] for row in rows]) for key in evening.HELD}
+    assert min(shares.values()) >= 0.9, shares
+    assert {row["clean flights failed"] for row in rows if row["clean flights failed"] >= 0} == {0}
+    assert {row["collisions passed"] for row in rows if row["collisions passed"] >= 0} == {0}
     assert evening.rows_of("white", rows).endswith("| 0 | 0 | yes |")

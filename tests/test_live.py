@@ -90,7 +90,7 @@ def test_quadrotors_follow_the_hand(yaw):
     for _ in range(120):
         pilot.steer(np.array([1.5, 0.5, 0.0]), np.array([0.0, 0.0, 0.3]))
         records.append(pilot.step())
-    assert pilot.ending == ""
+    assert pilot.flight.ending == ""
     assert max(map(slot_error, records)) < 0.02
     assert worst(records, "saturated") == 0.0
     assert worst(records, "vehicle_rates") < 1.5
@@ -155,7 +155,7 @@ def test_one_change_after_another():
     pilot.change("line")
     flown(pilot, 5.0)
     assert (pilot.formation, pilot.busy) == ("line", False)
-    assert [p.name for p in pilot.phases] == ["establish triangle", "change to line"]
+    assert [p.name for p in pilot.flight.phases] == ["establish triangle", "change to line"]
 
 
 def test_lets_go():
@@ -203,17 +203,17 @@ def test_by_body():
     """In the body architecture distances establish the formation, then the wrench on the body follows the hand."""
     pilot = Pilot(mission(architecture="body"))
     flown(pilot, 6.0)
-    assert pilot.phases[-1].control == "open"
+    assert pilot.flight.phases[-1].control == "open"
     pilot.steer(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 0.2]))
     records = flown(pilot, 0.6)
     records += flown(pilot, 12.0)
-    assert pilot.phases[-1].control == "body"
+    assert pilot.flight.phases[-1].control == "body"
     np.testing.assert_allclose(records[-1].cm[0], pilot.target.r, atol=1e-3)
     assert worst(records, "constraint") < 1e-3
     pilot.change("line")
     flown(pilot, 6.0)
     assert pilot.formation == "line"
-    assert pilot.ending == ""
+    assert pilot.flight.ending == ""
 
 
 def test_nothing_to_fly():
@@ -235,7 +235,7 @@ def test_cannot_go_on(monkeypatch):
 
     monkeypatch.setattr(pilot.flight._active, "fly_to", stop)
     after = pilot.step()
-    assert pilot.ending == "too steep"
+    assert pilot.flight.ending == "too steep"
     assert after is before
 
 
@@ -286,7 +286,7 @@ def test_a_ball_is_avoided_and_kept():
     np.testing.assert_allclose(ball.place, start - [14.0, 0.0, 0.0], atol=1e-9)
     pilot.take_out(ball.slot)
     flown(pilot, 1.0)
-    assert pilot.ending == ""
+    assert pilot.flight.ending == ""
     result = pilot.result()
     index = len(TRIANGLE.obstacles)
     thing = kept(result, index)
@@ -312,8 +312,8 @@ def test_without_the_guard_contact_ends_the_flight():
     ball = pilot.push_in(places(pilot)[1] + [0.0, 0.0, 5.0], 1.0, np.array([0.0, 0.0, -2.0]))
     flown(pilot, 4.0)
     met = 7.0 + (5.0 - 1.25) / 2.0  # the surfaces
-    assert pilot.ending.startswith("agent 2 met 'ball 1' at 8.")
-    assert float(pilot.ending.split()[-2]) == pytest.approx(met, abs=TICK)
+    assert pilot.flight.ending.startswith("agent 2 met 'ball 1' at 8.")
+    assert float(pilot.flight.ending.split()[-2]) == pytest.approx(met, abs=TICK)
     assert pilot.t == pytest.approx(met, abs=TICK)
     place = ball.place.copy()
     flown(pilot, 1.0)
@@ -403,14 +403,14 @@ def test_the_target_stays_out_of_obstacles():
     assert pilot.held_off == "hall"  # its west side is at x = 21 m
     slots = target_slots(pilot)
     assert 20.75 - 0.3 <= slots[:, 0].max() <= 20.75
-    assert pilot.ending == ""
+    assert pilot.flight.ending == ""
 
 
 def test_a_formation_without_room_is_refused():
     """A formation whose way leads through a wall is refused with the wall's name, and the one before stays."""
     wall = {"kind": "box", "name": "wall", "min": [8.5, -10.0, 0.0], "max": [9.0, 20.0, 9.0]}
     pilot = settled(obstacles=[{"kind": "ground"}, wall])
-    assert pilot.ending == ""
+    assert pilot.flight.ending == ""
     with pytest.raises(ValueError, match=r"'line' has no room here: agent 3 would meet 'wall'"):
         pilot.change("line")
     assert pilot.waiting is None

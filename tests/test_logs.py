@@ -3,6 +3,7 @@
 import lzma
 import os
 import re
+import sqlite3
 import struct
 from contextlib import suppress
 from pathlib import Path
@@ -202,6 +203,48 @@ def test_a_telemetry_log_has_the_clock_of_its_writer(log):
     np.testing.assert_allclose(np.diff(time), np.diff(own[:, 6]) / 1e3, atol=1e-6)
     assert said(read, "the clock begins anew, 2 times")
     assert "armed" in read.read[0]
+
+
+@pytest.mark.parametrize(("frame", "turned"), [(1, [1, 0, 2]), (4, [0, 1, 2])])
+def test_odometry_of_mavlink_is_of_its_frame(tmp_path, frame, turned):
+    """What pymavlink writes in north, east, down or east, north, up is read; a frame of the vehicle's start is not."""
+    common = pytest.importorskip("pymavlink.dialects.v20.common")
+    writer = common.MAVLink(None, 1, 1)
+    place = np.array([[0.5 * k, 1.0 - 0.25 * k, -2.0 - 0.125 * k] for k in range(40)])
+
+    def write(name, frame):
+        variances = [
+            0.25 if k == 0 else 0.0625 if k == 6 else 1.0 if k == 11 else 0.0 for k in range(21)
+        ]
+        packets = []
+        for k, x in enumerate(place.tolist()):
+            m = common.MAVLink_odometry_message(
+                3_000_000 + 50_000 * k,
+                frame,
+                12,
+                *x,
+                [1, 0, 0, 0],
+                *[0] * 6,
+                variances,
+                [0] * 21,
+                2 * (k >= 30),
+            )
+            received = 1_700_000_000_000_000 + 50_000 * k + 10_000 * (k % 4)
+            packets.append(struct.pack(">Q", received) + m.pack(writer))
+        (tmp_path / name).write_bytes(b"".join(packets))
+        return tmp_path / name
+
+    path = write("one.tlog", frame)
+    assert mavlink(path, "ODOMETRY", "frame_id", "y")[-1].tolist() == [frame, place[-1, 1]]
+    read = read_trajectories(path)
+    time, own = at_samples(read)
+    up = -1.0 if frame == 1 else 1.0
+    np.testing.assert_allclose(own, place[:, turned] * [1.0, 1.0, up])
+    np.testing.assert_allclose(time + read.since, 1.7e9 + 0.05 * np.arange(40), atol=1e-6)
+    np.testing.assert_allclose(measured(read).deviation, [np.array([0.5, 0.25, 1.0])[turned]] * 40)
+    assert said(read, "the estimator moves its position by")
+    with pytest.raises(TrajectoryError, match="ODOMETRY: positions are in a frame that is turned"):
+        read_trajectories(write("start.tlog", 20))
 
 
 def test_jumps_of_an_estimator_are_told(log, tmp_path):
@@ -492,6 +535,136 @@ def test_rosbag2_is_read(log, tmp_path):
     path.write_bytes(path.read_bytes()[:50_000])
     with pytest.raises(TrajectoryError, match="the recording is damaged"):
         read_trajectories(path)
+
+
+#: How `px4_msgs` defines the first fields of two messages, and the last ones that matter here.
+PX4 = {
+    "VehicleLocalPosition": """
+        uint32 MESSAGE_VERSION = 1
+        # Fused local position in NED.
+        uint64 timestamp\t\t\t# time since system start (microseconds)
+        uint64 timestamp_sample                 # the timestamp of the raw data (microseconds)
+        bool xy_valid\t\t\t\t# true if x and y are valid
+        bool z_valid
+        float32 x
+        float32 y
+        float32 z
+        float32[2] delta_xy
+        uint8 xy_reset_counter
+        float32 delta_z
+        uint8 z_reset_counter
+        float32 vx
+        float32 vy
+        float32 vz
+        float32 heading
+        uint8 heading_reset_counter
+        float64 ref_lat
+        float64 ref_lon
+        float32 ref_alt
+        float32 eph
+        float32 epv""",
+    "VehicleOdometry": """
+        uint64 timestamp
+        uint64 timestamp_sample
+        uint8 POSE_FRAME_NED     = 1 # NED earth-fixed frame
+        uint8 pose_frame
+        float32[3] position
+        float32[4] q
+        float32[3] position_variance
+        uint8 reset_counter""",
+}
+
+
+def px4_bag(folder: Path, plugin: str, version: int, messages: dict) -> Path:
+    """A recording that `rosbags` writes, with messages of PX4 that it is taught: their fields, by topic and kind."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.rosbag2.enums import StoragePlugin
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for kind, text in PX4.items():
+        store.register(get_types_from_msg(text, f"px4_msgs/msg/{kind}"))
+    with rosbag2.Writer(folder, version=version, storage_plugin=StoragePlugin[plugin]) as writer:
+        for (topic, kind), rows in messages.items():
+            name = f"px4_msgs/msg/{kind}"
+            to = writer.add_connection(topic, name, typestore=store)
+            for received, fields in rows:
+                data = store.serialize_cdr(store.types[name](**fields), name)
+                writer.write(to, received, data)
+    return folder
+
+
+def px4_rows(n=50):
+    """Fields of PX4's two messages at times of its own clock, and when they were recorded [ns]."""
+    single = lambda *x: np.array(x, np.float32)  # noqa: E731
+    local, odometry = [], []
+    for k in range(n):
+        t, received = 5_000_000 + 20_000 * k, 1_700_000_000_000_000_000 + 20_000_000 * k
+        stamps = {"timestamp": t + 900, "timestamp_sample": t}
+        place = 0.25 * k, 1.0 - 0.5 * k, -3.0 - 0.125 * k
+        local.append((received + 1_000_000 * (k % 3), stamps | {
+            "xy_valid": k >= 5, "z_valid": True, "x": place[0], "y": place[1], "z": place[2],
+            "delta_xy": single(9.0, 9.0), "xy_reset_counter": 7, "delta_z": 9.0, "z_reset_counter": 7, "vx": 12.5,
+            "vy": -25.0, "vz": -6.25, "heading": 0.5, "heading_reset_counter": 3, "ref_lat": 47.4, "ref_lon": 8.55,
+            "ref_alt": 488.0, "eph": 0.5, "epv": 0.25,
+        }))  # fmt: skip
+        odometry.append((received, stamps | {
+            "pose_frame": 1, "position": single(*place), "q": single(1, 0, 0, 0),
+            "position_variance": single(0.25, 0.0625, 1.0), "reset_counter": 0,
+        }))  # fmt: skip
+    return local, odometry
+
+
+@pytest.mark.parametrize(("plugin", "version"), [("MCAP", 9), ("SQLITE3", 9)])
+def test_messages_of_px4_are_read_from_recordings(tmp_path, plugin, version):
+    """North, east, down in the fields that the recording defines become east, north, up, a topic a vehicle."""
+    pytest.importorskip("mcap")
+    local, odometry = px4_rows()
+    kinds = ("VehicleLocalPosition", "VehicleOdometry")
+    topics = ("/px4_1/fmu/out/vehicle_local_position", "/px4_1/fmu/out/vehicle_odometry")
+    path = px4_bag(tmp_path / "bag", plugin, version,
+                   dict(zip(zip(topics, kinds, strict=True), (local, odometry), strict=True)))  # fmt: skip
+    read = read_trajectories(path)
+    assert read.names == topics[:1]
+    time, place = at_samples(read)
+    wanted = np.array([[f["y"], f["x"], -f["z"]] for _, f in local])
+    np.testing.assert_allclose(place, wanted[5:], atol=1e-6)
+    np.testing.assert_allclose(time + read.since, 1.7e9 + 0.02 * np.arange(5, 50), atol=1e-6)
+    np.testing.assert_allclose(measured(read).velocity, [[-25.0, 12.5, 6.25]] * 45)
+    np.testing.assert_allclose(measured(read).deviation[0], [0.5**1.5, 0.5**1.5, 0.25])
+    assert read.read[0]["origin"] == pytest.approx([47.4, 8.55, 488.0])
+    read = read_trajectories(path, topic="*/vehicle_odometry")
+    np.testing.assert_allclose(at_samples(read)[1], wanted, atol=1e-6)
+    np.testing.assert_allclose(measured(read).deviation, [[0.25, 0.5, 1.0]] * 50)
+
+
+def test_what_is_no_log_is_refused_by_name(tmp_path):
+    """A path that is planned, PX4's messages without their definition, and frames that are turned anyhow."""
+    _, odometry = px4_rows()
+    topic = "/fmu/out/vehicle_odometry"
+    path = px4_bag(tmp_path / "old", "SQLITE3", 8, {(topic, "VehicleOdometry"): odometry})
+    base = sqlite3.connect(next(path.glob("*.db3")))
+    base.execute("DROP TABLE IF EXISTS message_definitions")  # as before ROS 2 Iron
+    base.commit()
+    base.close()
+    with pytest.raises(TrajectoryError, match=r"_odometry: is of PX4, and .* define it: record as"):
+        read_trajectories(path)
+    turned = [(at, fields | {"pose_frame": 2}) for at, fields in odometry]
+    path = px4_bag(tmp_path / "frd", "SQLITE3", 9, {(topic, "VehicleOdometry"): turned})
+    with pytest.raises(TrajectoryError, match="positions are in a frame that is turned anyhow"):
+        read_trajectories(path)
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind, header, time = (store.types[x] for x in ("nav_msgs/msg/Path", "std_msgs/msg/Header",
+                                                   "builtin_interfaces/msg/Time"))  # fmt: skip
+    with rosbag2.Writer(tmp_path / "plan", version=9) as writer:
+        to = writer.add_connection("/plan", kind.__msgtype__, typestore=store)
+        message = kind(header(time(1, 0), "map"), [])
+        writer.write(to, 10**9, store.serialize_cdr(message, kind.__msgtype__))
+    with pytest.raises(TrajectoryError, match="/plan: is a path that is planned, not a log: give"):
+        read_trajectories(tmp_path / "plan")
 
 
 def test_fixes_of_ros_are_places_on_the_earth(log):

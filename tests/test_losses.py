@@ -454,7 +454,7 @@ def test_a_live_flight_goes_on():
     pilot = Pilot(mission({"lost": [{"agent": 2, "time": 6.0}], "on_loss": "land"}))
     while pilot.t < 8.0:
         pilot.step()
-    assert not pilot.ending
+    assert not pilot.flight.ending
     result = pilot.result()
     assert result.mission.on_loss == "continue"
     assert result.mission.lost_at[1] == 6.0

@@ -120,7 +120,8 @@ def test_the_linear_flight_is_the_flight(tables, loss, changes):
         most = max(most, np.abs(off(state, m)).max())
         here = linear.parts(x).orders[0].reshape(-1, 3)
         np.testing.assert_allclose(here, off(state, m), rtol=0, atol=1e-5 * most)
-    assert state.mail.count[LOST].sum() / state.mail.count[SENT].sum() > 0.2
+    lost = state.mail.count[LOST].sum() / state.mail.count[SENT].sum()
+    assert 0.2 < lost < loss + 0.1
     assert (least_grip == 0.0) == bool(changes)
 
 

@@ -15,7 +15,7 @@ from test_doubt import logged
 
 from rigidfleet.errors import ResultError
 from rigidfleet.mission import Mission, load_mission
-from rigidfleet.plotting import agent_colours
+from rigidfleet.plotting import agent_colours, figure_names
 from rigidfleet.simulation.as_logged import Doubts, judge_log
 from rigidfleet.simulation.flight import simulate
 from rigidfleet.web.replay import html_page, replay
@@ -356,6 +356,24 @@ def test_a_log_that_is_judged_has_its_plan_on_the_page():
     expected = t[bump > info["off"]][[0, -1]]
     assert [longest["start"], longest["end"]] == pytest.approx(expected, abs=0.15)
     assert [longest["worst"], longest["at"]] == pytest.approx([0.8, 7.5], abs=0.1)
+
+
+def test_a_log_of_vehicles_with_rotors_shows_nothing_of_rotors():
+    """A log says where vehicles are: neither attitudes nor rotors of its plan are shown as if measured."""
+    plan = quadrotors(3, 10.0)
+    shown = {"turn", "rotors", "saturated", "rotor plot"}
+    info, columns = parts(html_page(plan))
+    assert shown <= {*columns}
+    assert "rotors" in info
+    random = np.random.default_rng(0)
+    places = plan.position + 0.003 * random.standard_normal(plan.position.shape)
+    log = logged([plan.time] * 3, [*places.swapaxes(0, 1)])
+    result, _ = judge_log(log, plan, Doubts(0.003, 0.0))
+    info, columns = parts(html_page(result))
+    assert not shown & {*columns}
+    assert "rotors" not in info
+    assert {"off plot", "doubt"} <= {*columns}
+    assert not {"rotors", "vehicles"} & {*figure_names(result)}
 
 
 # -- the file

@@ -263,6 +263,10 @@ def test_a_file_is_checked_like_a_mission(tmp_path):
         Sweep.load(file)
     assert [f.file for f in caught.value.findings] == [str(file)] * 2
     assert "did you mean 'seed'?" in str(caught.value)
+    file.write_text(good.partition("\n")[2])
+    with pytest.raises(SweepError) as caught:
+        Sweep.load(file)
+    assert [(f.key, f.problem) for f in caught.value.findings] == [("mission", "is missing")]
 
 
 # -- flying ------------------------------------------------------------------------------------------
@@ -396,7 +400,7 @@ def flown(tmp_path_factory) -> Table:
 
 def test_rows_are_the_same_for_any_number_of_workers(flown, tmp_path, monkeypatch):
     """Processes give the rows of one process, bit for bit."""
-    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
     seen: list[SweepProgress] = []
     table = fly(sweep(), tmp_path, workers=2, progress=seen.append)
     assert numbers(table) == numbers(flown)
@@ -535,7 +539,7 @@ def test_ends_are_the_same_however_they_are_flown(ends, tmp_path, monkeypatch):
     """Bit for bit: after interruptions, with runs added, and by processes."""
     fly(by_final_states(runs=6), tmp_path / "a", workers=1)
     assert numbers(fly(by_final_states(), tmp_path / "a", workers=1)) == numbers(ends)
-    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
     assert numbers(fly(by_final_states(), tmp_path / "b", workers=2)) == numbers(ends)
     with pytest.raises(ResultError, match="it differs in: what is evaluated"):
         fly(Sweep.of(Mission.from_dict(TETRAHEDRON), STARTS, runs=20, seed=3), tmp_path / "a")
@@ -794,7 +798,7 @@ def test_a_pool_that_breaks_as_it_is_given_work_loses_none(tmp_path, monkeypatch
 
     kinds = [Dying, ThreadPoolExecutor]
 
-    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
     monkeypatch.setattr("rigidfleet.sweep.workers.processes", processes)
     monkeypatch.setattr("rigidfleet.sweep.runner._CHUNK", 0.0)
     asked = sweep(runs=60)
@@ -924,7 +928,7 @@ def test_a_killed_worker_is_replaced(flown, tmp_path, monkeypatch):
     """A worker process killed in mid-run costs its chunk some time, and nothing else."""
     import multiprocessing
 
-    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
     killed: list[int] = []
 
     def kill(progress: SweepProgress) -> None:
@@ -1612,7 +1616,7 @@ def test_a_sweep_flies_a_controller_by_name(folder, capsys, monkeypatch):
     """Rows are those of `simulate` with the controller, by one process and by workers; each run has a new object."""
     from rigidfleet.simulation.flight import simulate
 
-    monkeypatch.setattr("rigidfleet.sweep.runner._WORTH", 0.0)
+    monkeypatch.setattr("rigidfleet.sweep.runner.WORTH", 0.0)
     Path("a_law.py").write_text(LAW)
     line = ["sweep", "pair.toml", "--vary", SCATTER[1], "--runs", "9", "--no-figures", "--quiet"]
     own = [*line, "--controller", "a_law:Own", "--rate", "100"]

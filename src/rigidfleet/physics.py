@@ -94,7 +94,9 @@ def constraint_force(
     if e and not w.L.min() > 0.0:
         i, j = graph.edges[w.L.argmin()]
         raise ValueError(f"agents {i} and {j} coincide: their edge has no direction")
-    constraint.solve_multipliers(_vehicles(m), graph, law, w)
+    total, limit = float(m.sum()), np.full(n, np.inf)
+    vehicles = Vehicles(m, 1.0 / m, total, float(m.mean()), limit, False, 0.0)
+    constraint.solve_multipliers(vehicles, graph, law, w)
     f_C = np.zeros((n, 3))
     constraint.apply_multipliers(w.u, graph.edges, w.multiplier, f_C)
     i, j = graph.edges.T
@@ -183,10 +185,8 @@ def distance_schedule(
     """
     d0 = np.atleast_1d(np.asarray(d0, dtype=float))
     d1 = _full(d1, d0.shape, "d1")
-    ref = Reference(
-        SQUARED, float(start), float(blend), d0, d1, np.zeros((0, 3)), np.zeros((0, 3)),
-        np.zeros(3),
-    )  # fmt: skip
+    none = np.zeros((0, 3))
+    ref = Reference(SQUARED, float(start), float(blend), d0, d1, none, none, np.zeros(3))
     return _schedule(ref, np.zeros((len(d0), 2), dtype=np.int64), times)
 
 
@@ -199,12 +199,6 @@ def _schedule(ref: Reference, edges: Ints, times: ArrayLike) -> tuple[Floats, Fl
             references.blend_slots(time, ref, *p)
         references.distance_references(time, ref, edges, *p, *out[:, row])
     return out[0], out[1], out[2]
-
-
-def _vehicles(m: Floats) -> Vehicles:
-    return Vehicles(
-        m, 1.0 / m, float(m.sum()), float(m.mean()), np.full(len(m), np.inf), False, 0.0
-    )
 
 
 def _masses_and_points(masses: ArrayLike, points: ArrayLike) -> tuple[Floats, Floats]:

@@ -126,14 +126,8 @@ def csv_text(samples: Setpoints, first: int = 1) -> str:
     Agents count from ``first``.
     """
     k, n = samples.yaw.shape
-    columns = np.concatenate(
-        [
-            samples.state.transpose(0, 2, 1, 3).reshape(k, n, 12),
-            samples.yaw[..., None],
-            samples.yaw_rate[..., None],
-        ],
-        axis=2,
-    )
+    states = samples.state.transpose(0, 2, 1, 3).reshape(k, n, 12)
+    columns = np.concatenate([states, np.stack([samples.yaw, samples.yaw_rate], axis=2)], axis=2)
     lines = [HEADER]
     row = ",".join(["%.9g"] * columns.shape[2])
     for t, agents in zip(samples.time.tolist(), columns, strict=True):

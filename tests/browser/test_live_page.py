@@ -349,7 +349,7 @@ def test_quadrotors(browser):
                 "[...document.querySelectorAll('#fly button')].find((b) => b.textContent === 'behind').click()"
             )
             browser.wait(MOVED)
-            assert session.pilot.ending == ""
+            assert session.pilot.flight.ending == ""
             assert browser.heard() == []
             browser.driver.get("about:blank")
     finally:

@@ -89,8 +89,8 @@ def replacing_folder(path: Path, ours: re.Pattern[str]) -> Generator[Path]:
         shutil.rmtree(old, ignore_errors=True)
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """Write a file without ever leaving a partial one.
+def write_file(path: Path, data: bytes, *, parents: bool = False) -> None:
+    """Write a file without ever leaving a partial one, if wanted with the folders above it.
 
     Raises
     ------
@@ -98,6 +98,8 @@ def write_file(path: Path, data: bytes) -> None:
         The file cannot be written. The message has the cause and the remedy.
     """
     try:
+        if parents:
+            path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as file:
             file.write(data)
     except OSError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from rigidfleet.assessment.outcome import (
     CheckResult,
     Extreme,
     PhaseVerdict,
-    keeps_limit,
     limit_check,
     value,
 )
@@ -148,7 +148,6 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
     """Check each formation at the end of the phases that shape it, and at the end of the flight."""
     from rigidfleet.mission import KINDS  # takes long to load, and the flight has loaded it
 
-    limits: dict[str, float] = {}  # of errors of edges, by formation
     for i, p in enumerate(phases):
         shaping = KINDS[p.kind].shapes or i == len(phases) - 1
         if not (shaping and p.finished) or p.formation is None:
@@ -157,11 +156,8 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         edges, _ = measured.edges(p.formation, last)
         held = False
         if p.distances is not None:
-            if p.formation not in limits:
-                shortest = float(measured.formation(p.formation)[2].min())
-                form = measured.mission.formations[p.formation]
-                limits[p.formation] = form.greatest_error(shortest)
-            limit = limits[p.formation]
+            form = measured.mission.formations[p.formation]
+            limit = form.greatest_error(measured.mission.formation_distances(p.formation).min())
             held = p.distances <= limit
             words = f"{value(p.distances, 'm')} off (limit {value(limit, 'm')})"
             words = f"the worst of the {len(edges)} edges of '{p.formation}' is {words}"
@@ -177,7 +173,7 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
         )
         if held and not passed:
             left = measured.left[last]
-            shape = measured.mission.formations[p.formation].shape
+            shape = form.shape
             wanted = f"no {shape}" if shape else f"not the shape of '{p.formation}'"
             place = np.cumsum(left) - 1  # of each agent among those left
             rigid = is_rigid(measured.result.position[last][left], place[edges])
@@ -209,24 +205,15 @@ def _shape_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterato
 
 
 def _check_at_end(
-    p: PhaseVerdict,
-    check: str,
-    passed: bool,
-    words: str,
-    worst: float | None = None,
-    limit: float | None = None,
-    unit: str = "",
-    who: str = "",
+    p: PhaseVerdict, check: str, passed: bool, words: str, *judged: Any, who: str = ""
 ) -> CheckResult:
-    """A finding about the end of a phase."""
+    """A finding about the end of a phase; ``judged``: the worst value, its limit and their unit."""
     words = f"at the end of phase '{p.name}' ({p.t_end:.2f} s) {words}"
-    return CheckResult(
-        check, passed, words, worst, limit, unit, when=p.t_end, who=who, phase=p.name
-    )
+    return CheckResult(check, passed, words, *judged, when=p.t_end, who=who, phase=p.name)
 
 
 def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
-    """How far waypoints are missed in each quantity: those that are, or else the one that comes nearest."""
+    """How far each waypoint is missed, in each quantity."""
     points = [
         (p, what, at)
         for p in phases
@@ -238,12 +225,10 @@ def _waypoint_checks(phases: list[PhaseVerdict]) -> Iterator[CheckResult]:
         if at is not None
     ]
     for name, limit in WAYPOINT_TOLERANCE.items():
-        unit, every = UNITS[name], [x for x in points if getattr(x[2], name) is not None]
-        off = [getattr(at, name) for *_, at in every]
-        missed = [k for k, miss in enumerate(off) if not miss <= limit]
-        for k in missed or ([off.index(max(off))] if off else []):
-            (p, what, at), miss = every[k], off[k]
-            passed = miss <= limit
+        for p, what, at in points:
+            if (miss := getattr(at, name)) is None:
+                continue
+            unit, passed = UNITS[name], miss <= limit
             words = f"{'met' if passed else 'missed'}, {value(miss, unit)} off in {name}"
             words = f"{what} of phase '{p.name}' is {words} (limit {limit:g} {unit})"
             yield CheckResult(
@@ -329,21 +314,16 @@ def _flying_separation_check(measured: Measurements, q: Quantity) -> Iterator[Ch
 
 def _planned_separation_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:
     """How much nearer agents come in each phase than its plan's certificate says."""
-    allowed = q.limit_of(measured.mission)
-    every = [
-        (record.planned["separation"], e, record.name)
-        for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True)
-        if record.planned is not None and (e := worst.get("separation")) is not None
-    ]
-    nearer = [planned - e.value for planned, e, _ in every]
-    beyond = [k for k, by in enumerate(nearer) if not keeps_limit(q, by, allowed)]
-    for k in beyond or ([nearer.index(max(nearer))] if nearer else []):
-        planned, e, name = every[k]
-        words = (
-            f"in phase '{name}' {_nearness_in_words(e)};"
-            f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
-        )
-        yield limit_check(q, replace(e, value=nearer[k]), allowed, words)
+    allowed, checks = q.limit_of(measured.mission), []
+    for record, worst in zip(measured.result.phases, measured.worst_by_phase, strict=True):
+        if record.planned is not None and (e := worst.get("separation")) is not None:
+            planned = record.planned["separation"]
+            words = (
+                f"in phase '{record.name}' {_nearness_in_words(e)};"
+                f" the plan proves {value(planned, 'm')}, of which {allowed:g} m are allowed for tracking"
+            )
+            checks.append(limit_check(q, replace(e, value=planned - e.value), allowed, words))
+    yield from _failures_or_nearest(checks)
 
 
 def _nearness_in_words(e: Extreme) -> str:
@@ -399,9 +379,9 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
     when = mission.abandons_at
     if not when < measured.result.time[-1]:
         return
-    what, at = f"loss of {mission.first_lost}", mission.first_loss
+    who, what, at = "a loss", f"loss of {mission.first_lost}", mission.first_loss
     if mission.on_loss == "continue" or at > when:
-        what, at = "order to abort", when - mission.aborting.reaction
+        who, what, at = "the order", "order to abort", when - mission.aborting.reaction
     begun = sum(p.t_start < when for p in flown)
     left = [p.name for p in flown if p.abandoned]
     never = [phase.name for phase in mission.phases[begun:]]
@@ -414,7 +394,7 @@ def abandonment_check(measured: Measurements) -> Iterator[CheckResult]:
         )
     words = f"after the {what} at {at:.2f} s, {'; '.join(parts)}"
     yield CheckResult(
-        "abandoned", True, words, float(len(left + never)), None, "", when=when, judged=False
+        "abandoned", True, words, float(len(left + never)), when=when, who=who, judged=False
     )
 
 
@@ -450,15 +430,11 @@ def _thrust_checks(measured: Measurements, q: Quantity) -> Iterator[CheckResult]
     if beyond is None:
         yield limit_check(q, e, None)
         return
-
-    def limit(who: str) -> float:
-        return float(limits[int(who.removeprefix("agent ")) - 1])
-
-    if e.value - limit(e.who) < beyond.value:
+    own = {f"agent {i + 1}": most for i, most in enumerate(limits.tolist())}
+    if e.value - own[e.who] < beyond.value:
         yield limit_check(quantity("thrust_peak"), e, None)
-        most = limit(beyond.who)
-        e = replace(beyond, value=beyond.value + most)
-    yield limit_check(q, e, limit(e.who))
+        e = replace(beyond, value=beyond.value + own[beyond.who])
+    yield limit_check(q, e, own[e.who])
 
 
 def _rotor_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult]:

@@ -79,29 +79,25 @@ class DrawnWays:
         if name in _AT_END:
             k = int(np.abs(self.result.time - (check.when or 0.0)).argmin())
             if name not in _SHAPES:
-                return float(_lengths(shifts[:, order, k]).max(initial=0.0))
+                return _greatest_length(shifts[:, order, k])
             i, j = proximity.all_pairs(self.result.n_agents)
-            by = float(_lengths(shifts[:, 0, k, i] - shifts[:, 0, k, j]).max(initial=0.0))
+            by = _greatest_length(shifts[:, 0, k, i] - shifts[:, 0, k, j])
             least = float(_lengths(self.result.position[k, i] - self.result.position[k, j]).min())
-            if (
-                check.worst is None
-            ):  # an order or a handedness is lost where vehicles may change places
+            if check.worst is None:  # what is lost where vehicles may change places
                 return by if by > 0.5 * least else 0.0
             return math.degrees(math.atan2(by, least)) if check.unit == "deg" else by
         sizes = _lengths(shifts[:, order])
         most = float(sizes.max(initial=0.0))
         if q.name in ("separation", "separation_flying"):
             k, i, j = self._near_pairs(float(check.worst or 0.0) + 4.0 * most)
-            return float(_lengths(shifts[:, 0, k, i] - shifts[:, 0, k, j]).max(initial=0.0))
+            return _greatest_length(shifts[:, 0, k, i] - shifts[:, 0, k, j])
         if _is_of_pairs(name):
             return 2.0 * most
         if (
             name == "people"
         ):  # where a vehicle falls depends on its velocity, for the time of a fall
-            fall = math.sqrt(
-                2.0 * float(np.ptp(self.result.position[..., 2])) / self.result.mission.gravity
-            )
-            return most + fall * float(_lengths(shifts[:, 1]).max(initial=0.0))
+            height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
+            return most + math.sqrt(2.0 * height / gravity) * _greatest_length(shifts[:, 1])
         values = -self.measurements.close.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
             values = self.measurements.samples_of(name).rank
@@ -125,6 +121,10 @@ class DrawnWays:
 
 def _lengths(x: Floats) -> Floats:
     return np.sqrt(np.einsum("...a,...a->...", x, x))
+
+
+def _greatest_length(x: Floats) -> float:
+    return float(_lengths(x).max(initial=0.0))
 
 
 def _is_of_pairs(name: str) -> bool:
@@ -185,17 +185,11 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     if not keeps_limit(sense, better, limit):
         return replace(check, passed=False)
     share = abs(worst - limit) / by
-    rate = (
-        f", or, if it is white, {math.ceil(share**-2.4)} times the rate"
-        if share > _TOO_NEAR
-        else ""
-    )
+    times = math.ceil(share**-2.4) if share > _TOO_NEAR else 0
+    rate = f", or, if it is white, {times} times the rate" * (times > 0)
     remedy = f"noise of {value(1e3 * sigma * share)} mm would decide it{rate}"
-    words = (
-        words.replace(" is missed,", " may be missed,")
-        .replace(" is met,", " may be missed,")
-        .replace(" is not reached", " may not be reached")
-    )
+    words = re.sub(" is (missed|met),", " may be missed,", words)
+    words = words.replace(" is not reached", " may not be reached")
     return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
 
 
@@ -254,10 +248,8 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
     explained = facts["alignment"]
     applied = _APPLIED[facts["clock"]]
     if facts["clock"] == "own":
-        own = (
-            _lateness(*x["offset_s"]) if np.isfinite(x["offset_s"][0]) else "?"
-            for x in facts["vehicles"]
-        )
+        every = [x["offset_s"] for x in facts["vehicles"]]
+        own = (_lateness(*x) if np.isfinite(x[0]) else "?" for x in every)
         yield f"against the plan, clocks of vehicles are {', '.join(own)}; {applied}"
     elif explained["offset_s"] is None:
         yield f"the offset of the clock cannot be told, as the plan hardly moves; {applied}"

@@ -7,11 +7,12 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, quantity
-from rigidfleet.assessment.fits import Alignments, Fit, angle_between
+from rigidfleet.assessment.fits import Fit, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -34,6 +35,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 #: Quantities of which a phase between samples has a worst value.
 _DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geofence")
 
+#: What a verdict on a phase repeats of its record.
+_OF_RECORD = ("name", "kind", "control", "formation", "t_start", "t_end", "settled")
+
 
 class Measurements:
     """Measures a result phase by phase, at samples (recomputed from positions and forces) and between them."""
@@ -41,7 +45,6 @@ class Measurements:
     def __init__(self, result: Result) -> None:
         self.result, self.mission = result, result.mission
         self.left = result.left
-        self.whole = bool(self.left.all())
         #: Samples of each phase.
         ends = np.searchsorted(result.phase, np.arange(len(result.phases) + 1))
         self.parts = [slice(*pair) for pair in pairwise(ends.tolist())]
@@ -49,12 +52,7 @@ class Measurements:
         self.flown = [k for k, s in enumerate(self.parts) if s.stop > s.start]
         #: Quantities of which the record tells what happens between samples.
         self.names_recorded = set[str]().union(*(p.extremes for p in result.phases))
-        self._formations: dict[str, tuple[Floats | None, Ints, Floats]] = {}
-        self._nearest: dict[tuple[float, int], int] = {}
         self._sampled: dict[str, Samples] = {}
-        #: The last sample of each phase flown, and positions (F, N, 3) there.
-        self.last = [self.parts[k].stop - 1 for k in self.flown]
-        self.ends = result.position[self.last]
 
     @cached_property
     def close(self) -> proximity.Closeness:
@@ -66,15 +64,9 @@ class Measurements:
         """Values at samples of each quantity of which a phase has a worst value."""
         return {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
 
-    @cached_property
-    def rank(self) -> dict[str, list[float]]:
-        """Greatest rank of each quantity at the samples of each phase; -infinity of phases without samples."""
-        starts = np.array([self.parts[k].start for k in self.flown])
-        ranks = np.full((len(self.of_phases), len(self.parts)), -np.inf)
-        for row, sampled in zip(ranks, self.of_phases.values(), strict=True):
-            if places := sampled.rank.shape[1]:
-                row[self.flown] = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts)
-        return dict(zip(self.of_phases, ranks.tolist(), strict=True))
+    def rank(self, name: str, index: int) -> float:
+        """Greatest rank of a quantity at the samples of a phase; -infinity of a phase without samples."""
+        return float(self.of_phases[name].rank[self.parts[index]].max(initial=-np.inf))
 
     def first_time(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -107,12 +99,6 @@ class Measurements:
 
     # -- between samples ------------------------------------------------------------------------------
 
-    def recorded_extreme(self, name: str, index: int) -> Extreme | None:
-        """The recorded extreme of a phase in continuous time; None if the record has none."""
-        phase = self.result.phases[index]
-        x = phase.extremes.get(name)
-        return None if x is None else self.extreme_of(name, x, phase.name)
-
     def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
@@ -121,21 +107,18 @@ class Measurements:
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
-        if quantity(name).by_phase:
-            every = [worst[name] for worst in self.worst_by_phase if name in worst]
-            rank = QUANTITIES[name].rank
-            return max(every, key=lambda e: rank(e.value), default=None)
-        return self.worst_among(name, self.samples_of(name) if name in SAMPLED else None)
+        known = quantity(name).by_phase or name in SAMPLED
+        return self.worst_among(name, self.samples_of(name) if known else None)
 
     def worst_among(self, name: str, values: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``values`` at samples, or between them."""
         rank = quantity(name).rank
-        every = {
-            k: rank(p.extremes[name].value)
-            for k, p in enumerate(self.result.phases)
+        every = [
+            self.extreme_of(name, p.extremes[name], p.name)
+            for p in self.result.phases
             if name in p.extremes
-        }
-        between = self.recorded_extreme(name, max(every, key=every.__getitem__)) if every else None
+        ]
+        between = max(every, key=lambda e: rank(e.value), default=None)
         sampled = None if values is None else self.worst_sample(values, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
@@ -145,14 +128,16 @@ class Measurements:
     def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
-        phases = list(zip(self.result.phases, self.parts, every, strict=True))
         for name, sampled in self.of_phases.items():
-            rank_of, alone = sampled.quantity.rank, name not in self.names_recorded
-            for rank, (phase, part, worst) in zip(self.rank[name], phases, strict=True):
-                x = phase.extremes.get(name)
-                if x is not None and rank < rank_of(x.value):
-                    worst[name] = self.extreme_of(name, x, phase.name)
-                elif e := self.worst_sample(sampled, part, alone=alone):
+            rank, alone = sampled.quantity.rank, name not in self.names_recorded
+            for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
+                e, x = (
+                    self.worst_sample(sampled, self.parts[k], alone=alone),
+                    phase.extremes.get(name),
+                )
+                if x is not None and (e is None or rank(e.value) < rank(x.value)):
+                    e = self.extreme_of(name, x, phase.name)
+                if e is not None:
                     worst[name] = e
         return every
 
@@ -160,9 +145,9 @@ class Measurements:
         """The first contact of agents ("separation") or with an obstacle ("clearance"), of which e is the worst."""
         if e.value > 0.0:
             return None
-        every = [k for k, p in enumerate(self.result.phases) if f"{name}_first" in p.extremes]
-        if every:
-            return self.recorded_extreme(f"{name}_first", every[0])
+        for phase in self.result.phases:
+            if (x := phase.extremes.get(f"{name}_first")) is not None:
+                return self.extreme_of(f"{name}_first", x, phase.name)
         sampled = self.samples_of(name)
         k = int(np.argmax(sampled.values <= 0.0))
         return self.worst_sample(sampled, slice(k, k + 1), alone=True) or e
@@ -212,25 +197,17 @@ class Measurements:
         """Values of the record that disagree with its own positions and forces: in words, and when [s]."""
         result, time = self.result, self.result.time
         r = result.position
-        reach = float(max(r.max(initial=0.0), -r.min(initial=0.0)))
-        if math.isnan(reach):
-            reach = float(np.nanmax(np.abs(r), initial=0.0))
-        rounding = 1e-9 * (1.0 + reach)
+        rounding = 1e-9 * (1.0 + float(np.nanmax(np.abs(r), initial=0.0)))
         stored = {}
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             for name in ("separation", "clearance"):
                 if name in vars(result):  # else it would be made of these very positions
-                    stored[name] = getattr(result, name) - getattr(self.close, name), "m"
-        stored |= {
-            "distance": (
-                np.abs(proximity.lengths(r, result.edges).T - result.distance),
-                "m",
-            ),
-            "thrust": (self.samples_of("thrust").values - result.thrust, "N"),
-        }
-        for name, (off, unit) in stored.items():
-            wrong = off > (rounding if unit == "m" else 1e-6)
-            if wrong.any():
+                    stored[name] = getattr(result, name) - getattr(self.close, name)
+        stored["distance"] = np.abs(proximity.lengths(r, result.edges).T - result.distance)
+        stored["thrust"] = self.samples_of("thrust").values - result.thrust
+        for name, off in stored.items():
+            unit, least = ("N", 1e-6) if name == "thrust" else ("m", rounding)
+            if (wrong := off > least).any():
                 k = int(np.argmax(wrong.reshape(len(time), -1).any(axis=1)))
                 worst = float(off[wrong].max())
                 words = (
@@ -245,7 +222,7 @@ class Measurements:
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
             for name, share in _SLACK.items():
-                x, rank = extremes.get(name), self.rank[name][index]
+                x, rank = extremes.get(name), self.rank(name, index)
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
@@ -262,17 +239,14 @@ class Measurements:
 
     def is_due(self, name: str, index: int) -> bool:
         """Whether a phase that has samples has a worst value of a quantity between them."""
-        match name:
-            case "thrust":
-                return self.rank[name][index] > -math.inf
-            case "separation":
-                return bool(np.count_nonzero(self.left[self.parts[index].start]) > 1)
-            case "clearance":
-                phase, every = self.result.phases[index], self.mission.obstacles
-                return any(_meets(*thing.solid.there[0].tolist(), phase) for thing in every)
-            case "geofence":
-                return self.mission.limits.geofence is not None
-        return True
+        if name == "geofence":
+            return self.mission.limits.geofence is not None
+        if name != "clearance":
+            return self.rank(name, index) > -math.inf
+        # An obstacle that is there at the start or the end of a phase alone is not in it.
+        phase = self.result.phases[index]
+        there = (thing.solid.there[0] for thing in self.mission.obstacles)
+        return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
@@ -281,179 +255,104 @@ class Measurements:
         finished = finished and not record.abandoned
         fit = self.fits.get(index)
         return PhaseVerdict(
-            name=record.name,
-            kind=record.kind,
-            control=record.control,
-            formation=record.formation,
-            t_start=record.t_start,
-            t_end=record.t_end,
-            settled=record.settled,
+            **{key: getattr(record, key) for key in _OF_RECORD},
             finished=finished,
-            constraint=self.constraints.get(index),
-            distances=self.edge_errors.get(index),
+            constraint=_greatest(result.constraint[self.parts[index].stop - 1]) if flown else None,
+            distances=self.edge_error(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
-            flip=self.flips.get(index),
+            flip=self.flip(index),
             order=None if fit is None else fit.in_order,
-            waypoint=self.misses.get(("target", index)) if finished else None,
-            stay=self.misses.get(("stay", index)) if finished else None,
+            waypoint=self.miss(index, record.target) if finished else None,
+            stay=self.miss(index, record.stay) if finished else None,
             through=tuple(self.misses_on_way(index)),
             worst=self.worst_by_phase[index],
         )
 
-    @cached_property
-    def constraints(self) -> dict[int, float | None]:
-        """Greatest |c| [m] of an edge at the end of each phase flown."""
-        return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
-
-    @cached_property
-    def edge_errors(self) -> dict[int, float | None]:
-        """Greatest error [m] of an edge against its formation at the end of each phase that has one."""
-        alike: dict[str, list[int]] = {}
-        for i, k in enumerate(self.flown):
-            if (name := self.result.phases[k].formation) is not None:
-                alike.setdefault(name, []).append(i)
-        errors: dict[int, float | None] = {}
-        for name, every in alike.items():
-            # Some edges may be lost later
-            for group in [every] if self._same_edges else [[i] for i in every]:
-                edges, intended = self.edges(name, self.last[group[0]])
-                off = (proximity.lengths(self.ends[group], edges) - intended[:, None]).T
-                errors |= zip([self.flown[i] for i in group], _greatest(off), strict=True)
-        return errors
-
-    @property
-    def _same_edges(self) -> bool:
-        """Whether no edge of a formation is ever lost."""
-        return self.whole and not len(self.mission.links_lost[1])
+    def edge_error(self, index: int) -> float | None:
+        """Greatest error [m] of an edge against its formation at the end of a phase; None if it has none."""
+        name, k = self.result.phases[index].formation, self.parts[index].stop - 1
+        if name is None or index not in self.flown:
+            return None
+        edges, intended = self.edges(name, k)
+        return _greatest(proximity.lengths(self.result.position[k : k + 1], edges)[:, 0] - intended)
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
         """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
-        _, edges, intended = self.formation(formation)
-        if self._same_edges:
-            return edges, intended
+        mission = self.mission
+        edges, intended = mission.formation_edges(formation), mission.formation_distances(formation)
         kept = self.left[k][edges].all(axis=1)
-        kept &= self.mission.has_link(edges, float(self.result.time[k]))
+        kept &= mission.has_link(edges, float(self.result.time[k]))
         return edges[kept], intended[kept]
-
-    def formation(self, name: str) -> tuple[Floats | None, Ints, Floats]:
-        """Slots (N, 3) [m] of a formation (None if unknown), its edges (m, 2) and their lengths (m,) [m]."""
-        if name not in self._formations:
-            m = self.mission
-            self._formations[name] = (
-                m.formation_slots(name), m.formation_edges(name), m.formation_distances(name)
-            )  # fmt: skip
-        return self._formations[name]
 
     @cached_property
     def fits(self) -> dict[int, Fit]:
-        """Fits of the formations at the end of each phase; those of equally many agents are computed at once."""
-        alike: dict[int, list[tuple[int, Floats, Floats, Ints | None]]] = {}
-        known = np.atleast_1d(np.isfinite(self.ends).all(axis=(1, 2)))
-        for index, end, finite in zip(self.flown, self.ends, known, strict=True):
-            name = self.result.phases[index].formation
-            slots = None if name is None else self.formation(name)[0]
-            if slots is None or not finite:
-                continue
-            one = index, end, slots, None
-            if not self.whole:
-                left = np.flatnonzero(self.left[self.parts[index].stop - 1])
-                one = index, end[left], slots[left], left
-            if len(one[1]) > 1:
-                alike.setdefault(len(one[1]), []).append(one)
+        """Fits of the formations at the end of each phase."""
         fits = {}
-        for group in alike.values():
-            alignments = Alignments(
-                np.array([p for _, p, *_ in group]), np.array([s for *_, s, _ in group])
-            )
-            for k, (index, p, slots, left) in enumerate(group):
-                fit = fits[index] = Fit(p, slots, left, alignments, k)
-                form = self.mission.formations[self.result.phases[index].formation or ""]
-                fit.limit = form.greatest_error(fit.shortest)
+        for index in self.flown:
+            name, k = self.result.phases[index].formation, self.parts[index].stop - 1
+            slots = None if name is None else self.mission.formation_slots(name)
+            end, left = self.result.position[k], np.flatnonzero(self.left[k])
+            if name is None or slots is None or len(left) < 2 or not np.isfinite(end).all():
+                continue
+            fits[index] = fit = Fit(end[left], slots[left])
+            fit.pair = left.item(fit.pair[0]), left.item(fit.pair[1])
+            fit.limit = self.mission.formations[name].greatest_error(fit.shortest)
         return fits
 
-    @cached_property
-    def flips(self) -> dict[int, float]:
-        """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
-        flat = {k: fit for k, fit in self.fits.items() if fit.dimension in (1, 2)}
-        if not flat:
-            return {}
+    def flip(self, index: int) -> float | None:
+        """Angle [deg] of a line or plane from its intended direction at the end of a phase that has one."""
+        fit, k = self.fits.get(index), self.parts[index].stop - 1
+        if fit is None or fit.dimension > 2:
+            return None
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        last = [self.parts[k].stop - 1 for k in flat]
-        q = np.array([self.result.attitude_reference[last], self.result.frame[last]])
-        axes = np.array([fit.axis for fit in flat.values()])
-        aims = (att.dcm_from_quaternion(q).swapaxes(2, 3) @ axes[..., None])[..., 0]
-        angle_by_phase = {}
-        for i, (k, fit) in enumerate(flat.items()):
-            some = aims[:, i].tolist()
-            if fit.dimension == 1:
-                # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-                some = some[:1] if self.result.phases[k].control == "tracking" else []
-            angles = (angle_between(fit.points, aim) for aim in some)
-            angle = next(filter(math.isfinite, angles), None)
-            if angle is not None:
-                angle_by_phase[k] = angle
-        return angle_by_phase
+        aims = [self.result.attitude_reference[k], self.result.frame[k]]
+        if fit.dimension == 1:
+            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
+            aims = aims[: self.result.phases[index].control == "tracking"]
+        angles = (
+            angle_between(fit.points, (att.dcm_from_quaternion(q).T @ fit.axis).tolist())
+            for q in aims
+        )
+        return next(filter(math.isfinite, angles), None)
 
     def nearest_sample(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
-        known, time, part = self._nearest.get((t, index)), self.result.time, self.parts[index]
-        if known is None:
-            after = bisect_left(time, t, part.start, part.stop - 1)
-            before = max(after - 1, part.start)
-            known = after if abs(time[after] - t) < abs(time[before] - t) else before
-            self._nearest[t, index] = known
-        return known
+        time, part = self.result.time, self.parts[index]
+        after = bisect_left(time, t, part.start, part.stop - 1)
+        before = max(after - 1, part.start)
+        return after if abs(time[after] - t) < abs(time[before] - t) else before
 
-    @cached_property
-    def misses(self) -> dict[tuple[str, int], Waypoint]:
-        """Miss of the ``target`` of each phase that has one, and of its place to ``stay`` at its end.
+    def miss(self, index: int, target: dict[str, Any] | None) -> Waypoint | None:
+        """Miss of the target of a phase, or of its place to stay at its end; None if it has none.
 
         A target is due at its time, or at the end of a phase that settles earlier. Where no formation is held, each
         vehicle has a place of its own: the vehicle furthest from it counts.
         """
-        result = self.result
-        targets = [
-            ((what, k), x)
-            for k in self.flown
-            for what in ("target", "stay")
-            if (x := getattr(result.phases[k], what)) is not None
-        ]
-        if not targets:
-            return {}
-        at = [self.nearest_sample(target["time"], k) for (_, k), target in targets]
-        miss: dict[str, dict[int, float]] = {}
+        if target is None:
+            return None
+        result, k = self.result, self.nearest_sample(target["time"], index)
+        miss: dict[str, float] = {}
         for name, values in (
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
             ("rates", result.rates),
         ):  # fmt: skip
-            rows = values[at].tolist()
+            row, wanted = values[k].tolist(), target.get(name)
             # Where the quantity is asked for, and known.
-            wanted_at = {
-                i: wanted for i, ((_, target), row) in enumerate(zip(targets, rows, strict=True))
-                if (wanted := target.get(name)) is not None and all(map(math.isfinite, row))
-            }  # fmt: skip
-            rows = [rows[i] for i in wanted_at]
-            if name == "attitude" and rows:
-                off = np.degrees(att.angle_between(rows, [*wanted_at.values()])).tolist()
-            else:
-                off = map(math.dist, rows, wanted_at.values())
-            miss[name] = dict(zip(wanted_at, off, strict=True))
-        for i, off in miss["position"].items():
-            if result.phases[targets[i][0][1]].formation is None:
-                own = float(np.fmax.reduce(self.samples_of("tracking_error").values[at[i]]))
-                # With a vehicle lost, the centre of those left says nothing of their places.
-                miss["position"][i] = max(off, own) if self.left[at[i]].all() else own
-        return {
-            k: Waypoint(
-                time=t,
-                position=miss["position"].get(i),
-                velocity=miss["velocity"].get(i),
-                attitude=miss["attitude"].get(i),
-                rates=math.degrees(miss["rates"][i]) if i in miss["rates"] else None,
-            )
-            for i, ((k, _), t) in enumerate(zip(targets, result.time[at].tolist(), strict=True))
-        }
+            if wanted is not None and all(map(math.isfinite, row)):
+                turned = name == "attitude"
+                miss[name] = (
+                    float(att.angle_between(row, wanted)) if turned else math.dist(row, wanted)
+                )
+        if "position" in miss and result.phases[index].formation is None:
+            own = float(np.fmax.reduce(self.samples_of("tracking_error").values[k]))
+            # With a vehicle lost, the centre of those left says nothing of their places.
+            miss["position"] = max(miss["position"], own) if self.left[k].all() else own
+        for name in {"attitude", "rates"} & miss.keys():
+            miss[name] = math.degrees(miss[name])
+        return Waypoint(
+            result.time.item(k), *map(miss.get, ("position", "velocity", "attitude", "rates"))
+        )
 
     def misses_on_way(self, index: int) -> Iterator[Waypoint]:
         """Misses of the points on the way of a phase that the flight came to."""
@@ -467,17 +366,7 @@ class Measurements:
             yield Waypoint(float(result.time[k]), miss, off, None, None)
 
 
-def _meets(since: float, until: float, phase: PhaseRecord) -> bool:
-    """Whether an obstacle that is there from when to when [s] is there during a phase, not only at its start or end."""
-    return since < phase.t_end - 1e-9 and until > phase.t_start + 1e-9
-
-
-def _greatest(values: Floats) -> list[float | None]:
-    """Greatest finite size of each row of values (G, m); None if there is none."""
-    sizes = np.abs(values)
-    if not sizes.shape[1]:
-        return [None] * len(sizes)
-    return [
-        most if math.isfinite(most) else max(filter(math.isfinite, row.tolist()), default=None)
-        for most, row in zip(sizes.max(axis=1).tolist(), sizes, strict=True)
-    ]
+def _greatest(values: Floats) -> float | None:
+    """Greatest finite size of values (m,); None if there is none."""
+    sizes = np.abs(values[np.isfinite(values)])
+    return float(sizes.max()) if sizes.size else None

@@ -63,12 +63,9 @@ def _network_notes(measured: Measurements) -> Iterator[str]:
     age = result.message_age
     silent = np.zeros((1, len(result.edges))) if age is None else (age > net.silence).any(axis=2)
     if silent.any():
-        names = [result.edge_labels[k] for k in np.flatnonzero(silent.any(axis=0))]
-        more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+        names = _first_few([result.edge_labels[k] for k in np.flatnonzero(silent.any(axis=0))])
         since = measured.first_time(silent.max(axis=1))
-        yield (
-            f"edges that let go for want of messages, first at {since:.2f} s: {', '.join(names[:_NAMED])}{more}"
-        )
+        yield f"edges that let go for want of messages, first at {since:.2f} s: {names}"
 
 
 def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
@@ -97,13 +94,13 @@ def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
         )
     yield from result.statistics.get("notes", [])
     names = result.statistics.get("names", [])
-    known = (
-        [f"agent {k}" for k in range(1, len(names) + 1)],
-        [f"{k + 1}" for k in range(len(names))],
-    )
-    if names and names not in known:
-        more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
-        yield f"agents from 1 on are {', '.join(names[:_NAMED])}{more}"
+    if [name.removeprefix("agent ") for name in names] != [f"{k + 1}" for k in range(len(names))]:
+        yield f"agents from 1 on are {_first_few(names)}"
+
+
+def _first_few(names: list[str]) -> str:
+    more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 def _abandonment_notes(measured: Measurements) -> Iterator[str]:

@@ -45,7 +45,7 @@ class CheckResult:
     worst, limit : in `unit`; None where there is none
     at_least : whether the limit is the least value allowed, not the greatest
     when : mission time of the worst [s]
-    who : agents, edge or obstacle
+    who : agents, edge or obstacle; of abandoned phases, what they were left for
     phase : name of the phase
     judged : whether the check could fail; False for a value that is only reported
     at_samples : whether the worst is that of the samples, because nothing is known between them

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -73,22 +73,19 @@ def safety(result: Result, verdict: Verdict) -> list[Safety]:
     measured, checks = Measurements(result), verdict.by_name
     rows = []
     for q in QUANTITIES.values():
-        limit, worst, passed = None, None, True
+        limit, worst, passed, undecided, interval = None, None, True, False, None
         if (check := checks.get(q.name)) is not None:
             limit, passed = check.limit, check.passed
+            undecided, interval = check.undecided, check.interval
             if check.worst is not None and check.when is not None:
                 worst = Extreme(check.worst, check.when, check.who, check.phase, check.at_samples)
         elif q.monitored and not q.way:
             limit, worst = q.limit_of(result.mission), measured.worst(q.name)
         if (q.key or q.limit) and (limit is not None or worst is not None):
             limit = None if limit is None or not np.isfinite(limit) else limit
-            row = Safety(
-                q.name_in_words, q.text, display_unit(q.unit), q.at_least, limit, worst, passed
-            )
-            beyond = check is None and worst is not None and limit is not None
-            beyond = beyond and not keeps_limit(q, worst.value, limit)
-            unsure = check is not None and check.undecided
-            interval = None if check is None else check.interval
-            passed = passed and not beyond
-            rows.append(replace(row, passed=passed, undecided=unsure, interval=interval))
+            if check is None and worst is not None and limit is not None:
+                passed = keeps_limit(q, worst.value, limit)
+            bound = display_unit(q.unit), q.at_least, limit
+            judged = worst, passed, undecided, interval
+            rows.append(Safety(q.name_in_words, q.text, *bound, *judged))
     return rows

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -33,7 +32,7 @@ _PRAISE = {
     "clearance_start": "agents start {worst} above an obstacle",
     "clearance_end": "agents land {worst} above an obstacle",
     "lost": "lost vehicles stay {worst} away from the others",
-    "abandoned": "phases abandoned after a loss: {worst}",
+    "abandoned": "phases abandoned after {who}: {worst}",
     "thrust_peak": "thrust peaks at {worst} ({who})",
     "thrust": "thrust peaks at {worst}",
     "rotor_force": "rotors peak at {worst} of {limit}",
@@ -221,14 +220,12 @@ def _phase_table(phases: list[PhaseVerdict]) -> FactTable:
 
 def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
     """Miss of each waypoint, in position, velocity, attitude and rates."""
-
-    def rows() -> Iterator[Row]:
-        for p in phases:
-            points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
-            points += [] if p.waypoint is None else [(p.name, p.waypoint)]
-            for name, w in points:
-                yield Row((name, f"{w.time:.2f}", w.position, w.velocity, w.attitude, w.rates))
-
+    rows = []
+    for p in phases:
+        points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
+        points += [] if p.waypoint is None else [(p.name, p.waypoint)]
+        for name, w in points:
+            rows.append(Row((name, f"{w.time:.2f}", w.position, w.velocity, w.attitude, w.rates)))
     heads = (
         "waypoint, missed by",
         "at [s]",
@@ -237,4 +234,4 @@ def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
         "attitude [deg]",
         "rates [deg/s]",
     )
-    return FactTable(heads, [*rows()])
+    return FactTable(heads, rows)

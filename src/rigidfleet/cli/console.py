@@ -12,7 +12,7 @@ from collections import deque
 from functools import cache
 from io import TextIOWrapper
 from time import perf_counter
-from typing import IO, TYPE_CHECKING, Self
+from typing import IO, TYPE_CHECKING, Any, Self
 
 from rigidfleet.errors import MissionError
 
@@ -145,18 +145,14 @@ class _Screen:
             from rich.table import Column
 
             # The words change while nothing is heard, too: they are asked for whenever the screen is drawn.
-            words = progress.TextColumn(
-                "{task.fields[screen]}", markup=False, table_column=Column()
-            )
-            self.progress = progress.Progress(
+            columns = (
                 progress.SpinnerColumn(),
                 progress.BarColumn(bar_width=30),
                 progress.TaskProgressColumn(),
-                words,
-                console=self.console,
-                transient=True,
-                auto_refresh=False,
+                progress.TextColumn("{task.fields[screen]}", markup=False, table_column=Column()),
             )
+            look: dict[str, Any] = {"transient": True, "auto_refresh": False}
+            self.progress = progress.Progress(*columns, console=self.console, **look)
             self.task = self.progress.add_task("", total=None, screen=self)
             self.progress.start()
             self.animation.start()
@@ -185,10 +181,8 @@ class _Screen:
 
     def __str__(self) -> str:
         """Text on a terminal: progress, or what is waited for before there is any."""
-        if not self._waits():
-            return self._words()
         text = COMPILING if self.cold else "Starting"
-        return f"{text}: {perf_counter() - self.begun:.0f} s"
+        return self._words() or f"{text}: {perf_counter() - self.begun:.0f} s"
 
     def show(self, total: float, done: float, now: float) -> None:
         """Show the progress; without animation as a line, if the last line was long ago."""
@@ -201,10 +195,8 @@ class _Screen:
             self.told = now
             self.console.print(self._words())
 
-    def _waits(self) -> bool:
-        return True
-
     def _words(self) -> str:
+        """Progress; nothing while it is waited for."""
         return ""
 
 
@@ -251,24 +243,21 @@ class FlightWatch(_Screen):
         self.heard = now
         self.show(progress.t_end, progress.t, now)
 
-    def _waits(self) -> bool:
-        return not self.recent or (self.cold and perf_counter() - self.heard > _SILENCE)
-
     def _words(self) -> str:
         """Mission time, speed relative to real time, time left, phase."""
-        if not self.recent:
+        silence = perf_counter() - self.heard
+        if not self.recent or (self.cold and silence > _SILENCE):
             return ""
         last = self.recent[-1]
-        wall = last.wall + perf_counter() - self.heard  # include the time since the last report
+        wall = last.wall + silence
         while len(self.recent) > 1 and self.recent[1].wall <= wall - _RECENT:
             self.recent.popleft()
         words = [f"{last.t:.1f} of {last.t_end:g} s"]
         took, flown = wall - self.recent[0].wall, last.t - self.recent[0].t
         if took >= _KNOWN and flown > 0.0 and last.t < last.t_end:
             speed = flown / took
-            left = round((last.t_end - last.t) / speed)
             digits = ".0f" if speed >= 9.95 else ".1f" if speed >= 0.1 else ".1g"
-            words += [f"x{speed:{digits}}", f"{left // 60}:{left % 60:02} left"]
+            words += [f"x{speed:{digits}}", _time_left((last.t_end - last.t) / speed)]
         return "  ".join([*words, last.phase, *(["(planning)"] if last.planning else [])])
 
 
@@ -288,11 +277,8 @@ class SweepWatch(_Screen):
         if progress.flown and progress.workers > 1:
             self.stand_still()  # the cores are for the workers, and these may be forks, which want no thread
         self.last = progress
-        if not self._waits():
+        if self.base is not None:
             self.show(progress.runs, progress.done, perf_counter())
-
-    def _waits(self) -> bool:
-        return self.base is None or self.last is None
 
     def _words(self) -> str:
         """Finished runs, rate, time left, failures, workers."""
@@ -302,11 +288,15 @@ class SweepWatch(_Screen):
         words = [f"{p.done} of {p.runs} runs"]
         if (wall := p.wall - self.base.wall) > 0 and (flown := p.flown - self.base.flown) > 0:
             rate = flown / wall
-            left = round((p.runs - p.done) / rate)
-            words += [f"{rate:.3g} runs/s", f"{left // 60}:{left % 60:02} left"]
+            words += [f"{rate:.3g} runs/s", _time_left((p.runs - p.done) / rate)]
         words += [f"{p.failed} failed"] if p.failed else []
         words += [f"{count(p.workers, 'worker')}"] if p.workers > 1 else []
         return "  ".join(words)
+
+
+def _time_left(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes}:{rest:02} left"
 
 
 def count(n: int, noun: str) -> str:

@@ -85,23 +85,16 @@ def design(
     try:
         name, (slots, colours, notes) = points_of(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
-        if edges is not None:
-            _refuse_options_that_clash(
-                edges, reach, searched=extra != "0" or sensing_range is not None
-            )
-            if edges != "none":
-                kinds[edges] = GRAPHS[edges](slots, REACH if reach is None else reach)
-        else:
-            if reach is not None:
-                raise ValueError("--reach has no effect without --edges neighbours; remove it")
-            if sensing_range is not None and not sensing_range > 0.0:
-                raise ValueError(f"--range must be a positive length [m], not {sensing_range:g}")
+        _refuse_options_that_clash(edges, reach, extra, sensing_range)
+        if edges is None:
             more = extra if extra == "complete" else parse_whole(extra)
             kinds = {"designed": designs.design(slots, extra=more, sensing_range=sensing_range)}
             if shape == "cube":
                 kinds["the paper's 18"] = CUBE_EDGES
             if len(slots) <= _COMPARED:
                 kinds["all pairs"] = complete_graph(len(slots))
+        elif edges != "none":
+            kinds[edges] = GRAPHS[edges](slots, REACH if reach is None else reach)
         chosen = [] if edges == "none" else edges or kinds["designed"]
         text = "".join(f"# {note}\n" for note in notes)
         text += designs.mission_fragment(name, slots, chosen, reach)
@@ -121,13 +114,11 @@ def design(
         console.print_json({"name": name, "toml": text, "limits": limits, "graphs": graphs})
         return PASSED
     heads = ("graph", "edges", "rank", "index", "condition", "longest [m]", "class")
-    table = FactTable(
-        heads, [Row((what, *cells)) for what, (_, cells) in judged.items()], ("class",)
-    )
+    rows = [Row((what, *cells)) for what, (_, cells) in judged.items()]
     # Standard output has the formation alone, so that it can be piped.
     output = console.out() if out is not None else console.err()
     if kinds:
-        output.print(table)
+        output.print(FactTable(heads, rows, ("class",)))
     if limits and kinds:
         output.print(limits)
     if out is None:
@@ -137,21 +128,29 @@ def design(
     return PASSED
 
 
-def _refuse_options_that_clash(edges: str, reach: float | None, *, searched: bool) -> None:
-    """Reject an unknown graph, and options that have no effect on it.
+def _refuse_options_that_clash(
+    edges: str | None, reach: float | None, extra: str, sensing_range: float | None
+) -> None:
+    """Reject an unknown graph, and options that have no effect on it or on a search.
 
     Raises
     ------
     ValueError
-        The graph is unknown, or --extra, --range or --reach cannot be combined with it.
+        The graph is unknown, a value is not positive, or --extra, --range or --reach cannot be combined with it.
     """
     from rigidfleet._common.renamed import successor
     from rigidfleet.formation.graphs import GRAPHS
 
+    if edges is None:
+        if reach is not None:
+            raise ValueError("--reach has no effect without --edges neighbours; remove it")
+        if sensing_range is not None and not sensing_range > 0.0:
+            raise ValueError(f"--range must be a positive length [m], not {sensing_range:g}")
+        return
     if edges not in GRAPHS and edges != "none":
         remedy = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"
         raise ValueError(f"there is no graph {edges!r}; {remedy}")
-    if searched:
+    if extra != "0" or sensing_range is not None:
         raise ValueError("--extra and --range have no effect with --edges; remove them or --edges")
     if reach is not None and edges != "neighbours":
         raise ValueError(f"--reach has no effect on edges {edges!r}; remove it")

@@ -194,16 +194,12 @@ def _ask(name: str) -> tuple[str, dict[str, Any]]:
     def answer(question: str, offered: str, take: Callable[[str], Any]) -> Any:
         while True:
             try:
-                text = (
-                    console.err().input(f"{question} [{offered}]: ", markup=False).strip()
-                    or offered
-                )
+                reply = console.err().input(f"{question} [{offered}]: ", markup=False)
             except EOFError:
-                raise RigidfleetError(
-                    "No answer; no file is written. Give options instead."
-                ) from None
+                why = "No answer; no file is written. Give options instead."
+                raise RigidfleetError(why) from None
             try:
-                return take(text)
+                return take(reply.strip() or offered)
             except ValueError as error:
                 console.err().print(f"  {error}", style="yellow")
 

@@ -163,10 +163,8 @@ def _rehearsal(folder: Path, mission: Mission) -> list[str]:
     ResultError
         The folder has no drill, or that of another mission.
     """
-    from rigidfleet._common.quantities import display_unit
     from rigidfleet.planning.timing import expand_mission
     from rigidfleet.sweep import store
-    from rigidfleet.sweep.faults import UNITS
     from rigidfleet.sweep.summary import summarise
 
     table = store.read(folder)
@@ -177,22 +175,7 @@ def _rehearsal(folder: Path, mission: Mission) -> list[str]:
         )
     if own.digest != mission.digest:  # a result has the ways that were planned for its mission
         _refuse_other(path, expand_mission(own).digest, mission)
-    lines = [f"{outcome.success.count:,} of {outcome.flown:,} faults are harmless."]
-    if more := outcome.runs - outcome.flown:
-        lines.append(f"{more:,} more are planned and were not tried.")
-    for fault, cases in itertools.groupby(outcome.drill, lambda x: x.fault):
-        borne, parts, why = [], [], ""
-        for size, some in itertools.groupby(cases, lambda x: x.magnitude):
-            each = [*some]
-            if failed := sum(x.failed.count for x in each):
-                parts.append(f"{failed} of {sum(x.failed.of for x in each)} fail by {size:g}")
-                why = why or next(x.worst.detail for x in each if x.worst)
-            else:
-                borne.append(f"{size:g}")
-        parts = [f"none fails by {', '.join(borne)}"] * bool(borne) + parts
-        words = f"{'; '.join(parts)} {display_unit(UNITS[fault])}".rstrip()
-        lines.append(f"{fault.capitalize()}: {words}{': ' * bool(why)}{why}.")
-    return [*lines, _digest_of(path)]
+    return [*outcome.rehearsals(), _digest_of(path)]
 
 
 def _aborts(folder: Path, mission: Mission) -> list[str]:

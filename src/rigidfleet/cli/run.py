@@ -104,9 +104,10 @@ def run(
         except ValueError as error:
             raise RigidfleetError(f"--csv-rate: {error}.") from None
     console.show_verdict(verdict, json=json, quiet=quiet)
-    so_far = "the flight so far is saved, marked incomplete,"
-    what = so_far if interrupted else "the complete flight is saved"
-    if not interrupted:
+    what = "the complete flight is saved"
+    if interrupted:
+        what = "the flight so far is saved, marked incomplete,"
+    else:
         try:
             if replay:
                 write_replay(result, files.replay)
@@ -118,9 +119,8 @@ def run(
     if not (json or quiet):
         files.show()
     if interrupted:
-        console.err().print(
-            f"Interrupted: {what} in {files.result}", style="yellow", soft_wrap=True
-        )
+        words = f"Interrupted: {what} in {files.result}"
+        console.err().print(words, style="yellow", soft_wrap=True)
         return INTERRUPTED
     return PASSED if verdict.passed else FAILED
 

@@ -186,7 +186,7 @@ def _sweep_and_folder(
                 f"{what}: is the folder of a sweep, whose definition cannot change. Remove all options that define one:"
                 " only --runs may grow."
             )
-        definition = store.read_sweep(stored[0])
+        definition = store.read(stored[0]).sweep
         definition.runs = definition.runs if runs is None else runs
         return definition, here
     named = what in mission_names()

@@ -181,7 +181,7 @@ def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> li
         )
     begins = [(x - min(dated)) / 1e9 for x in dated]
     return [
-        part._replace(curves=tuple(curve.later(begin) for curve in part.curves)) if begin else part
+        part._replace(curves=tuple(curve.later(begin) for curve in part.curves))
         for part, begin in zip(parts, begins, strict=True)
     ]
 
@@ -217,13 +217,14 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     parts = [p for p in inside if p.suffix.lower() in _RECORDINGS]
     if parts and (path / "metadata.yaml").is_file():
         return [parts]
-    kinds = {p.suffix.lower() for p in inside if p.is_file() and _is_read(p)}
+    files = [p for p in inside if p.is_file() and _is_read(p)]
+    kinds = {p.suffix.lower() for p in files}
     if len(kinds) > 1:
         raise TrajectoryError(
             f"{path}: the folder has files {' and '.join(sorted(kinds))}. Give files of one kind for one flight."
         )
-    if kinds:
-        return [[p] for p in inside if p.is_file() and _is_read(p)]
+    if files:
+        return [[p] for p in files]
     folders = [p for p in inside if p.is_dir()]
     groups = [[p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders]
     if not groups or not all(groups):

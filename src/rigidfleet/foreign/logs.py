@@ -3,7 +3,8 @@
 Sources: PX4's messages (`msg/versioned/VehicleLocalPosition.msg` and its neighbours; `eph` is the root of the sum of
 two variances, `get_ekf_lpos_accuracy` in its EKF2), MAVLink's `common.xml`, and ArduPilot's `LogStructure.h` (of
 AP_NavEKF3, AP_AHRS and AP_GPS; states 7 to 9 of a filter are the position). All of them are north, east, down, and yaw
-is clockwise from north.
+is clockwise from north. Of MAVLink's ODOMETRY, `MAV_FRAME` says the frame; of PX4's odometry, ``pose_frame``, or
+``local_frame`` before version 1.14.
 """
 
 from __future__ import annotations
@@ -68,11 +69,15 @@ _GLOBAL = _Fields("geodetic", "lat lon alt", spread=_EPH)
 _GPS = _Fields("geodetic", "latitude_deg longitude_deg altitude_msl_m", spread=_EPH)
 _ODOMETRY = _Fields("ned", "position[0] position[1] position[2]")
 _ODOMETRY = _ODOMETRY._replace(spread=_ODOMETRY.place.replace("position", "position_variance"))
+_FRAMED = _Fields(
+    "ned", "x y z", spread="pose_covariance[0] pose_covariance[6] pose_covariance[11]"
+)
 _FILTER = _Fields("ned", "PN PE PD", "VN VE VD", "Yaw", _VARIANCES, (1.0, 1.0, 1.0, 1.0, _DEGREE))
 _POSE = _Fields("enu", "x y z", "vx vy vz", "yaw", "var_x var_y var_z")
 #: Messages with places, those that are preferred first; one has two forms.
 _MESSAGES = [
-    ("vehicle_local_position", _LOCAL), ("vehicle_odometry", _ODOMETRY), ("vehicle_global_position", _GLOBAL),
+    ("vehicle_local_position", _LOCAL), ("vehicle_odometry", _ODOMETRY), ("vehicle_odometry", _FRAMED),
+    ("vehicle_global_position", _GLOBAL),
     *[(name, form) for name in ("vehicle_gps_position", "sensor_gps")
       for form in (_GPS, _GLOBAL._replace(units=_INTEGERS))],
     ("vehicle_mocap_odometry", _ODOMETRY), ("vehicle_visual_odometry", _ODOMETRY), ("estimator_odometry", _ODOMETRY),
@@ -80,14 +85,15 @@ _MESSAGES = [
     ("vehicle_local_position_groundtruth", _LOCAL), ("vehicle_global_position_groundtruth", _GLOBAL),
     ("LOCAL_POSITION_NED", _Fields("ned", "x y z", "vx vy vz")),
     ("GLOBAL_POSITION_INT", _Fields("geodetic", "lat lon alt", "vx vy vz", "hdg", "", _INTEGERS)),
-    ("ATT_POS_MOCAP", _Fields("ned", "x y z")), ("GPS_RAW_INT", _Fields("geodetic", "lat lon alt", units=_INTEGERS)),
+    ("ODOMETRY", _FRAMED), ("ATT_POS_MOCAP", _Fields("ned", "x y z")),
+    ("GPS_RAW_INT", _Fields("geodetic", "lat lon alt", units=_INTEGERS)),
     ("XKF1", _FILTER), ("NKF1", _FILTER), ("EKF1", _FILTER),
     *[(name, _Fields("geodetic", "Lat Lng Alt")) for name in ("POS", "GPS", "SIM")],
     *[(name, _POSE) for name in ("PoseStamped", "NamedPoseArray", "Odometry", "PoseWithCovarianceStamped",
                                  "TransformStamped", "TFMessage")],
     ("NavSatFix", _GLOBAL._replace(spread="")),
 ]  # fmt: skip
-_RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
+RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
 _BESIDE = {
     "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
@@ -96,6 +102,8 @@ _BESIDE = {
 #: Fields that are not 0 where a place of PX4 is valid, and those that count how often its estimator set it anew.
 _VALID = {"xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"}
 _RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
+#: Frames of the Earth of MAVLink's `MAV_FRAME`: local ones that are turned anyhow are not read.
+_FRAMES = {1: "local_ned", 4: "local_enu"}
 
 
 class Channel(NamedTuple):
@@ -178,7 +186,7 @@ def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
         words = f" {' or '.join(topics)}" if topics else ""
         every = ", ".join(sorted(c.topic for c in channels)[:20]) or "none"
         raise fault(f"has no topic{words} with positions", f"Topics with positions are: {every}")
-    return sorted(chosen, key=lambda c: _RANK[c.message])
+    return sorted(chosen, key=lambda c: RANK[c.message])
 
 
 def trajectories_of(
@@ -204,10 +212,9 @@ def trajectories_of(
                 reasons.append(str(error).rstrip("."))
         else:
             raise fault("; ".join(reasons[:_LISTED]), "Name a topic that has valid positions")
-        others = ", ".join([c.topic for c in channels if c is not channel and not topics][:_LISTED])
-        words = f"positions are those of {channel.topic}" + f"; --topic may name {others}" * bool(
-            others
-        )
+        words = f"positions are those of {channel.topic}"
+        if others := [c.topic for c in channels if c is not channel and not topics][:_LISTED]:
+            words += f"; --topic may name {', '.join(others)}"
         for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
             notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
@@ -219,9 +226,8 @@ def trajectories_of(
         where = lambda k, topic=track.topic: f"{topic}: message {k + 1}"  # noqa: E731
         curves.append(curve_through_samples(time, track.place, track.yaw, interpolation, where))
         size = len(curves[-1].time), 3  # a single sample stays for a second
-        each = (
-            None if x is None else np.resize(x, size) for x in (track.velocity, track.deviation)
-        )
+        both = track.velocity, track.deviation
+        each = (None if x is None else np.resize(x, size) for x in both)
         measured.append(LoggedStates(*each, track.resets))
     frames = [*dict.fromkeys(track.frame for track in tracks.values())]
     if len(frames) > 1:
@@ -279,14 +285,20 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
-    frame = "ned" if channel.frame.endswith("_ned") else form.frame
+    frame = next((f for f in ("ned", "enu") if channel.frame.endswith(f"_{f}")), form.frame)
     place = _fields(columns, form.place) * form.units[:3]
     known = np.isfinite(place).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
     for name in _VALID & columns.keys():
         known &= columns[name] != 0
     if not known.any():
-        raise fault(f"{channel.topic}: no position is valid")
+        turned = "is_ned" in columns and not columns["is_ned"].any()
+        why = (
+            "positions are in a frame that is turned anyhow to north"
+            if turned
+            else "no position is valid"
+        )
+        raise fault(f"{channel.topic}: {why}")
     if not known.all():
         notes.append(f"{np.sum(~known):,} samples without a valid position are left out")
     rows = _increasing_rows(columns["time"], np.flatnonzero(known), notes)
@@ -376,7 +388,7 @@ def _read_ulog(path: Path) -> Log:
     from pyulog import ULog
 
     with path.open("rb") as file:
-        log = ULog(file, ["actuator_armed", *_RANK])
+        log = ULog(file, ["actuator_armed", *RANK])
     channels, armed, after = [], None, 0
     dated = 1000 * log.start_timestamp > _DATES
     for data in (x.data for x in log.data_list if "time_utc_usec" in x.data and not dated):
@@ -384,27 +396,28 @@ def _read_ulog(path: Path) -> Log:
             late = data["time_utc_usec"].astype(np.int64) - data["timestamp"].astype(np.int64)
             after = int(np.median((late - data.get("timestamp_time_relative", 0))[known]))
     for name, number, data in ((x.name, x.multi_id, x.data) for x in log.data_list):
-        # Positions are of the time of the sample, which is a little before that of the message.
-        stamp = data.get("timestamp_sample", data["timestamp"]).astype(np.int64)
-        data["time"] = 1000 * (
-            np.where(stamp > 0, stamp, data["timestamp"].astype(np.int64)) + after
-        )
+        channel = channel_of_px4(f"{name}:{number}" if number else name, name, data, after)
         if name == "actuator_armed":
             armed = data["time"], data["armed"]
-            continue
-        if "pose_frame" in data:
-            data["is_ned"] = data["pose_frame"] == 1
-        topic, place = (
-            f"{name}:{number}" if number else name,
-            _place_of(data, "ref_lat ref_lon ref_alt"),
-        )
-        channels.append(Channel(topic, name, data, "", place))
+        else:
+            channels.append(channel)
     notes = [DAMAGED] * log.file_corruption
     if lost := [x.duration / 1e3 for x in log.dropouts]:
         words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"
         notes.append(f"the logger lost data {len(lost):,} times, {words}")
     clock = GNSS if after else "the dates that the vehicle had" if dated else ""
     return Log({"": channels}, clock, armed, tuple(notes))
+
+
+def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) -> Channel:
+    """The samples of a message of PX4, whose times get ``after`` [us] added."""
+    # Positions are of the time of the sample, which is a little before that of the message.
+    stamp = data.get("timestamp_sample", data["timestamp"]).astype(np.int64)
+    data["time"] = 1000 * (np.where(stamp > 0, stamp, data["timestamp"].astype(np.int64)) + after)
+    for field, ned in (("pose_frame", 1), ("local_frame", 0)):
+        if field in data:
+            data["is_ned"] = data[field] == ned
+    return Channel(topic, name, data, "", _place_of(data, "ref_lat ref_lon ref_alt"))
 
 
 def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
@@ -415,14 +428,15 @@ def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
     names = {name: own.split() for name, own in _BESIDE.items()}
     for name, form in _MESSAGES:
         every = f"{form.place} {form.velocity} {form.yaw} {form.spread}"
-        names[name] = every.split()
+        names[name] = [*every.split(), "frame_id", *_RESETS]
     rows: dict[tuple[str, str, int], array[float]] = defaultdict(lambda: array("d"))
     while (message := log.recv_match(type=[*names])) is not None:
         kind, received = message.get_type(), message._timestamp
         who = f"{message.get_srcSystem()}" if hasattr(message, "get_srcSystem") else ""
         lane = 0 if kind in _BESIDE else getattr(message, "C", getattr(message, "I", 0))
-        stamp = getattr(message, "time_boot_ms", 1e3 * received) / 1e3
-        own = (getattr(message, name, math.nan) for name in names[kind])
+        stamp = getattr(message, "time_usec", 0.0) / 1e6 or received
+        stamp = getattr(message, "time_boot_ms", 1e3 * stamp) / 1e3
+        own = (_number_of(message, *name.split("[")) for name in names[kind])
         rows[who, kind, lane].extend((stamp, received, *own))
     table = {}
     for key, numbers in rows.items():
@@ -433,6 +447,12 @@ def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
             stamps = np.round(1e9 * own[:2]).astype(np.int64)
         table[key] |= {"time": stamps[0], "received": stamps[1]}
     return table
+
+
+def _number_of(message: Any, field: str, index: str = "") -> float:
+    """A field of a message, or the one with an index such as "0]" in it; NaN if there is none."""
+    value: Any = getattr(message, field, math.nan)
+    return value[int(index[:-1])] if index else value
 
 
 def _read_bin(path: Path) -> Log:
@@ -476,8 +496,11 @@ def _read_tlog(path: Path) -> Log:
     for (who, kind, _), columns in table.items():
         if kind not in _BESIDE:
             own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
-            place = _place_of(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3])
-            vehicles[f"system {who}"].append(Channel(kind, kind, columns, "", place))
+            place, frame = _place_of(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
+            if "frame_id" in columns:
+                frame = _FRAMES.get(int(columns["frame_id"][0]), "")
+                columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)
+            vehicles[f"system {who}"].append(Channel(kind, kind, columns, frame, place))
     armed, notes = None, (DAMAGED,) if any(kind == "BAD_DATA" for _, kind, _ in table) else ()
     if len(vehicles) == 1:
         ((who, channels),) = vehicles.items()

@@ -3,17 +3,20 @@
 Sources: the definitions of `geometry_msgs`, `nav_msgs`, `sensor_msgs` and `tf2_msgs` (ROS 2's common_interfaces and
 geometry2), `NamedPoseArray` of motion_capture_tracking_interfaces; CDR: after 4 bytes that say the order of bytes, each
 field is aligned to its size; rosbag2's tables (`rosbag2_storage_sqlite3`); and REP 103: frames are east, north, up, and
-one whose name ends in ``_ned`` is north, east, down.
+one whose name ends in ``_ned`` is north, east, down. Messages of `px4_msgs` are those of PX4's own logs. Their fields
+differ from version to version: the definition in the recording says where each is.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import sqlite3
 import struct
 from array import array
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +26,7 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import Channel, Log, choose
-from rigidfleet.typing import Floats
+from rigidfleet.foreign.logs import RANK, Channel, Log, channel_of_px4, choose
 
 MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _BILLION = 1_000_000_000
@@ -32,17 +34,6 @@ _BILLION = 1_000_000_000
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: What no position [m] or quaternion reaches.
 _FAR = 1e9
-#: What reading a damaged recording raises, besides the errors of `mcap`.
-_DAMAGED = (
-    ValueError,
-    OverflowError,
-    EOFError,
-    KeyError,
-    struct.error,
-    RuntimeError,
-    MemoryError,
-    sqlite3.Error,
-)
 #: Numbers of a message after its names: a position and a quaternion (7), the covariance of a pose (36, by rows), and a
 #: velocity in the vehicle's axes (3); or latitude, longitude [deg] and height [m] (3).
 _NUMBERS = {
@@ -51,10 +42,18 @@ _NUMBERS = {
 }  # fmt: skip
 
 
+#: What is no log of places, and what to give instead.
+_PATH = "is a path that is planned, not a log: give poses, odometry or transforms of what flew"
+_UNDEFINED = (
+    "is of PX4, and the recording does not define it: record as MCAP, or give PX4's own log (.ulg)"
+)
+
+
 class _Rows(NamedTuple):
-    """Kind and frame of the first message of a vehicle; stamps [ns] and numbers of all."""
+    """Kind, layout if it is PX4's, and frame of the first message of a vehicle; stamps [ns] and numbers of all."""
 
     message: str
+    layout: np.dtype[Any] | None
     frame: str
     stamps: array[int]
     numbers: array[float]
@@ -71,13 +70,16 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         The package `mcap` is missing, the recording is damaged, or has no positions.
     """
     rows: dict[str, _Rows] = {}
+    unread: dict[str, str] = {}
     try:
-        for topic, kind, data, received in (each for path in paths for each in _messages(path)):
+        for topic, kind, definition, data, received in (
+            each for path in paths for each in _messages(path, unread)
+        ):
+            layout = _layout(definition, data[1:2] == b"\1") if definition else None
             try:
-                for who, frame, stamp, numbers in _decode(kind, data):
-                    own = rows.setdefault(
-                        f"{topic}{who}", _Rows(kind, frame, array("q"), array("d"))
-                    )
+                for who, frame, stamp, numbers in _decode(kind, layout, data):
+                    new = _Rows(kind, layout, frame, array("q"), array("d"))
+                    own = rows.setdefault(f"{topic}{who}", new)
                     own.stamps.append(stamp or received)
                     own.numbers.extend(numbers)
             except struct.error:
@@ -87,45 +89,67 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         raise
     except ImportError as error:
         raise fault(f"is compressed, and a package is missing ({error})") from None
-    except Exception as error:
-        if not isinstance(error, _DAMAGED) and type(error).__module__ != "mcap.exceptions":
-            raise
+    except Exception as error:  # a damaged recording leads its packages to any
         reason = " ".join(str(error).split()) or type(error).__name__
         raise fault(f"the recording is damaged ({reason})", "Record again") from None
-    channels = [Channel(name, own.message, _columns(own), own.frame) for name, own in rows.items()]
+    if unread and not rows:
+        topic, why = next(iter(unread.items()))
+        raise fault(f"{topic}: {why}")
+    channels = [_channel(topic, own) for topic, own in rows.items()]
     chosen, notes = choose(channels, topics), []
     if not topics:
         chosen = [c for c in chosen if c.message == chosen[0].message]
         parts = {c.topic.rpartition(":")[2] for c in chosen if c.message == "TFMessage"}
         chosen = [c for c in chosen if c.frame not in parts]  # what moves in a body is a part of it
         others = sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]
-        notes = [f"topics that are not read: {', '.join(others)}; --topic may name them"] * bool(
-            others
-        )
-    return Log({c.topic: [c] for c in chosen}, "that of the stamps in messages", None, tuple(notes))
+        if others:
+            notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")
+    clock = "that of the stamps in messages"
+    if any("received" in c.columns for c in chosen):
+        clock = "that of who recorded, less the shortest delay"
+    notes += [f"{topic} is not read: it {why}" for topic, why in unread.items()]
+    return Log({c.topic: [c] for c in chosen}, clock, None, tuple(notes))
 
 
-def _messages(path: Path) -> Iterator[tuple[str, str, bytes, int]]:
-    """Topic, kind, content and time of recording [ns] of each message with positions."""
+def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, str, bytes, int]]:
+    """Topic, kind, definition ("" but of PX4's), content and time of recording [ns] of each message with positions.
+
+    Topics that seem to have some and cannot be read get a reason in ``unread``.
+    """
     with path.open("rb") as stream:
         records = _records_of_sqlite if stream.read(16) == SQLITE else _records_of_mcap
-    for topic, name, code, data, received in records(path):
-        if (kind := name.rpartition("/")[2]) in _NUMBERS and topic != "/tf_static":
+    for topic, name, code, definition, data, received in records(path):
+        package, kind = name.partition("/")[0], name.rpartition("/")[2]
+        own = package == "px4_msgs"
+        if own:
+            kind = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind).lower()  # as PX4's logs name it
+        if name == "nav_msgs/msg/Path":
+            unread[topic] = _PATH
+        elif own and kind in RANK and not definition:
+            unread[topic] = _UNDEFINED
+        elif kind in (RANK if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
                 raise fault(f"{topic}: is encoded as {code!r}, not as CDR")
-            yield topic, kind, data, received
+            yield topic, kind, definition if own else "", data, received
 
 
-def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, bytes, int]]:
+def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, str, bytes, int]]:
+    """Topic, name and code of its messages, their definition, content and time of recording [ns]."""
     query = (
         "SELECT name, type, serialization_format, data, timestamp FROM messages JOIN topics ON topics.id = topic_id "
         f"WHERE length(data) < {_MESSAGE} ORDER BY timestamp"
     )
     with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)) as base:
-        yield from base.execute(query)
+        defined: dict[str, str] = {}
+        with suppress(sqlite3.OperationalError):  # before ROS 2 Iron there is no such table
+            columns = "topic_type, encoded_message_definition"
+            defined.update(base.execute(f"SELECT {columns} FROM message_definitions"))
+        for topic, name, code, data, received in base.execute(query):
+            yield topic, name, code, defined.get(name, ""), data, received
 
 
-def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, bytes, int]]:
+def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, int]]:
+    """The same, of an MCAP."""
     if find_spec("mcap") is None:
         raise fault("needs the package 'mcap'", "Run: pip install rigidfleet[logs]")
     from mcap.reader import make_reader
@@ -139,12 +163,35 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, bytes, int]]:
                 raise fault(f"a chunk of it {more}", "Record poses")
         stream.seek(0)
         for schema, channel, message in make_reader(stream).iter_messages():
-            name = "" if schema is None else schema.name
-            yield channel.topic, name, channel.message_encoding, message.data, message.log_time
+            name, text = ("", b"") if schema is None else (schema.name, schema.data)
+            code, definition = channel.message_encoding, text.decode(errors="replace")
+            yield channel.topic, name, code, definition, message.data, message.log_time
 
 
-def _decode(kind: str, data: bytes) -> Iterator[tuple[str, str, int, Sequence[float]]]:
-    """Body ("" if the topic is of one), frame, stamp [ns] and numbers of each position in a message."""
+@lru_cache(100)
+def _layout(definition: str, little: bool) -> np.dtype[Any]:
+    """Where the fields of a message are after its first 4 bytes, if all have one size."""
+    fields, at = dict[str, tuple[np.dtype[Any], int]](), 0
+    line = r"(?m)^[ \t]*(\w+)(?:\[(\d+)\])?[ \t]+(\w+)[ \t]*(?:#.*)?$"
+    for kind, count, name in re.findall(line, definition.partition("\n===")[0]):
+        own = np.dtype(kind).newbyteorder("<" if little else ">")
+        at += -at % own.itemsize
+        for k in range(int(count or 1)):
+            fields[f"{name}[{k}]" if count else name] = own, at
+            at += own.itemsize
+    forms, offsets = zip(*fields.values(), strict=True)
+    return np.dtype({"names": [*fields], "formats": forms, "offsets": offsets, "itemsize": at})
+
+
+def _decode(
+    kind: str, layout: np.dtype[Any] | None, data: bytes
+) -> Iterator[tuple[str, str, int, Sequence[float]]]:
+    """Body ("" if the topic is of one), frame, stamp [ns] or 0, and numbers of each position in a message."""
+    if layout is not None:
+        if len(data) < 4 + layout.itemsize:
+            raise struct.error
+        yield "", "", 0, np.frombuffer(data, layout, 1, 4).item()
+        return
     order, at = "<" if data[1:2] == b"\1" else ">", 4
 
     def read(form: str) -> tuple[Any, ...]:
@@ -175,13 +222,17 @@ def _decode(kind: str, data: bytes) -> Iterator[tuple[str, str, int, Sequence[fl
         yield who if kind != "Odometry" else "", frame, stamp, read(f"{_NUMBERS[kind]}d")
 
 
-def _columns(rows: _Rows) -> dict[str, Floats]:
+def _channel(topic: str, rows: _Rows) -> Channel:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
     table, time = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1), np.asarray(rows.stamps)
+    if rows.layout is not None:
+        columns = {"received": time} | dict(zip(rows.layout.names or (), table.T, strict=True))
+        return channel_of_px4(topic, rows.message, columns)
     if rows.message == "NavSatFix":
-        return dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
+        columns = dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
+        return Channel(topic, rows.message, columns, rows.frame)
     known = np.asarray(np.abs(table[:, :7]).max(axis=1) < _FAR)
-    columns: dict[str, Any] = {
+    columns = {
         "time": time, "x": np.where(known, table[:, 0], np.nan),
         "y": table[:, 1], "z": table[:, 2], "yaw": yaws_of(np.where(known[:, None], table[:, 3:7], 0.0)),
     }  # fmt: skip
@@ -191,4 +242,4 @@ def _columns(rows: _Rows) -> dict[str, Floats]:
         vector, scalar, v = table[:, 3:6], table[:, 6:7], table[:, 43:46]
         v = v + 2.0 * np.cross(vector, np.cross(vector, v) + scalar * v)
         columns |= {f"v{axis}": v[:, k] for k, axis in enumerate("xyz")}
-    return columns
+    return Channel(topic, rows.message, columns, rows.frame)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
+from functools import wraps
 
 import numpy as np
 
@@ -35,6 +36,32 @@ _END = _PIECE.pack(0, 0)
 _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 1000]))
 
 
+#: An image, the memory it needs in words, and the size [bytes] and time [s] up to the end of each piece.
+_Image = tuple[bytes, str, list[tuple[int, float]]]
+
+
+def _within_memory(
+    images: Callable[[ExportedMotion, float], Iterator[_Image]],
+) -> Callable[[ExportedMotion, float], Iterator[bytes]]:
+    """A writer of images, with an error about one that does not fit: which tolerance, and how many seconds do."""
+
+    @wraps(images)
+    def write(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+        for agent, (data, needed, ends) in enumerate(images(motion, tolerance)):
+            if len(data) > MEMORY:
+                alone, wider = motion.of_vehicle(agent), [x for x in _TRIED if x > tolerance]
+                enough = next((x for x in wider if len(next(images(alone, x))[0]) <= MEMORY), None)
+                remedy = f"--tolerance {enough:g}" if enough else "No tolerance up to 1 m"
+                until = max((t for size, t in ends if size <= MEMORY), default=ends[0][1])
+                raise ResultError(
+                    f"the flight of agent {agent + 1} needs {needed}. {remedy} makes it fit; at "
+                    f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
+                )
+            yield data
+
+    return write
+
+
 def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """A table for each vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
     row = ",".join(["%.9g"] * (1 + len(NAMES) * POWERS))
@@ -43,7 +70,8 @@ def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
 
-def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+@_within_memory
+def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     """A memory image for each vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
 
     Raises
@@ -51,14 +79,11 @@ def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     ResultError
         The flight needs more than `PIECES` pieces.
     """
-    for agent, curve in enumerate(fit_curves(motion.ways(), tolerance)):
-        if (count := len(curve.pieces)) > PIECES:
-            needed = f"{count} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
-            until = curve.time[PIECES] - curve.time[0]
-            way = motion.of_vehicle(agent).ways
-            fits = lambda x, way=way: len(next(fit_curves(way(), x)).pieces) <= PIECES  # noqa: E731
-            raise _error_of_a_long_flight(agent, needed, until, tolerance, fits)
-        yield np.roll(curve_to_rows(curve), -1, axis=1).astype("<f4").tobytes()
+    for curve in fit_curves(motion.ways(), tolerance):
+        rows, after = np.roll(curve_to_rows(curve), -1, axis=1), curve.time - curve.time[0]
+        needed = f"{len(rows)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
+        ends = [(_POLY4D * k, t) for k, t in enumerate(after.tolist()) if k]
+        yield rows.astype("<f4").tobytes(), needed, ends
 
 
 def read_poly4d(data: bytes) -> list[Piecewise]:
@@ -67,7 +92,8 @@ def read_poly4d(data: bytes) -> list[Piecewise]:
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
-def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
+@_within_memory
+def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     """A compressed image for each vehicle: Bernstein coefficients in millimetres and tenths of a degree.
 
     Raises
@@ -81,21 +107,7 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[bytes
             f"the tolerance of {1e3 * tolerance:g} mm cannot be met: this format rounds to millimetres. "
             f"Use --tolerance {2 * COMPRESSED_ROUNDING:g} or more."
         )
-    for agent, (data, ends) in enumerate(_compressed_images(motion, tolerance)):
-        if len(data) > MEMORY:
-            needed = f"{len(data)} bytes, and the memory has {MEMORY}"
-            room = MEMORY - len(_END)
-            until = max((t for size, t in ends if size <= room), default=ends[0][1])
-            alone = motion.of_vehicle(agent)
-            fits = lambda x, alone=alone: len(next(_compressed_images(alone, x))[0]) <= MEMORY  # noqa: E731
-            raise _error_of_a_long_flight(agent, needed, until, tolerance, fits)
-        yield data
-
-
-def _compressed_images(
-    motion: ExportedMotion, tolerance: float
-) -> Iterator[tuple[bytes, list[tuple[int, float]]]]:
-    """The image of each vehicle's way with times in whole milliseconds, and where each piece ends in it [bytes, s]."""
+    # Times are whole milliseconds.
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
     ways = (way.on(np.round(way.time / _MS) * _MS) for way in motion.ways())
     curves = fit_curves(ways, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
@@ -103,7 +115,7 @@ def _compressed_images(
         yield _compressed_image(curve, number)
 
 
-def _compressed_image(curve: Piecewise, number: int) -> tuple[bytes, list[tuple[int, float]]]:
+def _compressed_image(curve: Piecewise, number: int) -> _Image:
     """The image of the curve of a vehicle."""
     duration = np.diff(curve.time)
     position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
@@ -134,8 +146,9 @@ def _compressed_image(curve: Piecewise, number: int) -> tuple[bytes, list[tuple[
                 body += struct.pack(f"<{len(due)}h", *due)
                 at[axis] = due[-1]
         data += _PIECE.pack(kinds, milliseconds) + body
-        ends.append((len(data), curve.time[k + 1] - curve.time[0]))
-    return data + _END, ends
+        ends.append((len(data + _END), curve.time[k + 1] - curve.time[0]))
+    data += _END
+    return data, f"{len(data)} bytes, and the memory has {MEMORY}", ends
 
 
 def read_compressed(data: bytes) -> list[Piecewise]:
@@ -157,19 +170,3 @@ def read_compressed(data: bytes) -> list[Piecewise]:
             at[axis] = points[0, -1]
         rows.append([milliseconds * _MS, *piece.ravel()])
     return [rows_to_curve(rows)]
-
-
-def _error_of_a_long_flight(
-    agent: int,
-    needed: str,
-    until: float,
-    tolerance: float,
-    fits: Callable[[float], bool],
-) -> ResultError:
-    """Error about a flight that does not fit: which tolerance makes it fit, and how many seconds do."""
-    enough = next((x for x in _TRIED if x > tolerance and fits(x)), None)
-    remedy = f"--tolerance {enough:g}" if enough else "No tolerance up to 1 m"
-    return ResultError(
-        f"the flight of agent {agent + 1} needs {needed}. {remedy} makes it fit; at "
-        f"{1e3 * tolerance:g} mm, the first {until:.1f} s fit."
-    )

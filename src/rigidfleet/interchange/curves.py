@@ -153,6 +153,12 @@ def _fit_together(
         yield Piecewise(time[np.append(0, ends[own])], pieces[own])
 
 
+def cubic_curves(motion: ExportedMotion, tolerance: float) -> Iterator[Piecewise]:
+    """For each vehicle its way in cubic pieces, from time zero on; see `heading_lines`."""
+    for curve in fit_curves(motion.ways(), tolerance, 2, YAW_TOLERANCE / 2):
+        yield curve.later(-motion.start)
+
+
 def heading_lines(curve: Piecewise) -> tuple[Floats, Floats]:
     """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import with_headings
-from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curves, heading_lines
+from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_lines
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades, has_lights, lights, view
 from rigidfleet.typing import Floats, Ints
@@ -70,9 +70,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     }
     nodes, samplers, channels = [], [], []
     radii = motion.result.mission.fleet.radius.tolist()
-    curves = fit_curves(motion.ways(), tolerance, 2, YAW_TOLERANCE / 2)
-    for agent, (radius, fitted) in enumerate(zip(radii, curves, strict=True)):
-        curve = fitted.later(-motion.start)
+    for agent, curve in enumerate(cubic_curves(motion, tolerance)):
         times, yaws = heading_lines(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
@@ -82,7 +80,9 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
             keys = {"input": file.add(time, bounds=True), "output": file.add(values)}
             samplers.append(keys | {"interpolation": way})
             channels.append({"sampler": len(samplers) - 1, "target": {"node": agent, "path": path}})
-        nodes.append({"name": f"agent {agent + 1}", "mesh": 0, "scale": [max(radius, 0.05)] * 3})
+        nodes.append(
+            {"name": f"agent {agent + 1}", "mesh": 0, "scale": [max(radii[agent], 0.05)] * 3}
+        )
     scene: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "rigidfleet"},
         "scene": 0,

@@ -49,33 +49,29 @@ def write_tlog(motion: ExportedMotion, rate: float | None) -> Iterator[bytes]:
     is disarmed, and gets no more setpoints.
     """
     for agent in range(motion.n_agents):
-        yield _log(motion.of_vehicle(agent), agent, rate)
-
-
-def _log(motion: ExportedMotion, agent: int, rate: float | None) -> bytes:
-    """The log of one vehicle, which is an agent's."""
-    wanted = np.unique(np.round((motion.at_rate(rate).time - motion.start) * 1e3))
-    setpoints = at_times(motion.samples, np.minimum(wanted / 1e3 + motion.start, motion.end))
-    every = np.round((setpoints.time - motion.start) * 1e3).astype(np.int64)
-    off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
-    flies, system = every <= off, agent % _SYSTEMS + 1
-    milliseconds = every[flies]
-    records: Any = np.zeros(len(milliseconds), dtype=_RECORD)
-    records["time"] = 1000 * milliseconds
-    records["mark"], records["length"], records["system"] = _MARK, _FIELDS.itemsize, _STATION
-    records["sequence"] = (np.arange(len(records)) + 1) % 256
-    records["message"] = _TARGET
-    fields = records["fields"]
-    fields["time_boot_ms"] = milliseconds
-    fields["state"] = _swap_enu_and_ned(setpoints.state[flies, :3, 0])
-    fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, 0] + np.pi) % (2.0 * np.pi) - np.pi
-    fields["yaw_rate"] = -setpoints.yaw_rate[flies, 0]
-    fields["target_system"], fields["target_component"] = system, _AUTOPILOT
-    fields["coordinate_frame"] = _LOCAL_NED
-    covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
-    records["checksum"] = _checksum(covered, _TARGET_EXTRA)
-    disarmed = b"" if off > every[-1] else _disarm_record(int(milliseconds[-1]), system)
-    return _origin_record(motion, system) + records.tobytes() + disarmed
+        alone = motion.of_vehicle(agent)
+        wanted = np.unique(np.round((alone.at_rate(rate).time - motion.start) * 1e3))
+        setpoints = at_times(alone.samples, np.minimum(wanted / 1e3 + motion.start, motion.end))
+        every = np.round((setpoints.time - motion.start) * 1e3).astype(np.int64)
+        off = 1e3 * (float(motion.result.motors_off[agent]) - motion.start)
+        flies, system = every <= off, agent % _SYSTEMS + 1
+        milliseconds = every[flies]
+        records: Any = np.zeros(len(milliseconds), dtype=_RECORD)
+        records["time"] = 1000 * milliseconds
+        records["mark"], records["length"], records["system"] = _MARK, _FIELDS.itemsize, _STATION
+        records["sequence"] = (np.arange(len(records)) + 1) % 256
+        records["message"] = _TARGET
+        fields = records["fields"]
+        fields["time_boot_ms"] = milliseconds
+        fields["state"] = _swap_enu_and_ned(setpoints.state[flies, :3, 0])
+        fields["yaw"] = (np.pi / 2 - setpoints.yaw[flies, 0] + np.pi) % (2.0 * np.pi) - np.pi
+        fields["yaw_rate"] = -setpoints.yaw_rate[flies, 0]
+        fields["target_system"], fields["target_component"] = system, _AUTOPILOT
+        fields["coordinate_frame"] = _LOCAL_NED
+        covered = records.view(np.uint8).reshape(len(records), -1)[:, 9:-2]
+        records["checksum"] = _checksum(covered, _TARGET_EXTRA)
+        disarmed = b"" if off > every[-1] else _disarm_record(int(milliseconds[-1]), system)
+        yield _origin_record(motion, system) + records.tobytes() + disarmed
 
 
 def read_tlog(data: bytes) -> list[Piecewise]:

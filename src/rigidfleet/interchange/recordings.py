@@ -134,10 +134,8 @@ def read_rrd(data: bytes) -> list[Piecewise]:
                 np.array(batch[f"Transform3D:{name}"].flatten().flatten()).reshape(len(time), -1)
                 for name in ("translation", "quaternion")
             ]
-            position, quaternion = (x.astype(float) for x in columns)
             number = int(chunk.entity_path.rpartition("/")[2])
-            parts = curves.setdefault(number, [])
-            parts.append(np.column_stack([time, position, quaternion]))
+            curves.setdefault(number, []).append(np.column_stack([time, *columns]))
     ways = []
     for number in sorted(curves):
         rows = np.concatenate(curves[number])

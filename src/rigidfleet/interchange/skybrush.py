@@ -19,7 +19,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import YAW_TOLERANCE, ExportedMotion, fit_curves, heading_lines
+from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_lines
 from rigidfleet.interchange.lights import light_program
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades
@@ -45,8 +45,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     mission = motion.result.mission
     changes = fades(motion.result)
     drones, files = [], {}
-    curves = fit_curves(motion.ways(), tolerance, 2, YAW_TOLERANCE / 2)
-    for agent, curve in enumerate(way.later(-motion.start) for way in curves):
+    for agent, curve in enumerate(cubic_curves(motion, tolerance)):
         name = f"agent {agent + 1}"
         folder = f"drones/{name.replace(' ', '-')}"
         points = _bezier_segments(curve)

@@ -264,15 +264,15 @@ def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) ->
     The correlation time is the likeliest. Without a stated size it must stand out from white noise, and from noise so
     slow that it cannot be told from motion; and what remains must be white.
     """
-    some = [_stretch(own) for own in sorted(vehicles, key=lambda own: -len(own.time))[:_SOME]]
+    some = []
+    for own in sorted(vehicles, key=lambda own: -len(own.time))[:_SOME]:
+        first = max(0, (len(own.time) - _ENOUGH) // 2)  # the middle of the samples
+        some.append(Positions(*(x[first : first + _ENOUGH] for x in own)))
     knots = [knots_over(own.time, 0.0, step) for own in some]
     usual = float(np.median([np.median(np.diff(own.time)) for own in some]))
     size = np.nan if sigma is None else sigma
 
-    calm = [
-        smooth(*pair).calm
-        for pair in zip(some, [PositionNoise(size)] * len(some), knots, strict=True)
-    ]
+    calm = [smooth(own, PositionNoise(size), k).calm for own, k in zip(some, knots, strict=True)]
 
     def fit(tau: float) -> tuple[float, list[Smoothed]]:
         parts = zip(some, knots, calm, strict=True)
@@ -310,9 +310,3 @@ def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) ->
     return NoiseEstimate(
         known, "data" if sigma is None else "stated", "" if white else "what remains is not white"
     )
-
-
-def _stretch(own: Positions) -> Positions:
-    """The middle of the samples, so many that the noise shows."""
-    first = max(0, (len(own.time) - _ENOUGH) // 2)
-    return Positions(*(x[first : first + _ENOUGH] for x in own))

@@ -37,20 +37,18 @@ class Area(Part):
 
     name: str = key("name; default: the kind and a number", "")
     polygon: _Ring | None = key(
-        "corners [x, y] [m], in order, either way round; the last one is joined to the first", None
+        "corners [x, y] [m], in order, either way round; the last one is joined to the first"
     )
     holes: tuple[_Ring, ...] = key("polygons that are cut out, each with corners [x, y] [m]", ())
     coordinates: Annotated[tuple[_Polygon, ...], Field(min_length=1)] | None = key(
         "instead of polygon: coordinates of a GeoJSON MultiPolygon, [longitude, latitude] [deg], WGS 84: a list of "
-        "polygons, each a list of rings: its border, then its holes; needs [geodetic_origin]",
-        None,
+        "polygons, each a list of rings: its border, then its holes; needs [geodetic_origin]"
     )
     file: str | None = key(
-        "instead of polygon: a GeoJSON file, relative to the mission file; the result holds its coordinates",
-        None,
+        "instead of polygon: a GeoJSON file, relative to the mission file; the result holds its coordinates"
     )
-    floor: Coordinate | None = key("height of the underside [m]", None)
-    ceiling: Coordinate | None = key("height of the upper side [m]", None)
+    floor: Coordinate | None = key("height of the underside [m]")
+    ceiling: Coordinate | None = key("height of the upper side [m]")
 
     def polygons(self, origin: Any) -> list[list[Floats]]:
         """Polygons, each its border and its holes, as corners (m, 2) [m]; ``origin`` is the mission's geodetic one.
@@ -129,11 +127,8 @@ def rules(m: Draft, area: Area, path: Keys) -> Breaches:
             yield Breach("holes", "has no effect without polygon", "put holes into coordinates")
         if why := flaw(area.polygons(m.geodetic_origin)):
             yield Breach(ways[0], *why, None)
-    if (
-        isinstance(area, People)
-        and area.floor is None
-        and any(x.kind == "heights" for x in m.obstacles)
-    ):
+    terrain = any(x.kind == "heights" for x in m.obstacles)
+    if isinstance(area, People) and area.floor is None and terrain:
         remedy = "give the floor and the ceiling of the terrain there, and two metres more"
         yield Breach("floor", "is missing: people stand on terrain", remedy, None)
     floor, ceiling = area.heights(-math.inf)
@@ -148,11 +143,8 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     if len(corners) > bounds.CORNERS:
         return f"has {len(corners):,} corners; the maximum is {bounds.CORNERS:,}", "simplify it"
     if np.abs(corners).max() > _FAR:
-        far = np.abs(corners).max() / 1000.0
-        return (
-            f"is {far:,.0f} km from the origin",
-            "give longitude before latitude, and check the origin",
-        )
+        remedy = "give longitude before latitude, and check the origin"
+        return f"is {np.abs(corners).max() / 1000.0:,.0f} km from the origin", remedy
     edges = Region.of_rings(rings).edges
     if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
         return "has two corners in a row at one place", "give each corner once"

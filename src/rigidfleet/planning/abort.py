@@ -12,11 +12,12 @@ A flight that aborts flies these steps as ordinary phases (`phases_of`), after a
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,8 +52,9 @@ from rigidfleet.typing import Bools, Floats, Ints
 BRAKING, JERK, SPEED = 2.0, 5.0, 5.0
 #: Height of the last straight way down [m], and the greatest speed [m/s] there.
 FINAL, DESCENT = 3.0, 1.0
-#: Shortest step [s], ratio of a time tried to the one before, and number of times tried; share that counts as kept.
-_SHORTEST, _LONGER, _TRIES, _KEPT = 0.5, 1.1, 40, 1.01
+#: Shortest step [s], ratio of a time tried to the one before, and number of times tried; share that counts as kept: the
+#: state at the start may be beyond a limit by rounding.
+SHORTEST, _LONGER, _TRIES, _KEPT = 0.5, 1.1, 60, 1.01
 #: Time between knots of the plan as polynomials of degree 7 [s], which differ from it by micrometres; knots that are
 #: nearer count as one.
 _KNOTS, _NEAR = 0.2, 0.01
@@ -87,7 +89,9 @@ class Step(NamedTuple):
     Attributes
     ----------
     name : what it is called
-    way : the ways of all vehicles, pieces (K, N, 3, P) from 0 [s]
+    make : makes its `way`: so many ways of so many vehicles are not kept
+    duration : how long it takes [s]
+    end : positions (N, 3) [m] at its end
     least : separation that is proved, its time from the beginning
     off : by how much nearer two vehicles may be in flight, since each is off its way [m]
     path : time along the plan at its end, if it leads along the plan [s]
@@ -95,21 +99,18 @@ class Step(NamedTuple):
     """
 
     name: str
-    way: Piecewise
+    make: Callable[[], Piecewise]
+    duration: float
+    end: Floats
     least: Certificate
     off: float = 0.0
     path: float | None = None
     lands: bool = False
 
     @property
-    def duration(self) -> float:
-        """How long it takes [s]."""
-        return float(self.way.time[-1])
-
-    @property
-    def end(self) -> Floats:
-        """Positions (N, 3) [m] at its end."""
-        return self.way.at(self.way.time[-1:])[0]
+    def way(self) -> Piecewise:
+        """The ways of all vehicles, pieces (K, N, 3, P) from 0 [s]."""
+        return self.make()
 
 
 class Home(NamedTuple):
@@ -185,6 +186,13 @@ def _in_a_row(curves: Sequence[Piecewise]) -> Piecewise:
     return Piecewise(np.concatenate([[0.0], *times]), np.concatenate(pieces))
 
 
+def _from_rest(start: Floats, end: Floats, time: float) -> Piecewise:
+    """Straight ways between places (N, 3) [m], from rest to rest in a time [s]."""
+    rest = np.zeros((3, 2, *start.shape))
+    states = np.concatenate([np.stack([start, end])[None], rest])
+    return Piecewise.hermite(np.array([0.0, time]), states)
+
+
 def _clock(begin: float, time: float, progress: Floats) -> Piecewise:
     """The time along a path, from a beginning on, for a time [s]: it goes on by a polynomial (P,) of its share."""
     piece = progress * time ** (1.0 - np.arange(float(len(progress))))
@@ -213,10 +221,8 @@ class Aborts:
         self.to = to or self.options.to
         self.lost = np.zeros(mission.n_agents, dtype=np.bool_) if lost is None else lost
         self.left, self.radius = np.flatnonzero(~self.lost), mission.fleet.radius
-        gentle = {"acceleration": BRAKING, "jerk": JERK, "speed": SPEED}
-        gentle = {name: min(most, getattr(limits, name) or most) for name, most in gentle.items()}
         self.limits = limits_of(mission)
-        self.home_limits = limits_of(mission, limits.model_copy(update=gentle))
+        self.home_limits = gentle_limits(mission, acceleration=BRAKING, jerk=JERK, speed=SPEED)
         self.need, widest = limits.separation or 0.0, 2.0 * float(self.radius.max())
         # Vehicles with rotors are off their ways by what both may be off, and all by the drag that no law knows.
         rotors = not all(model.point for model in mission.vehicle_models or ())
@@ -264,13 +270,12 @@ class Aborts:
             states = slot_derivatives(reference, motion, time, 4).swapaxes(0, 1)
             times.append(time[1:])
             pieces.append(Piecewise.hermite(time, states).pieces)
-        plan = Piecewise(np.concatenate(times), np.concatenate(pieces))
-        on = np.zeros_like(plan.pieces[:1])
-        on[0, ..., :2] = np.moveaxis(plan.states(plan.time[-1:], 2)[:, 0], 0, -1)
-        return _in_a_row([plan, Piecewise(np.array([0.0, 1.0]), on)])
+        on = np.zeros_like(pieces[-1][:1])
+        on[0, ..., :2] = np.moveaxis(Piecewise(time, pieces[-1]).states(time[-1:], 2)[:, 0], 0, -1)
+        return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
 
-    def along(self, name: str, clock: Piecewise) -> Step:
-        """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""
+    def _way_along(self, clock: Piecewise) -> Piecewise:
+        """The ways of all vehicles along the plan by a clock, either way."""
         duration, plan = float(clock.time[-1]), self.plan
         time = np.linspace(0.0, duration, 2 + math.ceil(duration / _KNOTS))
         begin, end = clock.at(time[[0, -1]]).tolist()
@@ -282,7 +287,12 @@ class Aborts:
         s = clock.states(time, 4)
         ends = tuple(x[:, turn] for x in plan.on(s[0, turn]).ends(4))[turn]
         rates = s[1:, :-1], s[1:, 1:]
-        way = Piecewise.of_ends(time, *map(_at_rates, ends, rates))
+        return Piecewise.of_ends(time, *map(_at_rates, ends, rates))
+
+    def along(self, name: str, clock: Piecewise) -> Step:
+        """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""
+        begin, end = clock.at(clock.time[[0, -1]]).tolist()
+        first, last = sorted((begin, end))
         least = _APART_FOR_EVER
         for leg in self.legs[self.leg_at(first) : self.leg_at(last) + 1]:
             proved = leg.certificate
@@ -290,7 +300,16 @@ class Aborts:
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
             least = min(least, proved or least)
         # Its polynomials differ from the plan's ways by less than `CLOSE`.
-        return Step(name, way, least._replace(time=0.0), self._off(way) + CLOSE, end)
+        make, least = partial(self._way_along, clock), least._replace(time=0.0)
+        return self._step(name, make, least, CLOSE, path=end)
+
+    def _step(
+        self, name: str, make: Callable[[], Piecewise], least: Certificate, off: float, **how: Any
+    ) -> Step:
+        """A step of ways that keep a separation, if they are so much off it [m]."""
+        way = make()
+        end = way.at(way.time[-1:])[0]
+        return Step(name, make, float(way.time[-1]), end, least, self._off(way) + off, **how)
 
     def slow_down(self, begins: float) -> tuple[Step, str]:
         """Slow down along the plan from a time on [s], in the least time that keeps the limits, or fly to its landing.
@@ -313,9 +332,9 @@ class Aborts:
         v = plan.states(np.array([begins]), 2)[1, 0, self.left]
         speed = float(np.linalg.norm(v, axis=1).max())
         first = max(_STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
-        time, over = _least_time(first, excess)
+        time, over = least_time(first, excess)
         if begins + 0.5 * time >= self.end and self.lands:
-            clock = _clock(begins, max(self.end - begins, _SHORTEST), _ON)
+            clock = _clock(begins, max(self.end - begins, SHORTEST), _ON)
             return self.along("to its end", clock), ""
         problem, step = "", self.along("slow down", _clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
@@ -352,10 +371,7 @@ class Aborts:
 
     def _straight(self, name: str, start: Floats, end: Floats) -> Step:
         """The step of straight ways (N, 3) [m], from rest to rest and in step, in the least time that keeps limits."""
-        x, rest = np.linspace(0.0, 1.0, _LOOKS), np.zeros((3, 2, *start.shape))
-        places = np.concatenate([np.stack([start, end])[None], rest])
-        whole = Piecewise.hermite(np.array([0.0, 1.0]), places)
-        states = whole.states(x, 4)
+        states = _from_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
         allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), 1.0)  # at rest
 
         def excess(time: float) -> Floats:
@@ -364,10 +380,9 @@ class Aborts:
 
         lands = name == "down"
         longest = float(np.linalg.norm(end - start, axis=1).max())
-        time, _ = _least_time(_FASTEST * longest / (DESCENT if lands else SPEED), excess)
-        way = Piecewise.hermite(np.array([0.0, time]), places)
+        time, _ = least_time(_FASTEST * longest / (DESCENT if lands else SPEED), excess)
         least = in_step(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
-        return Step(name, way, least, self._off(way), lands=lands)
+        return self._step(name, partial(_from_rest, start, end, time), least, 0.0, lands=lands)
 
     def obstruction(self, step: Step, begin: float) -> str:
         """What keeps a step from being flown, from a time [s] on; "" if nothing does.
@@ -439,7 +454,7 @@ class Aborts:
     def _back(self, path: float, begin: float) -> Iterator[Home]:
         """Ways home from farther and farther back along the plan, from a time along it where all rest at a time [s]."""
         for far in np.append(np.arange(_BACK, path, _BACK), path).tolist():
-            time = max(_FASTEST * far, _SHORTEST)
+            time = max(_FASTEST * far, SHORTEST)
             home = self.search(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
                 step = self.along("back", _clock(path, time, -far / time * _BLEND))
@@ -552,23 +567,14 @@ class Aborts:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
         begins, end, who = ordered + self.options.reaction, self.end, self._alone.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
-        problem, last = "there is no time left", np.array([max(begins, end - _TOUCHING), end])
-        states = self.plan.states(last, 4)
-        states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
-        ways = [Piecewise.hermite(last, states).later(-last[0])]
-        if last[0] > begins:
-            ways.insert(0, self.plan.between(begins, last[0]).later(-begins))
-        on = _in_a_row(ways)
+        problem = "there is no time left"
         for waits in np.arange(0.0, end - begins, self.options.step).tolist():
             alone = self._alone._of_all(ordered + waits)
             if alone.reason:
                 problem = alone.reason
                 continue
-            before = [on.between(0.0, waits)] if waits else []
-            own = _in_a_row([*before, *(step.way for step in alone.steps)])
-            knots = common_knots([own, on])
-            own, way = own.on(knots, stays=True), on.on(knots, stays=True)
-            way.pieces[:, who] = own.pieces[:, who]
+            make = partial(self._with_others, begins, waits, alone.steps)
+            way = make()
             proved = of_ways(way.time, way.pieces[:, order], self.radius[order], len(who))
             proved = proved._replace(agents=tuple(order[list(proved.agents)].tolist()))
             off = self._off(way)
@@ -580,9 +586,26 @@ class Aborts:
             least = min(proved, self.along("", _clock(begins, end - begins, _ON)).least)
             slow, *steps = alone.steps
             home = Home(tuple(steps), words, "", round(ordered / self.options.step))
-            step = Step("leave", way, least, off)
+            last = way.at(way.time[-1:])[0]
+            step = Step("leave", make, float(way.time[-1]), last, least, off)
             return Abort(ordered, begins, (step,), home, waits, slow.duration)
         return Abort(ordered, begins, (), Home(reason=problem))
+
+    def _with_others(self, begins: float, waits: float, steps: Sequence[Step]) -> Piecewise:
+        """The ways from a time on [s] of those that wait so long and then fly steps, and of the others, by the plan."""
+        last = np.array([max(begins, self.end - _TOUCHING), self.end])
+        states = self.plan.states(last, 4)
+        states[1:, 1] = 0.0  # a landing ends with the speed at which it touches down
+        ways = [Piecewise.hermite(last, states).later(-last[0])]
+        if last[0] > begins:
+            ways.insert(0, self.plan.between(begins, last[0]).later(-begins))
+        on = _in_a_row(ways)
+        before = [on.between(0.0, waits)] if waits else []
+        own = _in_a_row([*before, *(step.way for step in steps)])
+        knots = common_knots([own, on])
+        own, way, who = own.on(knots, stays=True), on.on(knots, stays=True), self._alone.left
+        way.pieces[:, who] = own.pieces[:, who]
+        return way
 
     # -- who does not hear --------------------------------------------------------------------------------
 
@@ -610,15 +633,26 @@ class Aborts:
         ]
 
 
-def _least_time(time: float, excess: Callable[[float], Floats]) -> tuple[float, Floats]:
-    """The least time from a first one on [s] that exceeds no limit, and the shares of them that it takes."""
-    time = max(time, _SHORTEST)
+def least_time(time: float, excess: Callable[[float], Floats]) -> tuple[float, Floats]:
+    """The least time from a first one on [s], to within a tenth, that exceeds no limit, and the shares that it takes.
+
+    If every time exceeds one, the best of those that were tried.
+    """
+    tries: list[tuple[float, Floats]] = []
+    time = max(time, SHORTEST)
     for _ in range(_TRIES):
-        over = excess(time)
-        if over.max(initial=0.0) <= _KEPT:
-            break
+        tries.append((time, excess(time)))
+        if tries[-1][1].max(initial=0.0) <= _KEPT:
+            return tries[-1]
         time *= _LONGER
-    return time, over
+    return min(tries, key=lambda x: x[1].max())
+
+
+def gentle_limits(mission: Mission, **most: float) -> list[Limit]:
+    """The limits of a mission, of which some are no greater than given here."""
+    own = mission.limits
+    less = {name: min(x, getattr(own, name) or x) for name, x in most.items()}
+    return limits_of(mission, own.model_copy(update=less))
 
 
 def _levels(distance: float, p: Floats, q: Floats) -> Ints:
@@ -626,21 +660,26 @@ def _levels(distance: float, p: Floats, q: Floats) -> Ints:
 
     Of two that are one above the other at first, the higher one gets the higher level.
     """
-    n = len(p)
-    near: list[list[int]] = [[] for _ in range(n)]
-    for i, j in pairs_nearer_than(distance, p * _ABOVE, q * _ABOVE).tolist():
-        near[i].append(j)
-        near[j].append(i)
-    level = np.full(n, -1)
+    near, level = neighbours(distance, p, q), np.full(len(p), -1)
     for i in np.argsort(p[:, 2], kind="stable").tolist():
         others = np.array([j for j in near[i] if level[j] >= 0], dtype=np.int64)
         under = others[np.linalg.norm((p[others] - p[i])[:, :2], axis=1) < distance]
-        taken = set(level[others].tolist())
-        k = int(level[under].max(initial=-1)) + 1
-        while k in taken:
-            k += 1
-        level[i] = k
+        level[i] = first_free(level[others], int(level[under].max(initial=-1)) + 1)
     return level
+
+
+def neighbours(distance: float, p: Floats, q: Floats) -> list[list[int]]:
+    """Of each vehicle, the others that come nearer than a distance [m], seen from above, on ways from p to q (N, 3)."""
+    near: list[list[int]] = [[] for _ in p]
+    for i, j in pairs_nearer_than(distance, p * _ABOVE, q * _ABOVE).tolist():
+        near[i].append(j)
+        near[j].append(i)
+    return near
+
+
+def first_free(taken: Ints, least: int = 0) -> int:
+    """The first level from a least one on that is not taken."""
+    return next(k for k in itertools.count(least) if k not in taken)
 
 
 def phases_of(mission: Mission, steps: Sequence[Step], before: str = "") -> list[Phase]:

@@ -12,7 +12,8 @@ from rigidfleet.kernel.problem import SHAPE, Reference, septic_polynomial
 from rigidfleet.math import proximity
 from rigidfleet.math.piecewise import about
 from rigidfleet.mission import Phase
-from rigidfleet.typing import Bools, Floats, Ints
+from rigidfleet.planning.derivatives import of_agents
+from rigidfleet.typing import Bools, Floats
 
 #: Greatest size of slots, in bytes, whose least separation is cached.
 _KEPT = 100_000
@@ -78,14 +79,6 @@ def _of_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certif
         return certificate
     i, j = (int(left[k]) for k in certificate.agents)
     return certificate._replace(agents=(i, j))
-
-
-def of_agents(reference: Reference, who: Ints) -> Reference:
-    """The reference of some agents' slots."""
-    if len(who) == len(reference.p0):
-        return reference
-    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
-    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
 
 
 def straight(reference: Reference, radius: Floats) -> Certificate | None:

@@ -16,8 +16,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import proximity, series
 from rigidfleet.math.piecewise import piece_at
 from rigidfleet.mission import Obstacle
-from rigidfleet.planning.certificate import of_agents
-from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.derivatives import of_agents, slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.solids.records import Solids
 from rigidfleet.typing import Floats, Ints

@@ -99,23 +99,12 @@ def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) ->
     return rest._replace(lift=Lift(control[-1] - control[0], blend, now.t + knots, ways, keeps=True))  # fmt: skip
 
 
-def _fly(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
-    """Go to a waypoint, and perhaps an attitude."""
-    velocity = np.zeros(3) if phase.free else np.array(phase.velocity)
-    return _steer(mission, phase, now, t_end, np.array(phase.position), velocity)
-
-
-def _turn(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
-    """Turn to an attitude on the spot."""
+def _steer(mission: Mission, phase: Fly | Turn, now: PhaseState, t_end: float) -> Course:
+    """Go to a waypoint, or stay, and turn to an attitude if there is one, within ``travel`` or by the end."""
     assert now.goal is not None  # a steering phase has a goal
-    return _steer(mission, phase, now, t_end, now.goal.r, np.zeros(3))
-
-
-def _steer(
-    mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
-) -> Course:
-    """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
-    assert now.goal is not None  # a steering phase has a goal
+    r, v = now.goal.r, np.zeros(3)
+    if isinstance(phase, Fly):
+        r, v = np.array(phase.position), v if phase.free else np.array(phase.velocity)
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
     T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
@@ -193,7 +182,8 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
         body[:, :3] = pieces[:, 0, :3]
         if phase.turns_away:
             body[:, 5] = pieces[:, 0, 3]
-            body[:, 5, 0] += _whole_turns(body[0, 5, 0], begin[0, 5])
+            # By whole turns, to be nearest to the yaw before.
+            body[:, 5, 0] += 2.0 * math.pi * round((begin[0, 5] - body[0, 5, 0]) / (2.0 * math.pi))
     else:
         masses = mission.fleet.mass
         body[:, :3] = np.einsum("i,kiqp->kqp", masses / masses.sum(), pieces[:, :, :3])
@@ -212,27 +202,15 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     return Course(goal, arrival, lambda: motion, lift)
 
 
-def _whole_turns(yaw: float, near: float) -> float:
-    """What to add to a yaw [rad] so that it is the one nearest to another."""
-    return 2.0 * math.pi * round((near - yaw) / (2.0 * math.pi))
-
-
 def course_conflict(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    return _MISMATCHES.get(phase.kind, lambda *_: "")(phase, now)
-
-
-def _slot_mismatch(phase: Reshape, now: PhaseState) -> str:
-    """What keeps a change of shape from following its bent ways, if it has any."""
-    if not phase.bent:
-        return ""
-    first = np.array(phase.control_points)[0]
-    far = np.inf if now.slots is None else float(np.abs(first - now.slots).max())
-    return (
-        ""
-        if far < _START_TOLERANCES[0]
-        else "begins in other slots than the phase before has led to"
-    )
+    if isinstance(phase, Follow):
+        return _vehicle_mismatch(phase, now)
+    if isinstance(phase, Reshape) and phase.bent:
+        first = np.array(phase.control_points)[0]
+        if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:
+            return "begins in other slots than the phase before has led to"
+    return ""
 
 
 def _vehicle_mismatch(phase: Follow, now: PhaseState) -> str:
@@ -345,16 +323,11 @@ def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:
 #: Function of each kind of phase that leads somewhere; in all others, the virtual body comes to rest.
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "brake": _brake,
-    "fly": _fly,
+    "fly": _steer,
     "follow": _follow,
     "land": _vertical,
     "orbit": _orbit,
     "reshape": _reshape,
     "takeoff": _vertical,
-    "turn": _turn,
-}
-#: Function of each kind of phase that may follow given ways, which says what keeps it from that.
-_MISMATCHES: dict[str, Callable[[Any, PhaseState], str]] = {
-    "follow": _vehicle_mismatch,
-    "reshape": _slot_mismatch,
+    "turn": _steer,
 }

@@ -16,7 +16,7 @@ from numpy.polynomial import Polynomial
 from rigidfleet.kernel.problem import Motion, Reference, septic_polynomial
 from rigidfleet.math import series
 from rigidfleet.math.piecewise import Piecewise, piece_at
-from rigidfleet.typing import Floats
+from rigidfleet.typing import Floats, Ints
 
 #: Number of coefficients of a series: position, velocity, acceleration, jerk, snap.
 ORDERS = 5
@@ -55,6 +55,14 @@ def slot_derivatives(
     return derivatives.transpose(3, 0, 2, 1)
 
 
+def of_agents(reference: Reference, who: Ints) -> Reference:
+    """The reference of some agents' slots."""
+    if len(who) == len(reference.p0):
+        return reference
+    ways = reference.ways[:, who] if len(reference.knots) else reference.ways
+    return reference._replace(p0=reference.p0[who], dp=reference.dp[who], ways=ways)
+
+
 def slots_by_own_clocks(reference: Reference, motion: Motion, time: Floats, tau: Floats) -> Floats:
     """Position, velocity, acceleration and jerk (K, 4, N, 3) of slots, each by the clock of its vehicle.
 
@@ -63,11 +71,7 @@ def slots_by_own_clocks(reference: Reference, motion: Motion, time: Floats, tau:
     """
     out = np.empty((len(time), 4, tau.shape[1], 3))
     for i in range(tau.shape[1]):
-        alone = reference._replace(
-            p0=reference.p0[i : i + 1],
-            dp=reference.dp[i : i + 1],
-            ways=reference.ways[:, i : i + 1],
-        )
+        alone = of_agents(reference, np.array([i]))
         own, (s, slope) = time + tau[:, i, 0], tau[:, i, 1:3].T[..., None]
         inside = np.maximum(own, motion.knots[0])
         r, v, a, j = slot_derivatives(alone, motion, inside, 4)[:, :, 0].swapaxes(0, 1)

@@ -13,13 +13,12 @@ each part, less the way that a ball flies from there, is what is needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Obstacle
 from rigidfleet.solids import records
@@ -88,11 +87,6 @@ class Layer(NamedTuple):
     formation: str
     angles: tuple[float, float, float]  # roll, pitch, yaw [deg]
     offsets: Floats  # (M, 3) of balls from the centre of mass, world axes [m]
-
-    @property
-    def turn(self) -> Floats:
-        """Its attitude (3, 3), world to body."""
-        return att.dcm_from_euler(np.deg2rad(self.angles))
 
 
 class Change(NamedTuple):
@@ -253,24 +247,18 @@ class Roadmap:
         self.size = int(starts[-1])
         self.points = np.concatenate([x.points for row in self.lattices for x in row])
         self.layer_of = np.repeat(np.tile(np.arange(len(layers)), len(frames)), np.ravel(counts))
-        self._join()
+        links = zip(*self._links(), strict=True)
+        self.tails, self.heads, self.costs = map(np.concatenate, links)
 
-    def _join(self) -> None:
-        """Collect motions within layers, changes at common places, and crossings from frame to frame."""
-        tails, heads, costs = [], [], []
+    def _links(self) -> Iterator[tuple[Ints, Ints, Floats]]:
+        """Nodes and costs of motions within layers, of changes at common places, of crossings from frame to frame."""
         space, radius, need = self.space, self.radius, self.need
-
-        def add(one: Ints, two: Ints, cost: Floats) -> None:
-            tails.append(one)
-            heads.append(two)
-            costs.append(cost)
-
         for f, row in enumerate(self.lattices):
             for k, x in enumerate(row):
                 a, b = x.edges + self.first[f, k]
                 length = np.linalg.norm(self.points[a] - self.points[b], axis=1)
                 other = 1.0 if x.layer.formation == self.layers[0].formation else _OTHER
-                add(a, b, length * other)
+                yield a, b, length * other
             for change in self.changes:
                 one, two = row[change.before], row[change.after]
                 free = one.free[one.common] & two.free[two.common]
@@ -278,12 +266,10 @@ class Roadmap:
                 spots = one.points[a]
                 good = keeps_room(space, spots, spots, change.path, change.ways, radius, need)
                 a, b = a[good] + self.first[f, change.before], b[good] + self.first[f, change.after]
-                add(a, b, np.full(len(a), change.cost))
+                yield a, b, np.full(len(a), change.cost)
         for f in range(1, len(self.lattices)):
             for k, layer in enumerate(self.layers):
-                add(*self._crossings(k, layer, f))
-        self.tails, self.heads = np.concatenate(tails), np.concatenate(heads)
-        self.costs = np.concatenate(costs)
+                yield self._crossings(k, layer, f)
 
     def _crossings(self, k: int, layer: Layer, f: int) -> tuple[Ints, Ints, Floats]:
         """Straight ways of a layer between common places of the world's lattice and the nearest of another frame."""
@@ -307,7 +293,7 @@ class Roadmap:
         at = [int(np.abs(x.axes[k] - place[k]).argmin()) for k in range(3)]
         return int(self.first[0, layer] + np.ravel_multi_index(at, x.shape))
 
-    def shortest(self, begin: tuple[Floats, int], end: tuple[Floats, int]) -> Way | None:
+    def shortest(self, begin: Stop, end: Stop) -> Way | None:
         """The way of least cost from a place and layer to others; None if there is none."""
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
@@ -380,29 +366,27 @@ class Roadmap:
         ]
         return [s for s, again in zip(stops, alike, strict=True) if not again]
 
-    def widest(
-        self, begin: tuple[Floats, int], end: tuple[Floats, int]
-    ) -> tuple[float, Floats, int]:
-        """The most room [m] that a way between two nodes leaves everywhere, and place and layer where it is least."""
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-
-        tails, heads, rooms = [], [], []
-        for k, x in enumerate(self.lattices[0]):
+    def _rooms(self) -> Iterator[tuple[Ints, Ints, Floats]]:
+        """Nodes of the world's lattice that a motion or a change joins, proved or not, and the room there [m]."""
+        row, first = self.lattices[0], self.first[0]
+        for k, x in enumerate(row):
             a, b = x.all_edges
             share = np.linspace(0.0, 1.0, 5)[1:-1]
             between = x.points[a, None] + share[:, None] * (x.points[b] - x.points[a])[:, None]
             room = self.space.room(between[:, :, None] + x.layer.offsets, self.radius)
-            tails.append(a + self.first[0, k])
-            heads.append(b + self.first[0, k])
-            rooms.append(np.minimum(room.min(axis=(1, 2)), np.minimum(x.room[a], x.room[b])))
+            ends = np.minimum(x.room[a], x.room[b])
+            yield a + first[k], b + first[k], np.minimum(room.min(axis=(1, 2)), ends)
         for change in self.changes:
-            one, two = self.lattices[0][change.before], self.lattices[0][change.after]
-            a, b = one.common, two.common
-            tails.append(a + self.first[0, change.before])
-            heads.append(b + self.first[0, change.after])
-            rooms.append(np.minimum(one.room[a], two.room[b]))
-        tail, head, room = map(np.concatenate, (tails, heads, rooms))
+            (a, one), (b, two) = ((row[k].common, row[k]) for k in (change.before, change.after))
+            room = np.minimum(one.room[a], two.room[b])
+            yield a + first[change.before], b + first[change.after], room
+
+    def widest(self, begin: Stop, end: Stop) -> tuple[float, Floats, int]:
+        """The most room [m] that a way between two nodes leaves everywhere, and place and layer where it is least."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+
+        tail, head, room = map(np.concatenate, zip(*self._rooms(), strict=True))
         # Of places that are as narrow, the one nearest to the straight way.
         along = end[0] - begin[0]
         beside = np.cross(self.points[tail] - begin[0], along / max(np.linalg.norm(along), 1e-9))

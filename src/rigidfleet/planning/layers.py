@@ -93,10 +93,8 @@ def narrow_yaws(slots: Floats, start: Angles, axes: list[Floats]) -> set[float]:
     yaws = set()
     for frame in axes:
         lies = math.degrees(math.atan2(frame[0, 1], frame[0, 0]) - best)
-        for yaw in (
-            lies,
-            lies + 90.0,
-        ):  # of the two that are the same but for half a turn, the nearer one
+        # Of the two that are the same but for half a turn, the nearer one.
+        for yaw in (lies, lies + 90.0):
             yaws.add(round(yaw_before + (yaw - yaw_before + 90.0) % 180.0 - 90.0, 4))
     return yaws
 

@@ -300,13 +300,8 @@ def leg_from(mission: Mission, phase: Phase, departure: Departure) -> Leg:
         slots = now.slots if shaping is None else target
     bent: Any = ()
     if lift is not None:
-        kind, dp, T_b, slots, bent = (
-            SHAPE,
-            lift.dp,
-            lift.time,
-            p0 + lift.dp,
-            (lift.knots, lift.ways),
-        )
+        kind, dp, T_b, bent = SHAPE, lift.dp, lift.time, (lift.knots, lift.ways)
+        slots = p0 + dp
         if not lift.keeps:
             name = target = None  # no formation outlasts it
     reference = Reference(kind, now.t, T_b, _NONE, _NONE, p0, dp, turn, *bent)

@@ -19,8 +19,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
-from rigidfleet.planning.certificate import of_agents
-from rigidfleet.planning.derivatives import slot_derivatives
+from rigidfleet.planning.derivatives import of_agents, slot_derivatives
 from rigidfleet.planning.vehicles import air_force
 from rigidfleet.typing import Floats, Ints
 

@@ -14,26 +14,32 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import Brake, Hold, Land, Reshape, Turn
-from rigidfleet.planning.abort import BRAKING, DESCENT, JERK, Aborts, phases_of, state_to_leave
+from rigidfleet.planning.abort import (
+    BRAKING,
+    DESCENT,
+    JERK,
+    SHORTEST,
+    Aborts,
+    gentle_limits,
+    least_time,
+    phases_of,
+    state_to_leave,
+)
 from rigidfleet.planning.clearance import CLOSE, closest, pace
 from rigidfleet.planning.courses import height, rises
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
-from rigidfleet.planning.limits import limits_of, use_of_limits
+from rigidfleet.planning.limits import use_of_limits
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.timing import timed_leg
+from rigidfleet.typing import Floats
 
 #: Greatest acceleration of the descent [m/s^2].
 _DESCENDING = 0.5
 #: Peaks of speed and acceleration of a septic blend over unit way and time.
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.1875, 7.5132
-#: Least time of a phase [s]; ratio of a time tried to the one before, and number of times tried.
-_SHORTEST, _LONGER, _TRIES = 0.5, 1.1, 60
-#: Share of a limit that counts as keeping it; the state at the start may be beyond it by rounding.
-_KEPT = 1.01
 #: Tilt that counts as level [rad].
 _LEVEL = 1e-3
 
@@ -85,7 +91,7 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     def then(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
         """Add the leg of a phase; with ``freely``, only if it leads into nothing. Return whether it was added."""
         nonlocal now
-        leg = _shortest(mission, now, make, _SHORTEST)
+        leg = _shortest(mission, now, make, SHORTEST)
         if freely and _hits(mission, leg):
             return False
         legs.append(leg)
@@ -126,11 +132,8 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     for make, depth in ways:
         if depth <= 0.0:
             return legs
-        speed, acceleration = (
-            _PEAK_SPEED * depth / DESCENT,
-            _PEAK_ACCELERATION * depth / _DESCENDING,
-        )
-        least = max(speed, math.sqrt(acceleration), _SHORTEST)
+        least = max(_PEAK_SPEED * depth / DESCENT, SHORTEST)
+        least = max(math.sqrt(_PEAK_ACCELERATION * depth / _DESCENDING), least)
         down = _shortest(mission, now, lambda t, make=make: make(duration=t), least)
         if not _hits(mission, down):
             break
@@ -151,27 +154,14 @@ def _shortest(
 
     Where the state at the start is beyond a limit, that counts as the limit. If no time keeps them, the best one tried.
     """
-    own = mission.limits
-    gentle = {"acceleration": BRAKING, "jerk": JERK}
-    gentle = {name: min(most, getattr(own, name) or most) for name, most in gentle.items()}
-    limits = limits_of(mission, own.model_copy(update=gentle))
+    limits = gentle_limits(mission, acceleration=BRAKING, jerk=JERK)
+    departure = depart(mission, make(least), now)
 
-    def shares(reference: Reference, motion: Motion, end: float) -> np.ndarray:
-        return np.array([x.share for x in use_of_limits(limits, reference, motion, now.t, end)])
-
-    best, least_worst, time = None, math.inf, least
-    departure = depart(mission, make(time), now)
-    allowed: np.ndarray | None = None
-    for _ in range(_TRIES):
+    def shares(time: float, end: float = math.inf) -> Floats:
         leg = leg_from(mission, make(time), departure)
-        if allowed is None:
-            begun = shares(leg.reference, leg.motion, now.t + 1e-9 * max(1.0, now.t))
-            allowed = np.maximum(begun, 1.0)
-        worst = float((shares(leg.reference, leg.motion, leg.end) / allowed).max())
-        if best is None or worst < least_worst:
-            best, least_worst = leg, worst
-        if worst <= _KEPT:
-            break
-        time *= _LONGER
-    assert best is not None
-    return best
+        use = use_of_limits(limits, leg.reference, leg.motion, now.t, min(leg.end, end))
+        return np.array([x.share for x in use])
+
+    allowed = np.maximum(shares(least, now.t + 1e-9 * max(1.0, now.t)), 1.0)
+    time, _ = least_time(least, lambda time: shares(time) / allowed)
+    return leg_from(mission, make(time), departure)

@@ -224,10 +224,10 @@ def plan_phase(
         The phase has no time left, or would take hours to simulate.
     """
     phase, shaping, now, name = leg.phase, leg.phase.shaping, leg.departure.now, leg.formation
-    _check_time(phase, leg.start)
-    _check_size(mission, phase)
     masses = mission.fleet.mass.copy()
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
+    method = solvers.choose(len(masses), edges, mission.constraint.solver)
+    _refuse(mission, phase, leg.start, edges if method == "dense" else edges[:0])
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
         d1 = now.reference.of(edges, d1)
@@ -243,7 +243,6 @@ def plan_phase(
     elif phase.control == "body":
         assert leg.goal is not None
         feedback = _feedback(mission, phase, leg.goal, leg.start, leg.arrival)
-    method = solvers.choose(len(masses), edges, mission.constraint.solver)
     held = _formation_in_shape(mission, name, now) if method == "dense" else None
     problem = Problem(
         body_formulation=mission.formulation == "body",
@@ -300,28 +299,18 @@ def _limit_steps(external: External, motion: Motion, reference: Reference) -> Ex
     return external if longest == most else external._replace(max_step=0.5 * longest)
 
 
-def _check_time(phase: Phase, start: float) -> None:
-    """Refuse a phase that is to end before it starts [s]."""
+def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
+    """Refuse a phase that is to end before it starts [s], or that would take hours to simulate, for its dense edges."""
     if phase.until is not None and phase.until <= start:
         raise StoppedError(
             f"phase '{phase.name}' is to end at {phase.until:g} s, but the phases before it end at"
             f" {start:.2f} s. Give it a duration instead of until"
         )
-
-
-def _check_size(mission: Mission, phase: Phase) -> None:
-    """Refuse a phase that would take hours to simulate."""
-    if phase.shaping is None:
-        return
-    formation = phase.shaping.formation
     n, solver = mission.n_agents, mission.constraint.solver
-    edges = mission.formation_edges(formation)
-    if solvers.choose(n, edges, solver) != "dense":
-        return
     size = solvers.equations(n, len(edges), solver)
-    if size > solvers.MOST_DENSE:
+    if phase.shaping is not None and size > solvers.MOST_DENSE:
         raise StoppedError(
-            f"phase '{phase.name}' takes '{formation}', whose {len(edges):,} edges between"
+            f"phase '{phase.name}' takes '{phase.shaping.formation}', whose {len(edges):,} edges between"
             f' {n:,} agents give {size:,} equations for the constraint force; solver "{solver}" needs'
             f" their eigenvalues; with more than {solvers.MOST_DENSE:,} a flight takes hours. Use solver ="
             ' "iterated" (or "exact"), give it fewer edges, or track slots with edges = []'

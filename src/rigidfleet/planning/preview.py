@@ -66,11 +66,7 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     planned: list[PlannedPhase] = []
     most = samples_per_phase(mission)
     # If even the fewest samples of all phases are too many, only the first phases.
-    possible = (
-        len(mission.phases)
-        if most >= FEWEST_SAMPLES
-        else most * len(mission.phases) // FEWEST_SAMPLES
-    )
+    possible = len(mission.phases) * min(most, FEWEST_SAMPLES) // FEWEST_SAMPLES
     most = max(most, FEWEST_SAMPLES)
     wanted = mission.phases[:phases]
     now = at_start(mission)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rigidfleet._common.progress import report
-from rigidfleet.errors import Finding, MissionError
+from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.values import AUTO
@@ -111,25 +112,21 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
     if problem := course_conflict(phase, departure.now):
         key = "file" if phase.follows_curves else "formation"
         remedy = "lead the vehicles there before, by phases such as 'fly', 'turn' and 'reshape'"
-        path = f"phases[{number + 1}].{key}"
-        raise MissionError([Finding(mission.origin, path, None, problem, remedy)])
+        raise ways.error_of_key(mission, number, key, None, problem, remedy)
     if not phase.automatic:
         return leg_from(mission, phase, departure)
     phase = _shared_out(mission, phase, departure)
+    shortest, vary = _SHORTEST, partial(_moving, phase)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
-        shortest, vary = phase.shaping.least_time, _lasting
-    else:
-        shortest, vary = _SHORTEST, _moving
-    time, worst = _least(mission, lambda t: vary(phase, t), departure, shortest)
+        shortest, vary = phase.shaping.least_time, partial(_lasting, phase)
+    time, worst = _least(mission, vary, departure, shortest)
     if time is None:
-        key = phase.automatic[0]
         problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
         remedy = f"raise {worst.limit.of.key}, or change the way"
-        path = f"phases[{number + 1}].{key}"
-        raise MissionError([Finding(mission.origin, path, AUTO, problem, remedy)])
+        raise ways.error_of_key(mission, number, phase.automatic[0], AUTO, problem, remedy)
     if time > shortest:
         time = math.ceil(time * _MARGIN / _UNIT - 1e-9) * _UNIT
-    return leg_from(mission, vary(phase, round(time, 6)), departure)
+    return leg_from(mission, vary(round(time, 6)), departure)
 
 
 def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
@@ -139,7 +136,7 @@ def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
     """
     length = {"until": None, "settle": None, "duration": leg.end - leg.start}
     phase = _shared_out(mission, leg.phase.model_copy(update=length), leg.departure)
-    time, _ = _least(mission, lambda t: _moving(phase, t), leg.departure, _SHORTEST)
+    time, _ = _least(mission, partial(_moving, phase), leg.departure, _SHORTEST)
     return phase.time_key, time
 
 
@@ -257,7 +254,6 @@ def _error_of_reference(mission: Mission, number: int, last: Phase) -> MissionEr
         "depends on distances alone, so that the starts of later phases are known only in flight"
     )
     remedy = f"give the formation a shape or slots, or give '{last.name}' a time"
-    path = f"phases[{number + 1}].formation"
     shaping = mission.phases[number].shaping
     name = None if shaping is None else shaping.formation
-    return MissionError([Finding(mission.origin, path, name, problem, remedy)])
+    return ways.error_of_key(mission, number, "formation", name, problem, remedy)

@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.progress import report
-from rigidfleet.formation.assignment import closest_approach, pairs_nearer_than
+from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
-from rigidfleet.planning.abort import Aborts, Step, phases_of
+from rigidfleet.planning.abort import Aborts, Step, first_free, neighbours, phases_of
 from rigidfleet.planning.legs import at_start
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import transfer
 from rigidfleet.planning.ways import Timed, error_of_key
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Floats
 
 #: What the parts of a transition are called.
 _PARTS = ("apart", "across", "together")
@@ -65,24 +65,28 @@ def expand_phases(mission: Mission, timed: Timed) -> Mission:
         if not phase.flown_as_written:
             so_far = data | {"phases": tables, "formations": data["formations"] | forms}
             state = partial(_state_after, mission, so_far, timed)
-            parts, levels = _PARTS_OF[phase.kind](mission, k, table, phase, before, state)
-            forms |= levels
+            if isinstance(phase, Vertical):
+                parts = _stagger(mission, k, table, phase, before, state)
+            elif isinstance(phase, Reshape):
+                parts, levels = _transition(mission, k, table, phase, before, state)
+                forms |= levels
         tables += parts
         before = before if phase.shaping is None else phase.shaping.formation
     data |= {"phases": tables, "formations": data["formations"] | forms}
     return mission.rewritten(data)
 
 
-#: Phases as tables, and the formations that they take on the way.
-_Parts = tuple[list[dict[str, Any]], dict[str, Any]]
 #: The state at the start of a phase (`_state_after`).
 _State = Callable[[], PhaseState | None]
 
 
 def _transition(
     mission: Mission, number: int, table: dict[str, Any], phase: Reshape, before: str | None, state: _State
-) -> _Parts:  # fmt: skip
-    """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do."""
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:  # fmt: skip
+    """The phase with its bent ways, or the phases of a transition by layers; as it is if straight ways will do.
+
+    Beside the tables of the phases, the formations that they take on the way.
+    """
     if phase.transition == "ways":
         report(f"looking for ways of the agents in '{phase.name}'")
         return [_bent(mission, number, table, phase, before, _room(mission, state()))], {}
@@ -96,7 +100,7 @@ def _transition(
 
 def _stagger(
     mission: Mission, number: int, table: dict[str, Any], phase: Vertical, before: str | None, state: _State
-) -> _Parts:  # fmt: skip
+) -> list[dict[str, Any]]:  # fmt: skip
     """The phases of a staggered take-off or landing, one for each group, or of a landing on the own places.
 
     Raises
@@ -105,7 +109,7 @@ def _stagger(
         The duration leaves no time for the last group, or so much that groups would be under way together.
     """
     if phase.stagger is None:
-        return _to_own_places(mission, number, table, phase, state()), {}
+        return _to_own_places(mission, number, table, phase, state())
     assert isinstance(phase.duration, float)  # checked
     moving = phase.agents or tuple(range(1, mission.n_agents + 1))
     groups = [[i] for i in moving]
@@ -127,21 +131,12 @@ def _stagger(
         )
         raise error_of_key(mission, number, "duration", phase.duration, problem, remedy)
     common = {key: x for key, x in table.items() if key not in ("stagger", "by")}
-    parts = [
+    return [
         common
         | {"name": f"{phase.name}: {k} of {len(groups)}", "agents": group, "travel": travel}
         | {"duration": phase.stagger if k < len(groups) else travel}
         for k, group in enumerate(groups, start=1)
     ]
-    return parts, {}
-
-
-#: What takes the place of each kind of phase that may not be flown as it is written.
-_PARTS_OF: dict[str, Callable[[Mission, int, dict[str, Any], Any, str | None, _State], _Parts]] = {
-    "land": _stagger,
-    "reshape": _transition,
-    "takeoff": _stagger,
-}
 
 
 def _to_own_places(
@@ -311,7 +306,7 @@ def _stops(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _level_of(pairs_nearer_than(apart, p * _ABOVE, q * _ABOVE), len(p))
+    level = height * _level_of(neighbours(apart, p, q))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):
@@ -327,19 +322,11 @@ def _stops(
     return stops
 
 
-_ABOVE = np.array([1.0, 1.0, 0.0])
-
-
-def _level_of(conflicts: Ints, n: int) -> Floats:
-    """Level (N,) of each agent, ... -1, 0, 1, ..., such that no conflict (m, 2) is within a level."""
-    near: list[list[int]] = [[] for _ in range(n)]
-    for i, j in conflicts.tolist():
-        near[i].append(j)
-        near[j].append(i)
-    colour = np.full(n, -1)
+def _level_of(near: list[list[int]]) -> Floats:
+    """Level (N,) of each agent, ... -1, 0, 1, ..., such that no two that are near each other are within a level."""
+    colour = np.full(len(near), -1)
     for i in np.argsort([-len(others) for others in near], kind="stable").tolist():
-        taken = set(colour[near[i]].tolist())
-        colour[i] = next(k for k in range(n) if k not in taken)
+        colour[i] = first_free(colour[near[i]])
     # The fullest in the middle: 0, 1, -1, 2, -2, ...
     order = np.argsort(-np.bincount(colour), kind="stable")
     place = np.empty(len(order))

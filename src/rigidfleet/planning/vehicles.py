@@ -338,14 +338,18 @@ class TickTables:
         if not self.flight.vehicles.point.all() or self.yaw.kind == "along":
             # An ideal point has no attitude that goes ahead of its force.
             yaw, slots = self._references(problem, ticks / self.rate, turn)
-            jerk, snap = self._force_rates(slots)
+            if len(slots):
+                jerk, snap = self._force_rates(slots)
         if self.compensated:
             path = _by_tick(slots[:2].reshape(6, self.n, -1)) if len(slots) else self._path(ticks)
         noise_r = noise_v = np.zeros((0, self.n, 3))
         dropped = np.zeros((0, self.n), dtype=np.bool_)
         if self.noise is not None:
-            rows = _rows(first, last, sensing.every)
-            seed = self.noise.seed
+            # Which multiples of the ticks between measurements lie there.
+            rows, seed = (
+                range(-(-first // sensing.every), -(-last // sensing.every)),
+                self.noise.seed,
+            )
             if self.noise.position or self.noise.velocity:
                 white = _random_rows(_NOISE, seed, rows, (2, self.n, 3))
                 noise_r = np.ascontiguousarray(self.noise.position * white[:, 0])
@@ -356,9 +360,8 @@ class TickTables:
         if tau is None:
             return made
         # Rows of single ticks are taken in flight from those of all
-        rows, size = len(ticks), (last - first, self.n)
-        parts = [x if len(x) else np.zeros((rows, *x.shape[1:])) for x in made[2:6]]
-        path, yaw, jerk, snap = (np.zeros((*size, x.shape[2])) for x in parts)
+        parts = [x if len(x) else np.zeros((len(ticks), *x.shape[1:])) for x in made[2:6]]
+        path, yaw, jerk, snap = (np.zeros((last - first, *x.shape[1:])) for x in parts)
         path[0] = self._path_at(first, tau) if self.compensated else 0.0
         return made._replace(
             path=path, yaw=yaw, jerk=jerk, snap=snap, by_clock=np.concatenate(parts, axis=2), origin=origin,
@@ -375,7 +378,7 @@ class TickTables:
 
         A vehicle turns with the formation, or from its yaw at the start of the phase into the one asked for.
         """
-        if problem.control.kind != TRACKING or not len(time):
+        if problem.control.kind != TRACKING:
             still = np.zeros((len(time), self.n, 3))
             still[..., 0] = turn.start
             return still, np.zeros((0, 3, self.n, len(time)))
@@ -396,8 +399,6 @@ class TickTables:
 
         Drag that is fed forward changes the force with the velocity; near level flight body axes are the world's.
         """
-        if not len(x):
-            return np.zeros((0, self.n, 3)), np.zeros((0, self.n, 3))
         _, v, a, j, s = x
         vehicles = self.flight.vehicles
         share = self.flight.guidance.drag / vehicles.m
@@ -470,24 +471,16 @@ def slots_and_yaw(
 
 def _by_tick(x: Floats) -> Floats:
     """A table (K, N, Q) of values (Q, N, K)."""
-    table = np.empty(x.shape[::-1])
-    for q, values in enumerate(x):  # faster than a copy of the transposed array
-        table[..., q] = values.T
-    return table
+    return np.ascontiguousarray(x.T)
 
 
-def _rows(first: int, last: int, every: int) -> Ints:
-    """Which multiples of ``every`` lie between ticks, counted in multiples."""
-    return np.arange(-(-first // every), -(-last // every))
-
-
-def _random_rows(kind: int, seed: int, rows: Ints, shape: tuple[int, ...]) -> Floats:
+def _random_rows(kind: int, seed: int, rows: range, shape: tuple[int, ...]) -> Floats:
     """Random numbers (K, *shape) of some rows: normal ones for noise, else uniform ones."""
-    if not len(rows):
+    if not rows:
         return np.zeros((0, *shape))
-    blocks = range(int(rows[0]) // _BLOCK, int(rows[-1]) // _BLOCK + 1)
+    blocks = range(rows[0] // _BLOCK, rows[-1] // _BLOCK + 1)
     numbers = np.concatenate([_block(kind, seed, block, shape) for block in blocks])
-    begin = int(rows[0]) - blocks[0] * _BLOCK
+    begin = rows[0] - blocks[0] * _BLOCK
     return numbers[begin : begin + len(rows)]
 
 

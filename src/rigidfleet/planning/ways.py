@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Any, cast
 
@@ -76,13 +77,14 @@ class _Search:
         self, mission: Mission, number: int, phase: Go, now: PhaseState, timed: Timed
     ) -> None:
         self.mission, self.number, self.phase, self.now, self.timed = mission, number, phase, now, timed  # fmt: skip
+        self.mistake = mistake = partial(error_of_key, mission, number)
         if now.formation is None or now.slots is None:
-            raise error_of_key(mission, number, "kind", "go", "needs a formation that flies there",
-                          "add a phase of kind 'establish' before")  # fmt: skip
+            remedy = "add a phase of kind 'establish' before"
+            raise mistake("kind", "go", "needs a formation that flies there", remedy)
         speed = float(np.linalg.norm(now.v, axis=1).max())
         if speed > _REST:
-            raise error_of_key(mission, number, "kind", "go", f"begins at {speed:.2g} m/s, but a way begins at rest",
-                          "end the phase before at rest")  # fmt: skip
+            problem = f"begins at {speed:.2g} m/s, but a way begins at rest"
+            raise mistake("kind", "go", problem, "end the phase before at rest")
         masses = mission.fleet.mass
         pose = now.goal
         T = np.eye(3) if pose is None else pose.T
@@ -137,7 +139,9 @@ class _Search:
             if lacking <= 0.0:
                 return mission
             need += lacking + _KEPT
-        raise self._unproved_error(lacking)
+        problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
+        remedy = "give more time, or ask for less clearance"
+        raise self.mistake("clearance", self.phase.clearance, problem, remedy)
 
     def _cheapest_way(self, need: float) -> tuple[Roadmap, Way]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
@@ -190,12 +194,8 @@ class _Search:
             low, high = points.min(axis=0), points.max(axis=0)
             ends = np.array([self.begin, self.end]) @ frame.T
             count = np.clip(np.ceil((high - low) / (2.0 * self.reach)), *_EVEN).astype(int)
-            common.append(
-                [
-                    np.unique([*np.linspace(low[k], high[k], count[k]), *ends[:, k]])
-                    for k in range(3)
-                ]
-            )
+            even = map(np.linspace, low, high, count)
+            common.append([np.unique([*a, *b]) for a, b in zip(even, ends.T, strict=True)])
         changes = list(layers.changes(self.mission, shapes, angles))
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = staying(nodes[0])
@@ -305,38 +305,28 @@ class _Search:
                     f" '{planned.phase}'"
                 )
             if thing.solid.moves and proved < need:
-                raise self._unmet()
+                problem = (
+                    f"ways are found round obstacles at rest, and on the one found {self._worst}"
+                )
+                remedy = "wait before by kind 'hold', or fly elsewhere first"
+                raise self.mistake("position", self.phase.position, problem, remedy)
         return need - least
 
     # -- what to say -----------------------------------------------------------------------------------
 
-    def _unmet(self) -> MissionError:
-        problem = f"ways are found round obstacles at rest, and on the one found {self._worst}"
-        return error_of_key(self.mission, self.number, "position", self.phase.position, problem,
-                       "wait before by kind 'hold', or fly elsewhere first")  # fmt: skip
-
-    def _unproved_error(self, lacking: float) -> MissionError:
-        problem = f"finds a way, but its proof lacks {lacking:.3f} m of clearance: {self._worst}"
-        return error_of_key(self.mission, self.number, "clearance", self.phase.clearance, problem,
-                       "give more time, or ask for less clearance")  # fmt: skip
-
     def _none(self, roadmap: Roadmap) -> MissionError:
         """What stands in the way, and how much is missing."""
+        mistake = partial(self.mistake, "position", self.phase.position)
         for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
-            x = roadmap.layers[layer]
-            room = roadmap.space.room(place + x.offsets, roadmap.radius)
-            if room.min() < roadmap.need:
-                agent, thing = self._nearest(roadmap, place, layer, room)
+            room, agent, thing = self._nearest(roadmap, place, layer)
+            if room < roadmap.need:
                 problem = (
-                    f"its {what} leaves agent {agent + 1} {room.min():.2f} m of clearance from {thing}, which is less"
+                    f"its {what} leaves agent {agent + 1} {room:.2f} m of clearance from {thing}, which is less"
                     f" than {self.phase.clearance:g} m"
                 )
-                return error_of_key(self.mission, self.number, "position", self.phase.position, problem,
-                               "move it, or ask for less clearance")  # fmt: skip
+                return mistake(problem, "move it, or ask for less clearance")
         least, place, layer = roadmap.widest((self.begin, 0), (self.end, self._last))
-        x = roadmap.layers[layer]
-        room = roadmap.space.room(place + x.offsets, roadmap.radius)
-        _, thing = self._nearest(roadmap, place, layer, room)
+        x, (_, _, thing) = roadmap.layers[layer], self._nearest(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
@@ -346,20 +336,16 @@ class _Search:
             or f"has {least:.2f} m of clearance from {thing}, {roadmap.need - least:.2f} m less than asked for"
         )
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
-        return error_of_key(
-            self.mission, self.number, "position", self.phase.position, problem, remedy
-        )
+        return mistake(problem, remedy)
 
-    def _nearest(
-        self, roadmap: Roadmap, place: Floats, layer: int, room: Floats
-    ) -> tuple[int, str]:
-        """The agent with the least room at a place, and what is nearest to it."""
-        x, agent = roadmap.layers[layer], int(room.argmin())
-        _, near = proximity.obstacle_clearances(
-            place + x.offsets, roadmap.radius, roadmap.space.obstacles
-        )
-        k = int(near[agent])
-        return agent, f"'{roadmap.space.obstacles[k].name}'" if k >= 0 else "the geofence"
+    def _nearest(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
+        """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
+        r, space = place + roadmap.layers[layer].offsets, roadmap.space
+        room = space.room(r, roadmap.radius)
+        _, near = proximity.obstacle_clearances(r, roadmap.radius, space.obstacles)
+        agent = int(room.argmin())
+        thing = f"'{space.obstacles[near[agent]].name}'" if near[agent] >= 0 else "the geofence"
+        return float(room[agent]), agent, thing
 
     def _gap(self, roadmap: Roadmap, place: Floats, layer: int) -> str:
         """What a shape needs in the gap between the two nearest obstacles; "" if they do not lie on two sides of it."""

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.files import replacing, why_not
-from rigidfleet.errors import ResultError
+from rigidfleet._common.files import write_file
 from rigidfleet.plotting.curves import (
     attitude,
     clearance,
@@ -270,23 +269,7 @@ def write_files(path: Path, drawn: Mapping[str, bytes]) -> list[Path]:
     paths = {kind: path.with_name(f"{path.name}.{kind}") for kind in drawn or FORMATS}
     for kind, there in paths.items():
         if drawn:
-            write(there, drawn[kind])
+            write_file(there, drawn[kind], parents=True)
         else:
             there.unlink(missing_ok=True)
     return list(paths.values()) if drawn else []
-
-
-def write(path: Path, data: bytes) -> None:
-    """Write a figure's file completely or not at all.
-
-    Raises
-    ------
-    ResultError
-        The file cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
-            file.write(data)
-    except OSError as error:
-        raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,10 +99,10 @@ def sketch(result: Result, falls: Floats) -> Figure:
         flat = places[result.left]
         ax.plot(*flat[:: 1 + len(flat) // _MOST].T, ".", markersize=2, color=colour, zorder=2)
         handles.append(st.legend_entry(what, linestyle="", marker="o", markersize=5, color=colour))
-    line = partial(st.legend_entry, color=st.ALERT, linewidth=1.1)
-    kinds = {fence.soft for fence in result.mission.fences}
-    handles += [line("fence")] if False in kinds else []
-    handles += [line("soft fence", linestyle=_SOFT)] if True in kinds else []
+    for soft in sorted({fence.soft for fence in result.mission.fences}):
+        look: dict[str, Any] = {"linestyle": _SOFT} if soft else {}
+        name = "soft fence" if soft else "fence"
+        handles.append(st.legend_entry(name, color=st.ALERT, linewidth=1.1, **look))
     if result.mission.people:
         handles.append(st.legend_entry("people", color=PEOPLE, linewidth=5.0, alpha=0.4))
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]")

@@ -53,13 +53,12 @@ def edge_groups(result: Result) -> list[EdgeGroup]:
         pairs = map(tuple, mission.formation_edges(name).tolist())
         for pair, d in zip(pairs, mission.formation_distances(name), strict=True):
             lengths[place[pair], f] = d
-    keys: dict[tuple[str, ...], list[int]] = {}
-    for k, row in enumerate(lengths):
-        keys.setdefault(
-            tuple(f"{d:.4g}" for d in row) + ((str(k),) if m <= SINGLE else ()), []
-        ).append(k)
     if m > st.MANY:
         return _groups_by_formation(result, lengths)
+    keys: dict[Any, list[int]] = {}
+    for k, row in enumerate(lengths):
+        key = k if m <= SINGLE else tuple(f"{d:.4g}" for d in row)
+        keys.setdefault(key, []).append(k)
     groups = list(keys.values())
     if m > SINGLE:
         groups.sort(key=lambda g: np.nan_to_num(lengths[g[0]], nan=0.0).tolist())
@@ -94,14 +93,13 @@ def _edge_label(result: Result, edges: list[int], lengths: Floats) -> str:
 def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> None:
     """A line for each edge, values (K, m), in the colour of its group; for many edges, the spread of each group."""
     for group in edge_groups(result):
+        of_group = values[:, group.edges]
         if len(result.edges) > st.MANY:
-            active = np.isfinite(result.constraint[:, group.edges])
-            st.draw_spread(
-                ax, result.time, np.where(active, values[:, group.edges], np.nan), group.colour
-            )
+            of_group = np.where(np.isfinite(result.constraint[:, group.edges]), of_group, np.nan)
+            st.draw_spread(ax, result.time, of_group, group.colour)
             continue
-        for k in group.edges:
-            st.draw_line(ax, result.time, values[:, k], color=group.colour, **look)
+        for x in of_group.T:
+            st.draw_line(ax, result.time, x, color=group.colour, **look)
 
 
 def edge_handles(result: Result) -> list[Line2D]:
@@ -145,32 +143,25 @@ def distances(result: Result) -> Figure:
     ax = axes[0, 0]
     draw_distances(ax, result)
     if len(result.edges):
-        title = "edge" if len(result.edges) <= SINGLE else ""
-        st.draw_legend(
-            ax, [*edge_handles(result), *_reference_handle(result.distance_reference)], title
-        )
+        handles = [*edge_handles(result), *_reference_handle(result.distance_reference)]
+        st.draw_legend(ax, handles, "edge" if len(result.edges) <= SINGLE else "")
     return fig
 
 
 # -- the formation as a whole --------------------------------------------------------------------------
 
 
+#: Flown and commanded values (K, 3), those of waypoints (time, [3]), names of the components and their unit.
+_Column = tuple[Floats, Floats, list[tuple[float, Any]], str, str]
 #: A waypoint.
 _RING: dict[str, Any] = {
     "linestyle": "", "marker": "o", "markersize": 5.5, "markerfacecolor": "white", "markeredgecolor": st.INK,
 }  # fmt: skip
 
 
-def _draw_components(
-    result: Result,
-    axes: Any,
-    flown: Floats,
-    wanted: Floats,
-    targets: list[tuple[float, Any]],
-    names: str,
-    unit: str,
-) -> None:
-    """A row for each of three components: flown and reference (K, 3), targets (time, [3])."""
+def _draw_components(result: Result, axes: Any, column: _Column) -> None:
+    """A row for each of three components."""
+    flown, wanted, targets, names, unit = column
     for i, (ax, name) in enumerate(zip(axes, names.split(), strict=True)):
         goals = np.array([goal[i] for _, goal in targets], dtype=float)
         st.draw_line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
@@ -178,11 +169,16 @@ def _draw_components(
         for t, goal in targets:
             ax.plot(t, goal[i], **_RING, markeredgewidth=1.0, zorder=4, clip_on=False)
         ax.set_ylabel(f"{name} [{unit}]")
-        if not st.note_if_still(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit):
-            widen_limits(ax, 0.1)
+        show_variation(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit)
 
 
-def widen_limits(ax: Axes, least: float) -> None:
+def show_variation(ax: Axes, values: Floats, unit: str) -> None:
+    """Note the value if it does not vary; else choose limits so that rounding errors do not fill the axes."""
+    if not st.note_if_still(ax, values, unit):
+        _widen_limits(ax, 0.1)
+
+
+def _widen_limits(ax: Axes, least: float) -> None:
     """Widen the limits so that rounding errors do not fill the axes."""
     low, high = ax.get_ylim()
     if high - low < least:
@@ -196,17 +192,15 @@ def _waypoint_values(result: Result, key: str) -> list[tuple[float, Any]]:
     return [(t, value) for t, value in values if value is not None and t <= result.time[-1] + 1e-9]
 
 
-#: Flown and commanded values (K, 3), those of waypoints (time, [3]), names of the components and their unit.
-_Column = tuple[Floats, Floats, list[tuple[float, Any]], str, str]
-
-
 def _body_figure(result: Result, title: str, *columns: _Column) -> Figure:
     """Components of the body's state in rows, lower ones where nothing changes; each column beside the other."""
-    still = [all(st.is_still(f[:, i], w[:, i]) for f, w, *_ in columns) for i in range(3)]
+    still = [
+        all(st.is_still(np.stack([f[:, i], w[:, i]])) for f, w, *_ in columns) for i in range(3)
+    ]
     shares = [_STILL_ROW if x else 1.0 for x in still]
     fig, axes = st.time_figure(result, title, 3, len(columns), height=1.5, shares=shares)
     for k, column in enumerate(columns):
-        _draw_components(result, axes[:, k], *column)
+        _draw_components(result, axes[:, k], column)
     entries = [st.legend_entry("flown", color=st.FLOWN, linewidth=2.4)]
     entries += _reference_handle(*(wanted for _, wanted, *_ in columns))
     entries += [st.legend_entry("waypoint", **_RING)] if any(c[2] for c in columns) else []
@@ -289,7 +283,7 @@ def inputs(result: Result) -> Figure:
     if not st.note_if_still(below, result.thrust, "N"):
         panel = Panel(below, result, result.thrust, "N", result.extreme("thrust"))
         panel.leave_out_final_peak()
-        widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
+        _widen_limits(below, min(0.1, 0.1 * peak_before_breakdown(result, result.thrust)))
         panel.mark_extremes()
     st.draw_agents_legend(above, result.n_agents)
     return fig
@@ -387,12 +381,8 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     if len(large):
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
         if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
-            st.annotate(
-                ax,
-                f"not drawn: below {_SMALLEST:g} m (rounding)",
-                st.corner_places()[::-1],
-                color=st.GREY,
-            )
+            words = f"not drawn: below {_SMALLEST:g} m (rounding)"
+            st.annotate(ax, words, st.corner_places()[::-1], color=st.GREY)
     else:
         ax.set_ylim(_SMALLEST, 1.0)
         st.write_note(ax, f"only rounding errors: at most {seen.max():.1g} m")
@@ -402,12 +392,10 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
 @st.in_style
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
-    fig, axes = st.time_figure(
-        result, "Constraint error, and shape error of all pairs against the slots", 1, height=3.6
-    )
+    title = "Constraint error, and shape error of all pairs against the slots"
+    fig, axes = st.time_figure(result, title, 1, height=3.6)
     ax = axes[0, 0]
-    handles = draw_error(ax, result)
-    if handles:
+    if handles := draw_error(ax, result):
         st.draw_legend(ax, [*handles, *(edge_handles(result) if len(result.edges) else [])])
     return fig
 
@@ -453,10 +441,9 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
         x = Extremum(float(values[k]), float(result.time[k]), *who[:2])
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
-    words = (
-        f"{x.value:.3g} m at {x.time:.2f} s, {st.clean_name(owner_name(result, q, x.who, x.other))}"
-    )
-    st.annotate(ax, words, st.places_around(x.time, x.value))
+    who = st.clean_name(owner_name(result, q, x.who, x.other))
+    places = st.places_around(x.time, x.value)
+    st.annotate(ax, f"{x.value:.3g} m at {x.time:.2f} s, {who}", places)
     low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)

@@ -45,8 +45,9 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
     ResultError
         The file's name does not end in .png, .svg or .pdf, or it cannot be written.
     """
+    from rigidfleet._common.files import write_file
     from rigidfleet.errors import ResultError
-    from rigidfleet.plotting import encode_figure, write
+    from rigidfleet.plotting import encode_figure
 
     if path.suffix not in _FORMATS:
         known = ", ".join(_FORMATS)
@@ -54,7 +55,7 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
             f"{path}: the name has no figure format. Give a name that ends in {known}."
         )
     (drawn,) = encode_figure(graphs(mission, judged), [path.suffix[1:]]).values()
-    write(path, drawn)
+    write_file(path, drawn, parents=True)
 
 
 def _draw_formation(

@@ -41,8 +41,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
         st.draw_reference(ax, result.time, wanted[:, i])
         handles.append(st.legend_entry(name, **look))
     _legend_above(ax, handles)
-    if not st.note_if_still(ax, np.concatenate([flown, wanted]), "deg"):
-        curves.widen_limits(ax, 0.1)
+    curves.show_variation(ax, np.concatenate([flown, wanted]), "deg")
 
 
 @st.in_style

@@ -34,8 +34,9 @@ def rotor_limits(mission: Mission) -> Floats:
 
 
 def has_rotors(result: Result) -> bool:
-    """Whether a vehicle with rotors flies."""
-    return result.rotor_force is not None and bool(np.isfinite(rotor_limits(result.mission)).any())
+    """Whether a vehicle with rotors flies, and what they give is known: a log beside its plan does not say it."""
+    known = result.rotor_force is not None and "doubt" not in result.statistics
+    return known and bool(np.isfinite(rotor_limits(result.mission)).any())
 
 
 def rotor_forces(result: Result) -> Floats:
@@ -103,17 +104,17 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
     if limits[i] < high + 0.3 * (high - low):
         st.draw_limit(ax, float(limits[i]), f"limit {limits[i]:.4g} N")
     ax.set_ylabel(f"rotors of agent {i + 1} [N]")
-    entries = [
-        st.legend_entry(name, color=colour)
-        for name, colour in zip(LABELS["rotor"], colours, strict=True)
-    ]
+    looks = zip(LABELS["rotor"], colours, strict=True)
+    entries = [st.legend_entry(name, color=colour) for name, colour in looks]
     st.draw_legend(ax, entries, "nearest to its limit")
 
 
 @st.in_style
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
-    saturated = _saturation_mask(result)
+    saturated = np.zeros(result.left.shape, dtype=np.bool_)
+    if result.saturated is not None and has_rotors(result):
+        saturated = (result.saturated != 0) & result.left
     shares = (1.0, 1.0, 0.6 if saturated.any() else _TEXT_ROW)
     title = "Tilt, tracking error and saturation of the vehicles"
     fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
@@ -149,13 +150,6 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
         top = max(ax.get_ylim()[1], 1.2 * limit)
         ax.set_ylim(-0.04 * top, top)
         st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
-
-
-def _saturation_mask(result: Result) -> Bools:
-    """Mask (K, N) of the vehicles that cannot give what is asked of them."""
-    if result.saturated is None:
-        return np.zeros(result.left.shape, dtype=np.bool_)
-    return (result.saturated != 0) & result.left
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:

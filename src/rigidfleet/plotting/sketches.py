@@ -81,12 +81,8 @@ def formations(result: Result) -> Figure:
         _draw_formation(fig, rect, result, name)
     if legend:
         entries = curves.edge_handles(result)
-        fig.legend(
-            handles=entries,
-            loc="lower center",
-            ncols=min(int(fig.get_figwidth() / 2.2), len(entries)),
-            borderaxespad=0.8,
-        )
+        columns = min(int(fig.get_figwidth() / 2.2), len(entries))
+        fig.legend(handles=entries, loc="lower center", ncols=columns, borderaxespad=0.8)
     return fig
 
 
@@ -163,15 +159,14 @@ def draw_graph(
 
     With the colour of each agent's light, it is night.
     """
+    from matplotlib.colors import to_rgb
+
     n = len(p)
     room = 1.25 * float(np.abs(p[:, :2]).max()) or 1.0
     ax.set(xlim=(-room, room), ylim=(-room, room), aspect="equal")
     ax.axis("off")
     if lights:
-        from matplotlib.patches import Rectangle
-
-        night: Any = {"facecolor": st.NIGHT, "linewidth": 0, "zorder": 0}
-        ax.add_patch(Rectangle((-room, -room), 2 * room, 2 * room, **night, gid="night"))
+        ax.axhspan(-room, room, facecolor=st.NIGHT, linewidth=0, zorder=0, gid="night")
     shown = lights or st.agent_colours(n)
     if n > st.MANY:
         _draw_mesh(ax, p, edges, colours, shown)
@@ -204,8 +199,9 @@ def draw_graph(
         x, y = p[i, :2]
         ax.plot(x, y, **marker_look(colour, size), zorder=5, gid=f"agent-{i + 1}")
         if size > 7:
+            light = float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
             ax.text(
-                x, y, str(i + 1), fontsize=0.6 * size, color=_letter_colour(colour), ha="center",
+                x, y, str(i + 1), fontsize=0.6 * size, color="white" if light < 0.6 else st.INK, ha="center",
                 va="center_baseline", zorder=6, fontweight="bold",
             )  # fmt: skip
 
@@ -216,9 +212,8 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Seque
     from matplotlib.colors import to_rgba_array
 
     depth = p[:, 2] - p[:, 2].min()
-    depth = (
-        0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if np.ptp(p[:, 2]) else 1 + 0 * depth
-    )
+    # All are as near as the nearest if none is deeper.
+    depth = 0.15 + 0.85 * depth / max(float(depth.max()), 1e-9) if depth.any() else 1.0 + depth
     if len(edges):
         near = depth[edges].mean(axis=1)
         order = np.argsort(near)
@@ -265,9 +260,3 @@ def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:
     along = b - a
     s = np.clip((points - a) @ along / max(float(along @ along), 1e-300), 0.0, 1.0)
     return np.linalg.norm(points - a - s[:, None] * along, axis=1)
-
-
-def _letter_colour(colour: str) -> str:
-    from matplotlib.colors import to_rgb
-
-    return "white" if float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114))) < 0.6 else st.INK

@@ -33,19 +33,21 @@ class DrawnObstacle:
     name: str
     zone: bool
     plain: bool  # whether it is a box along the axes, which is seen through
-    terrain: bool
     surface: Outline  # without motion
     at: Floats  # (M, 3) displacements at which it is drawn, in order of time [m]
     way: Floats  # (W, 3) displacements over the flight [m]
     grid: tuple[Floats, Floats, Floats] | None  # x, y and heights of a height map
 
     @property
+    def terrain(self) -> bool:
+        """Whether it is a height map."""
+        return self.grid is not None
+
+    @property
     def ends(self) -> Floats:
         """Lowest and highest corner (2, 3) [m] of all places at which it is drawn."""
         points = self.surface.triangles.reshape(-1, 3)
-        return np.array(
-            [points.min(axis=0) + self.at.min(axis=0), points.max(axis=0) + self.at.max(axis=0)]
-        )
+        return np.array([f(points, axis=0) + f(self.at, axis=0) for f in (np.min, np.max)])
 
 
 def drawn_obstacles(
@@ -67,15 +69,11 @@ def drawn_obstacles(
             way = places(solid, np.linspace(since, until, _WAY))
         grid = None
         if solid.kind[0] == HEIGHTS:
-            x, y = (
-                solid.origin[0, k] + np.linspace(0.0, solid.size[0, 3 + k], n)
-                for k, n in enumerate(solid.grid[0])
-            )
-            grid = x, y, solid.heights.reshape(solid.grid[0])
-        terrain = grid is not None
-        shape = DrawnObstacle(thing.name, thing.zone, plain, terrain, surface, at, way, grid)
-        near = (shape.ends[1] > low) & (shape.ends[0] < high)
-        if near.all():
+            (a, b), (wide, deep), (n, m) = solid.origin[0, :2], solid.size[0, 3:5], solid.grid[0]
+            x, y = a + np.linspace(0.0, wide, n), b + np.linspace(0.0, deep, m)
+            grid = x, y, solid.heights.reshape(n, m)
+        shape = DrawnObstacle(thing.name, thing.zone, plain, surface, at, way, grid)
+        if ((shape.ends[1] > low) & (shape.ends[0] < high)).all():
             near_obstacles.append(shape)
     return near_obstacles
 
@@ -131,6 +129,7 @@ def _face_colours(shape: DrawnObstacle, faces: Floats, colour: str, opacity: flo
 
 def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     """Draw an obstacle from above: its outline at each place, its way, contours of a height map, and its name."""
+    from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patches import Polygon
     from scipy.spatial import ConvexHull
 
@@ -139,25 +138,19 @@ def draw_from_above(ax: Axes, shape: DrawnObstacle) -> None:
     rim = flat[ConvexHull(flat).vertices]
     look: dict[str, Any] = {"facecolor": colour, "linewidth": 0, "zorder": 1}
     dashed: dict[str, Any] = {"fill": False, "edgecolor": colour, "linestyle": (0, (4, 2))}
+    dashed |= {"linewidth": 0.8, "zorder": 1.1}
     if shape.grid is not None:
         x, y, z = shape.grid
-        ax.contourf(x, y, z.T, 8, cmap=_height_colours(), alpha=0.5, zorder=0.8)
+        low_to_high = LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])
+        ax.contourf(x, y, z.T, 8, cmap=low_to_high, alpha=0.5, zorder=0.8)
         ax.contour(x, y, z.T, 8, colors=colour, linewidths=0.4, alpha=0.8, zorder=0.9)
     for at, share in zip(shape.at, _opacities(shape), strict=True):
         opacity = 0.0 if shape.terrain else 0.3 if not shape.zone else 0.1
         patch = ax.add_patch(Polygon(rim + at[:2], **look, alpha=opacity * float(share)))
         if shape.zone:
-            border = Polygon(rim + at[:2], **dashed, linewidth=0.8, alpha=float(share), zorder=1.1)
-            ax.add_patch(border)
+            ax.add_patch(Polygon(rim + at[:2], **dashed, alpha=float(share)))
     if len(shape.way) > 1:
         way = shape.way[:, :2] + rim.mean(axis=0)
         ax.plot(*way.T, color=colour, linewidth=1.0, linestyle=(0, (1, 1.5)), zorder=1.2)
     x, y = rim.mean(axis=0)[0], rim[:, 1].min()
     st.name_box(ax, patch, x + shape.at[-1, 0], y + shape.at[-1, 1], shape.name)
-
-
-def _height_colours() -> Any:
-    """Colours of a height map from its lowest to its highest."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("terrain", ["#F4F1EA", COLOUR])

@@ -54,11 +54,8 @@ def scene(result: Result) -> Scene:
     rows = np.flatnonzero(np.isfinite(r).all(axis=(1, 2)))
     thin = rows[st.spaced_indices(len(rows), _TRAIL if r.shape[1] <= st.MANY else _TRAIL // 10)]
     waypoints = _waypoints(result)
-    seen = np.concatenate(
-        [r[thin].reshape(-1, 3), *(w[1][None] for w in waypoints), np.zeros((0, 3))]
-    )
-    if not len(seen):
-        seen = np.zeros((1, 3))
+    seen = np.concatenate([r[thin].reshape(-1, 3), *(place[None] for _, place in waypoints)])
+    seen = seen if len(seen) else np.zeros((1, 3))
     low, high = seen.min(axis=0), seen.max(axis=0)
     near = float((high - low).max()) + 5.0
     if stands := mission.ground > low[2] - near:  # on a ground that is near
@@ -122,9 +119,10 @@ def _drawn_samples(result: Result, rows: Any) -> list[int]:
 
 
 def _edge_segments(result: Result, shots: list[int]) -> Floats:
-    """Edges active at samples as segments (n, 2, 3)."""
+    """Edges active at samples as segments (n, 2, 3); none of very many, which would hide everything."""
     drawn = [result.position[k][result.edges[np.isfinite(result.constraint[k])]] for k in shots]
-    return np.concatenate([np.zeros((0, 2, 3)), *drawn])
+    edges = np.concatenate([np.zeros((0, 2, 3)), *drawn])
+    return edges if len(edges) <= _LINES else edges[:0]
 
 
 # -- paths ---------------------------------------------------------------------------------------------
@@ -134,39 +132,34 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Draw paths, agents at the drawn samples, start, end and waypoints, in 2 or 3 axes."""
     for _, place in view.waypoints:
         ax.plot(*place[:axes, None], **_CROSS, zorder=7)
-    if has_lights(result):
-        for i in st.spaced_indices(result.n_agents, st.MANY):
-            path: dict[str, Any] = {"color": st.GREY, "linewidth": 0.4, "alpha": 0.3, "zorder": 3}
-            ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
-        r = result.position[view.shots, :, :axes].reshape(-1, axes)
+    n, night, shots = result.n_agents, has_lights(result), result.position[view.shots, :, :axes]
+    colours = [st.GREY] * n if night else st.agent_colours(n)
+    width, alpha = (0.4, 0.3) if night else (0.4, 0.5) if n > st.MANY else (0.8, 0.9)
+    for i in st.spaced_indices(n, st.MANY):
+        path: dict[str, Any] = {"color": colours[i], "linewidth": width, "alpha": alpha}
+        ax.plot(*view.paths[:, i, :axes].T, **path, zorder=3, gid=f"agent-{i + 1}")
+    if night:
         shown = lights(result, result.time[view.shots]).reshape(-1, 3)
         look: dict[str, Any] = {"depthshade": False} if axes == 3 else {}
+        r = shots.reshape(-1, axes)
         ax.scatter(*r.T, s=5, c=shown, linewidths=0, zorder=5, gid="lights", **look)
-        return
-    if result.n_agents > st.MANY:
-        _draw_many(ax, result, view, axes)
-        return
-    for i, colour in enumerate(st.agent_colours(result.n_agents)):
-        path: dict[str, Any] = {"color": colour, "linewidth": 0.8, "alpha": 0.9, "zorder": 3}
-        ax.plot(*view.paths[:, i, :axes].T, **path, gid=f"agent-{i + 1}")
-        r = result.position[view.shots, i, :axes].T
-        ax.plot(*r, **marker_look(colour, 3), zorder=5)
-        ax.plot(*r[:, :1], **marker_look(colour, 5, hollow=True), zorder=6, gid="start")
-        ax.plot(*r[:, -1:], **marker_look(colour, 5, marker="s"), zorder=6, gid="end")
+    elif n > st.MANY:
+        _draw_many(ax, shots, colours)
+    else:
+        for colour, r in zip(colours, shots.transpose(1, 2, 0), strict=True):
+            ax.plot(*r, **marker_look(colour, 3), zorder=5)
+            ax.plot(*r[:, :1], **marker_look(colour, 5, hollow=True), zorder=6, gid="start")
+            ax.plot(*r[:, -1:], **marker_look(colour, 5, marker="s"), zorder=6, gid="end")
 
 
-def _draw_many(ax: Axes, result: Result, view: Scene, axes: int) -> None:
-    """Draw paths of some of many agents, and all agents at the drawn samples."""
-    colours = np.array(st.agent_colours(result.n_agents))
-    for i in st.spaced_indices(result.n_agents, st.MANY):
-        ax.plot(*view.paths[:, i, :axes].T, color=colours[i], linewidth=0.4, alpha=0.5, zorder=3)
-    first, last = view.shots[0], view.shots[-1]
-    for k in view.shots:
-        r = result.position[k, :, :axes].T
-        hollow = k == first != last
+def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
+    """Draw many agents at places (K, N, axes); the first are hollow, the last squares."""
+    last = len(shots) - 1
+    for k, r in enumerate(shots):
+        hollow = k == 0 != last
         look: dict[str, Any] = {"c": "white" if hollow else colours, "edgecolors": colours}
         look |= {"marker": "s" if k == last else "o", "linewidths": 0.5 if hollow else 0.0}
-        ax.scatter(*r, s=4 if k in (first, last) else 3, **look, zorder=6 if hollow else 5)
+        ax.scatter(*r.T, s=4 if k in (0, last) else 3, **look, zorder=6 if hollow else 5)
 
 
 def marker_look(
@@ -200,12 +193,14 @@ def draw_space(
     low, high = view.low, view.high
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     _set_ticks(ax)
-    night = has_lights(result)
-    if night:
+    azimuth, elevation = _azimuth(view), _ELEVATION
+    if night := has_lights(result):
         ax.grid(visible=False)
         walls: tuple[Any, ...] = (ax.xaxis, ax.yaxis, ax.zaxis)
         for wall in walls:
             wall.set_pane_color(st.NIGHT)
+        azimuth, elevation = np.degrees(seen(result)) + [_ASIDE, 0.0]
+        elevation = min(max(elevation, _LOW), _HIGH)
     if view.ground and not night:
         flat = corners(low, high)[[0, 2, 6, 4]]
         flat[:, 2] = view.floor
@@ -216,7 +211,7 @@ def draw_space(
     shadow = np.full(len(view.centre), view.floor)
     ax.plot(*view.centre[:, :2].T, shadow, color=st.FAINT, linewidth=1.0, zorder=1)
     edges = _edge_segments(result, view.shots)
-    if 0 < len(edges) <= _LINES:
+    if len(edges):
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
     labels = {(name, x, y): z for name, (x, y, z) in view.waypoints}  # once above each other
@@ -225,11 +220,7 @@ def draw_space(
             x, y, z, f"  {name}", fontsize=7.5, zorder=8, va="bottom", parse_math=False,
             path_effects=st.halo(),
         )  # fmt: skip
-    if night:
-        azimuth, elevation = np.degrees(seen(result))
-        ax.view_init(min(max(elevation, _LOW), _HIGH), azimuth + _ASIDE)
-    else:
-        ax.view_init(_ELEVATION, _azimuth(view))
+    ax.view_init(elevation, azimuth)
     _fit_axes(fig, ax, view, rect)
     _name_axes(fig, ax, view)
     return ax
@@ -259,8 +250,8 @@ def _azimuth(view: Scene) -> float:
     candidates = sorted(range(-75, -14, 5), key=lambda a: abs(a + 55))
     if len(points) < 3:
         return candidates[0]
-    most = max(spread(a) for a in candidates)
-    return next(a for a in candidates if spread(a) >= 0.85 * most)
+    spreads = [spread(a) for a in candidates]
+    return next(a for a, x in zip(candidates, spreads, strict=True) if x >= 0.85 * max(spreads))
 
 
 def _on_screen(ax: Axes3D, points: Floats) -> Floats:
@@ -345,7 +336,6 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
         (x, y), size = fence.min[:2], np.subtract(fence.max, fence.min)
         ax.add_artist(Rectangle((x, y), *size[:2], **look, zorder=1, gid="geofence"))
     edges = _edge_segments(result, view.shots)[..., :2]
-    edges = edges if len(edges) <= _LINES else edges[:0]  # more would hide everything
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
     over: dict[tuple[float, float], list[str]] = {}

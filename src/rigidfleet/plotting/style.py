@@ -201,22 +201,20 @@ def draw_head(fig: Figure, result: Result, title: str) -> None:
 
 def draw_heading(fig: Figure, title: str, words: str, colour: str = GREY) -> None:
     """Title at the left, text at the right; without titles, only a warning text."""
-    top = 1 - _PAD / fig.get_figheight()
-    if not _shape.get()[0]:
-        if colour == ALERT:
-            look: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 9, "color": colour}
-            warning = fig.suptitle(words, x=0.988, parse_math=False, **look)
-            if fig.get_layout_engine() is None:
-                warning.set_y(top)
+    top, titles = 1 - _PAD / fig.get_figheight(), _shape.get()[0]
+    look: dict[str, Any] = {"va": "top", "parse_math": False}
+    beside: dict[str, Any] = look | {"ha": "right", "fontsize": 9, "color": colour}
+    if titles:
+        title = textwrap.fill(title, int(9 * fig.get_figwidth()))
+        above = fig.suptitle(title, x=0.012, ha="left", fontsize=11, fontweight="bold", **look)
+        if colour == ALERT or not is_narrow():
+            fig.text(0.988, top, words, **beside)
+    elif colour == ALERT:
+        above = fig.suptitle(words, x=0.988, **beside)
+    else:
         return
-    title = textwrap.fill(title, int(9 * fig.get_figwidth()))
-    title_text = fig.suptitle(
-        title, x=0.012, ha="left", va="top", fontsize=11, fontweight="bold", parse_math=False
-    )
     if fig.get_layout_engine() is None:  # a layout engine places it itself, clear of the axes
-        title_text.set_y(top)
-    words = words if colour == ALERT or not is_narrow() else ""
-    fig.text(0.988, top, words, ha="right", va="top", fontsize=9, color=colour, parse_math=False)
+        above.set_y(top)
 
 
 def draw_time_axis(ax: Axes, result: Result) -> None:
@@ -312,29 +310,28 @@ def place_words(fig: Any) -> None:
     engine = fig.get_layout_engine()
     if engine is not None:
         engine.execute(fig)
-    for ax in fig.axes:
-        labels = [(text, places) for text, places in fig.words if text.axes is ax]
-        waiting = {text for text, _ in labels}
-        for label, places in labels:
-            waiting.remove(label)
-            # Phase names stand outside; text without a place yet covers nothing.
-            others = [
-                text.get_window_extent() for text in ax.texts
-                if text is not label and text not in waiting and text.get_gid() != "phase"
-            ]  # fmt: skip
-            best, chosen = math.inf, places[0]
-            for place in places:
-                _move(label, place)
-                covered = _overlap_cost(ax, label.get_window_extent().padded(2 * _DOT), others)
-                if covered < best:
-                    best, chosen = covered, place
-                if not covered:
-                    break
-            _move(label, chosen)
-            if best >= _OUTSIDE:  # beside its place rather than off the page
-                box, page = label.get_window_extent(), ax.bbox
-                over = min(0.0, page.x1 - box.x1) or max(0.0, page.x0 - box.x0)
-                label.set_position((chosen[2][0] + 72.0 * over / fig.dpi, chosen[2][1]))
+    waiting = [text for text, _ in fig.words]
+    for label, places in fig.words:
+        waiting.remove(label)
+        ax = label.axes
+        # Phase names stand outside; text without a place yet covers nothing.
+        others = [
+            text.get_window_extent() for text in ax.texts
+            if text is not label and text not in waiting and text.get_gid() != "phase"
+        ]  # fmt: skip
+        best, chosen = math.inf, places[0]
+        for place in places:
+            _move(label, place)
+            covered = _overlap_cost(ax, label.get_window_extent().padded(2 * _DOT), others)
+            if covered < best:
+                best, chosen = covered, place
+            if not covered:
+                break
+        _move(label, chosen)
+        if best >= _OUTSIDE:  # beside its place rather than off the page
+            box, page = label.get_window_extent(), ax.bbox
+            over = min(0.0, page.x1 - box.x1) or max(0.0, page.x0 - box.x0)
+            label.set_position((chosen[2][0] + 72.0 * over / fig.dpi, chosen[2][1]))
 
 
 def _move(label: Annotation, place: Place) -> None:
@@ -353,8 +350,8 @@ def _overlap_cost(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
         else:
             n += bool(path.intersects_bbox(box, filled=False))
     for band in ax.collections:
-        for path in band.get_paths():
-            n += bool(band.get_transform().transform_path(path).intersects_bbox(box, filled=True))
+        paths = map(band.get_transform().transform_path, band.get_paths())
+        n += sum(bool(path.intersects_bbox(box, filled=True)) for path in paths)
     inside = ax.bbox.padded(_DOT)
     if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
         over = (inside.x0 - box.x0, box.x1 - inside.x1, inside.y0 - box.y0, box.y1 - inside.y1)
@@ -365,25 +362,21 @@ def _overlap_cost(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
 def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
     """If values do not vary, write the value into the axes; return whether this is so."""
     known = values[np.isfinite(values)]
-    if not len(known) or np.ptp(known) > STILL:
+    if not len(known) or not is_still(known):
         return False
     value = round(float(known.max() + known.min()) / 2, 3) + 0.0
     off = float(np.abs(known - value).max())
     caption = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
     ax.set_ylim(value - 1.0, value + 1.0)
     ax.set_yticks([value], [f"{value:.6g}"])
-    annotate(
-        ax,
-        caption,
-        [((0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom")],
-        color=GREY,
-    )
+    place: Place = (0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom"
+    annotate(ax, caption, [place], color=GREY)
     return True
 
 
-def is_still(*values: Floats) -> bool:
+def is_still(values: Floats) -> bool:
     """Whether all known values are the same, or none is known."""
-    known = np.concatenate([v[np.isfinite(v)] for v in values])
+    known = values[np.isfinite(values)]
     return not len(known) or float(np.ptp(known)) <= STILL
 
 
@@ -424,17 +417,6 @@ def draw_spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
     draw_line(ax, t, middle, color=colour, linewidth=1.4, zorder=2.1)
 
 
-def spread_handles(what: str, colour: str) -> list[Any]:
-    """Legend entries of `draw_spread`."""
-    from matplotlib.patches import Patch
-
-    return [
-        Patch(color=colour, alpha=0.25, linewidth=0, label=f"all {what}"),
-        Patch(color=colour, alpha=0.7, linewidth=0, label="nine in ten"),
-        legend_entry("median", color=colour, linewidth=1.4),
-    ]
-
-
 def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
     """A line for each agent, values (K, N), in its colour; the first ones are widest, so that all are visible.
 
@@ -452,11 +434,8 @@ def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
 
 def agent_handles(n: int, **look: Any) -> list[Line2D]:
     """Legend entries of the agents: all of them, or some evenly spread ones."""
-    colours = agent_colours(n)
-    entries = _ENTRIES if n <= MANY else 4
-    return [
-        legend_entry(f"agent {i + 1}", color=colours[i], **look) for i in spaced_indices(n, entries)
-    ]
+    colours, shown = agent_colours(n), spaced_indices(n, _ENTRIES if n <= MANY else 4)
+    return [legend_entry(f"agent {i + 1}", color=colours[i], **look) for i in shown]
 
 
 def draw_agents_legend(ax: Axes, n: int) -> None:
@@ -466,7 +445,16 @@ def draw_agents_legend(ax: Axes, n: int) -> None:
 
 def agent_line_handles(n: int) -> list[Any]:
     """What a legend has of `draw_agent_lines`."""
-    return agent_handles(n) if n <= MANY else spread_handles(f"{n} agents", FLOWN)
+    if n <= MANY:
+        return agent_handles(n)
+    from matplotlib.patches import Patch
+
+    look: dict[str, Any] = {"color": FLOWN, "linewidth": 0}
+    return [
+        Patch(**look, alpha=0.25, label=f"all {n} agents"),
+        Patch(**look, alpha=0.7, label="nine in ten"),
+        legend_entry("median", color=FLOWN, linewidth=1.4),
+    ]
 
 
 def spaced_indices(n: int, most: int) -> list[int]:
@@ -508,14 +496,13 @@ def _name_phases(axes: Sequence[Axes], result: Result) -> None:
     for a legend beside them.
     """
     axes = axes[: 1 if is_narrow() else None]
-    labels, fit = [], True
+    labels, over = [], 0.0
     for ax in axes:
         per_second = 0.8 * ax.bbox.width / float(np.diff(ax.get_xlim())[0])
         for name, start, end in _phase_spans(ax, result):
-            label = _label_phase(ax, clean_name(name, 60), start, end, fontsize=8)
-            fit = fit and label.get_window_extent().width <= per_second * (end - start)
-            labels.append(label)
-    if fit:
+            labels.append(_label_phase(ax, clean_name(name, 60), start, end, fontsize=8))
+            over = max(over, labels[-1].get_window_extent().width - per_second * (end - start))
+    if not over:
         return
     for label in labels:
         label.remove()

@@ -72,15 +72,8 @@ class AbortsCheck(Shown):
             takes = max(x.end - x.ordered for x in aborts)
             least = min(x.least.separation for x in aborts)
             worst = min((each for _, each in run if each), key=min, default=[])
-            yield Row(
-                (
-                    when,
-                    aborts[0].way,
-                    takes,
-                    least if np.isfinite(least) else None,
-                    self._unheard(worst),
-                )
-            )
+            apart = least if np.isfinite(least) else None
+            yield Row((when, aborts[0].way, takes, apart, self._unheard(worst)))
 
     def _unheard(self, each: list[Worst]) -> str:
         """What follows if a vehicle does not hear, in words."""

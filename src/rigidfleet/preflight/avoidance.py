@@ -44,10 +44,8 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
         for o in np.flatnonzero(a.sight.moves == 0):
             nearest = from_obstacle(r[i], stop[i], o, a.solids, np.nan, a.normal)
             if nearest[0] - a.reach[i] < worst:
-                worst, who = (
-                    nearest[0] - a.reach[i],
-                    f"agent {i + 1} and '{mission.obstacles[o].name}'",
-                )
+                worst = nearest[0] - a.reach[i]
+                who = f"agent {i + 1} and '{mission.obstacles[o].name}'"
     if who:
         text = (
             f"{who} cannot brake in time at the start: they would come {-worst:.2g} m nearer than [avoidance] keeps, so"

@@ -214,12 +214,10 @@ class FormationNetwork:
             f" ({self.own_delay * ms:.0f} ms)",
         ]
         if self.loss is not None:
-            most = (
-                f"up to {100 * self.loss:.0f} % of losses"
-                if self.loss < 0.95
-                else "with 95 % of losses"
+            most = f"up to {100 * self.loss:.0f}" if self.loss < 0.95 else "with 95"
+            parts.append(
+                f"stable in mean square {most} % of losses, its own are {100 * self.own_loss:.0f} %"
             )
-            parts.append(f"stable in mean square {most}, its own are {100 * self.own_loss:.0f} %")
         if self.growing is not None:
             parts.append(
                 f"errors grow in {100 * self.growing:.0f} % of sampled flights over its own network"
@@ -450,8 +448,7 @@ class Preflight(Shown):
 
     def _proof(self) -> Iterator[tuple[str, str]]:
         """The least of the certificates, and the phases that have none."""
-        certificates = self.certificates
-        if not certificates:
+        if not (certificates := self.certificates):
             return
         phase, least = min(certificates.items(), key=lambda item: item[1].separation)
         text = (
@@ -466,11 +463,8 @@ class Preflight(Shown):
     @property
     def certificates(self) -> dict[str, Certificate]:
         """Certificate of each planned phase that has one, by its name."""
-        return {
-            planned.phase: certificate
-            for planned in self.planned_phases
-            if (certificate := planned.certificate) is not None
-        }
+        each = ((planned.phase, planned.certificate) for planned in self.planned_phases)
+        return {name: certificate for name, certificate in each if certificate is not None}
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON, agents and slots counted from 1."""

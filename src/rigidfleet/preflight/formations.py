@@ -32,6 +32,7 @@ from rigidfleet.rigidity.realisations import lead_lengths
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
+_Held = Literal["tracking", "distances", "nothing"]
 #: Remarks on formations, by their text.
 _note, _fails = partial(Remark, "note", "formation"), partial(Remark, "fails", "formation")
 #: Maximum number of agents for which other shapes with the same distances are searched by default.
@@ -59,22 +60,11 @@ def check_formations(
     for k, name in enumerate(sorted(held, key=lambda name: held[name] == "nothing"), start=1):
         progress(f"formation '{name}', {k} of {len(held)}")
         work = _work_time(mission, name, search=search)
-        if k > 1 and work > left:
-            edges = mission.formation_edges(name)
-            method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
-            checks[name] = FormationCheck(name, None, held[name], method=method, skipped=True)
-        else:
-            left -= work
-            checks[name] = _formation_check(mission, name, held[name], search=search)
-    return [_with_spacing(mission, checks[name]) for name in mission.formations]
-
-
-def _with_spacing(mission: Mission, check: FormationCheck) -> FormationCheck:
-    """The check with what concerns a show: the spacing of the slots, and the lights."""
-    slots = mission.formation_slots(check.name)
-    spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
-    colours = len({*(mission.formation_colours(check.name) or ())})
-    return replace(check, spacing=spacing, colours=colours)
+        skipped = k > 1 and work > left
+        left -= 0.0 if skipped else work
+        check = _outline(mission, name, held[name], skipped=skipped)
+        checks[name] = check if skipped else _analysis(mission, check, search=search)
+    return [checks[name] for name in mission.formations]
 
 
 def _work_time(mission: Mission, name: str, *, search: bool) -> float:
@@ -85,31 +75,42 @@ def _work_time(mission: Mission, name: str, *, search: bool) -> float:
     return 0.1 * search + 5e-10 * min(m, 3 * n) ** 2 * max(m, 3 * n) + 2e-3
 
 
-def _formation_check(
-    mission: Mission, name: str, held: Literal["tracking", "distances", "nothing"], *, search: bool
-) -> FormationCheck:
+def _outline(mission: Mission, name: str, held: _Held, *, skipped: bool) -> FormationCheck:
+    """What needs no decomposition: the method, the spacing of the slots, and the lights."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
-    method = solvers.choose(mission.n_agents, edges, mission.constraint.solver)
+    spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
+    return FormationCheck(
+        name, None, held,
+        method=solvers.choose(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
+        spacing=spacing, colours=len({*(mission.formation_colours(name) or ())}),
+    )  # fmt: skip
+
+
+def _analysis(mission: Mission, check: FormationCheck, *, search: bool) -> FormationCheck:
+    """The check with the rigidity, or the spectrum of a large formation, and other shapes if they are searched."""
+    name = check.name
+    slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     if slots is None or not len(edges):
-        return FormationCheck(name, None, held, method=method)
+        return check
     masses, space = mission.agents.mass, mission.formations[name].dimension or mission.dimension
     if min(len(edges), 3 * mission.n_agents) > DENSE:
         start = _dimension_spanned(mission.fleet.position, centred(mission.fleet.velocity))
-        if held == "distances" and max(start, _dimension_spanned(slots)) == 2:
+        if check.held_by == "distances" and max(start, _dimension_spanned(slots)) == 2:
             space = 2  # which they do not leave
         points = flatten(slots, space)[0]
         ends = spectrum(points, edges, masses) if len(slots) <= LANCZOS else None
-        return FormationCheck(name, None, held, method=method, spectrum=ends)
+        return replace(check, spectrum=ends)
     rigidity = analyse(slots, edges, masses=masses, dimension=space)
+    check = replace(check, rigidity=rigidity)
     endless = rigidity.own.rigidity_class is RigidityClass.FLEXIBLE  # a continuum of other shapes
     if not search or endless or worst_contradiction(mission, name) is not None:
-        return FormationCheck(name, rigidity, held, method=method)
+        return check
     start, space = mission.agents.position, rigidity.own.space
     others = realisations(slots, edges, starts=STARTS, start=start, dimension=space)
-    return FormationCheck(name, rigidity, held, others, method)
+    return replace(check, realisations=others)
 
 
-def _held_by(mission: Mission, name: str) -> Literal["tracking", "distances", "nothing"]:
+def _held_by(mission: Mission, name: str) -> _Held:
     """What holds a formation in the phases that have it."""
     now, controls = None, set()
     for phase in mission.phases:

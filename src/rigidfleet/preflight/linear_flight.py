@@ -109,16 +109,17 @@ class LinearFlight:
         self._coupling *= 1.0 - np.eye(most)
         self._inverse = self._inverses(np.ones((self.n, most)), np.arange(self.n))
 
-        self._late, tick = lags[0].delay, radio.tick
-        waits = math.ceil(self._late / tick - 1e-9)
+        late, tick = lags[0].delay, radio.tick
+        #: Ticks from a measurement to its use.
+        self.waits = math.ceil(late / tick - 1e-9)
         orders = _ORDERS if any(not lag.point for lag in lags) else 2
         self._motion, self._early = (
-            _motion_over(t, lags, drag, orders) for t in (tick, waits * tick - self._late)
+            _motion_over(t, lags, drag, orders) for t in (tick, self.waits * tick - late)
         )
         #: Rows that are held and sent of each link, and number of links.
         self.shape = 1 + _REST + iterations, L
         self._shapes = {
-            "orders": (orders, n3), "seen": (waits, 2, n3), "estimate": (n3,), "gust": (n3,), "commanded": (n3,),
+            "orders": (orders, n3), "seen": (self.waits, 2, n3), "estimate": (n3,), "gust": (n3,), "commanded": (n3,),
             "error": (n3 * (self.law.ki > 0.0),), "held": self.shape,
         }  # fmt: skip
         self.size = sum(map(math.prod, self._shapes.values()))
@@ -161,25 +162,14 @@ class LinearFlight:
             y[who, :, flight] = (inverses @ each[who, :, flight, None])[..., 0]
         return y[self._at]
 
-    def drift(self, delay: int) -> Floats:
-        """Places and steady velocities of the whole formation, which no vehicle feels.
-
-        Of each, the state with the messages of ``delay`` ticks (size + ..., 2 t), as `fly` takes them.
-        """
+    def free_motions(self) -> Floats:
+        """States (size, 2 t) in the places and with the steady velocities of the whole formation; nothing is heard."""
         Q = rigid_motions(self.r)
         still, moving = np.hstack([Q, 0.0 * Q]), np.hstack([0.0 * Q, Q])
         x = np.zeros((self.size, still.shape[1]))
-        messages = np.zeros((delay, *self.shape, still.shape[1]))
-        z, tick, (own, _, _) = self.parts(x), self.radio.tick, self._maps
-        z.orders[:2], z.estimate[:] = (still, moving), moving
-        for waits, seen in enumerate(z.seen[::-1]):
-            seen[:] = still + (waits * tick - self._late) * moving, moving
-        for k, (_, *held) in enumerate((*messages, z.held)):
-            # Edges keep their lengths, so that both ends move alike along them.
-            before = still - ((delay - k) * tick + self._late) * moving
-            held[_PLACE][:], held[_VELOCITY][:] = -FRESH * (own @ before), -FRESH * (own @ moving)
-            held[_THEIR_VELOCITY][:] = own @ moving
-        return np.concatenate([x, messages.reshape(-1, x.shape[1])])
+        z = self.parts(x)
+        z.orders[:2], z.seen[:], z.estimate[:] = (still, moving), (still, moving), moving
+        return x
 
     def fly(
         self,

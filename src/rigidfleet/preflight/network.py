@@ -34,9 +34,12 @@ from rigidfleet.typing import Floats
 _LARGEST = 6_000
 #: Delays beyond this are not looked at [s].
 _LATEST = 2.0
-#: Time between two vectors of Arnoldi's method [s], their number, and the relative accuracy of the radius: with 1e-6,
-#: stresses that neither grow nor decay were taken to grow by up to 5e-3 a second.
-_PERIOD, _VECTORS, _ACCURACY = 0.4, 20, 1e-8
+#: Time between two vectors of Arnoldi's method [s], and their number.
+_PERIOD, _VECTORS = 0.4, 20
+#: Relative accuracy of the radius, and the growth [1/s] from which a motion then surely grows. Stresses that neither
+#: grow nor decay are nearly defective: their growth is wrong by the root of the accuracy, so that a rough search only
+#: says which delays are far from stable.
+_ROUGH, _FINE = (1e-3, 0.1), (1e-8, GROWTH)
 #: Losses that are tried first; the limit is then found to the hundredth.
 _LOSSES = (0.5, 0.8, 0.95)
 #: Time for which second moments move [s].
@@ -108,7 +111,7 @@ def _law_every(mission: Mission) -> int:
     return max(1, round(mission.autopilot.rate / mission.autopilot.formation_rate))
 
 
-def growth_at(flight: LinearFlight, delay: int) -> float:
+def growth_at(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]) -> float:
     """Greatest growth [1/s] of a motion if all messages arrive after ``delay`` ticks; about 0 at least.
 
     Free motions of the whole formation, and integrals of stresses that no vehicle feels, neither grow nor decay.
@@ -117,24 +120,33 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
 
     every, tick = flight.radio.every, flight.radio.tick
     ticks = max(1, round(_PERIOD / tick / every)) * every
-    messages = (delay, *flight.shape, 1)
+    messages = (delay, *flight.shape)
     size = flight.size + math.prod(messages)
-    drift = np.linalg.qr(flight.drift(delay))[0] if flight.is_free else np.zeros((size, 0))
+    drift = np.zeros((size, 0))
 
     def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
         return news(0) if (k - delay) % every == 0 else 0.0
 
+    def later(z: Floats, ticks: int, grip: Floats | None = None) -> Floats:
+        sent = z[flight.size :].reshape(*messages, -1).copy()
+        _, x = flight.fly(z[: flight.size], sent, ticks, delay, arrive, grip)
+        sent = np.roll(sent, -(ticks % delay), axis=0)
+        return np.concatenate([x, sent.reshape(-1, x.shape[1])])
+
     def period_later(z: Floats) -> Floats:
-        sent = z[flight.size :].reshape(messages).copy()
-        _, x = flight.fly(z[: flight.size].reshape(-1, 1), sent, ticks, delay, arrive)
-        z = np.concatenate([x.ravel(), np.roll(sent, -(ticks % delay), axis=0).ravel()])
+        z = later(z.reshape(-1, 1), ticks)[:, 0]
         return z - drift @ (drift.T @ z)  # motions of the whole formation are projected out
 
+    if flight.is_free:
+        # No vehicle feels them once all it holds is of them: until then, nobody pulls.
+        start = np.concatenate([x := flight.free_motions(), np.zeros((size - len(x), x.shape[1]))])
+        known = math.ceil((delay + every + flight.waits) / every) * every
+        drift = np.linalg.qr(later(start, known, np.zeros((len(flight.links), x.shape[1]))))[0]
     # No class of its own: what scipy declares of this one is not how it is made.
     operator: Any = LinearOperator((size, size), matvec=period_later, dtype=np.float64)  # ty: ignore[missing-argument, unknown-argument, parameter-already-assigned]
     try:
         values = eigs(
-            operator, 1, ncv=min(_VECTORS, size - 1), tol=_ACCURACY, return_eigenvectors=False,
+            operator, 1, ncv=min(_VECTORS, size - 1), tol=accuracy, return_eigenvectors=False,
             v0=np.random.default_rng(0).normal(size=size),
         )  # fmt: skip
     except ArpackNoConvergence as stopped:  # several motions grow alike
@@ -145,14 +157,21 @@ def growth_at(flight: LinearFlight, delay: int) -> float:
 def last_stable_delay(flight: LinearFlight) -> int:
     """Last delay in ticks at which no motion grows; 0 if there is none, or the last one that is looked at."""
     most = max(1, math.ceil(_LATEST / flight.radio.tick))
-    low, high = 0, min(flight.radio.delay, most)
-    while growth_at(flight, high) < GROWTH:
+    roughly = _last_delay(flight, min(flight.radio.delay, most), most, *_ROUGH)
+    return _last_delay(flight, roughly, roughly, *_FINE) if roughly else 0
+
+
+def _last_delay(flight: LinearFlight, first: int, most: int, accuracy: float, growth: float) -> int:
+    """Last delay in ticks up to ``most`` at which motions grow by less, looked for from ``first`` on."""
+    low, high = 0, first
+    while growth_at(flight, high, accuracy) < growth:
         if high == most:
             return most
         low, high = high, min(2 * high, most)
     while high - low > 1:
         middle = (low + high) // 2
-        low, high = (middle, high) if growth_at(flight, middle) < GROWTH else (low, middle)
+        stable = growth_at(flight, middle, accuracy) < growth
+        low, high = (middle, high) if stable else (low, middle)
     return low
 
 

@@ -36,10 +36,8 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     within = np.array(
         [[planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))] for planned in way]
     )
-    far = (
-        np.stack([_distance_bound(within, thing) for thing in mission.obstacles], axis=1)
-        - radius.max()
-    )
+    bounds = [_distance_bound(within, thing) for thing in mission.obstacles]
+    far = np.stack(bounds, axis=1) - radius.max()
     held, met, skipped = 0, 0, []
     unproved: dict[int, float] = {}
     paces = [pace(planned) for planned in way]

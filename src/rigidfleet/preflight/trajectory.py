@@ -50,12 +50,11 @@ def separation_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remar
             ends.append((float(separations[k]), float(planned.time[k]), tuple(pairs[k].tolist())))
         bent = len(planned.leg.reference.knots) and planned.path_ends is None and flying.all()
         if bent and (proved := planned.certificate) is not None:
-            ends = [(proved.separation, proved.time, proved.agents)]
+            ends = [proved[:3]]
         if planned.path_ends is not None:
             certificate = planned.certificate or straight(planned.leg.reference, radius)
             assert certificate is not None  # there are two agents
-            separation, who = certificate.separation, certificate.agents
-            crossing = separation, certificate.time, who
+            crossing, separation = certificate[:3], certificate.separation
             least = min(least, crossing)
             beyond = flying.all() and (separation <= 0 or separation < limit - SLACK)
             if beyond and separation < min(ends)[0] - SLACK:
@@ -128,12 +127,8 @@ def downwash_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         k = int(height.argmin())
         if height[k] < worst.get(planned.exact, (np.inf,))[0]:
             low, high = sorted(pair[k].tolist(), key=lambda i: planned.position[k, i, 2])
-            worst[planned.exact] = (
-                float(height[k]),
-                float(planned.time[k]),
-                (low, high),
-                planned.phase,
-            )
+            at = float(height[k]), float(planned.time[k])
+            worst[planned.exact] = *at, (low, high), planned.phase
     for exact, (height, t, (low, high), phase) in worst.items():
         text = f"agent {low + 1} is {max(height, 0.0):.2f} m below agent {high + 1} at {t:.2f} s in '{phase}'"
         if limit is None:
@@ -237,10 +232,8 @@ def _step_thrust(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     if c.stabilisation == "none":
         return
     limits = mission.fleet.thrust_limit
-    starts = [
-        mission.fleet.position,
-        *(planned.position[-1] for planned in preflight.planned_phases),
-    ]
+    ends = (planned.position[-1] for planned in preflight.planned_phases)
+    starts = [mission.fleet.position, *ends]
     for phase, r in zip(mission.phases, starts, strict=False):
         shaping = phase.shaping
         if shaping is None or shaping.reference != "step":
@@ -276,22 +269,17 @@ def waypoint_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
         if phase.control == "open" or goal is None or leg.arrival > leg.end:
             continue
         pose = pose_at(leg.motion, leg.arrival)
-        meets = {
-            "position": math.dist(pose.r, goal.r),
-            "velocity": math.dist(pose.v, goal.v),
-        }
         stays = phase.control == "tracking" and "position" not in phase.meets
-        meets = {what: off for what, off in meets.items() if stays or what in phase.meets}
+        ways = ("position", pose.r, goal.r), ("velocity", pose.v, goal.v)
+        meets = {x: math.dist(a, b) for x, a, b in ways if stays or x in phase.meets}
         if "attitude" in phase.meets and mission.n_agents > 1:
             turn = att.rotation_vector_from_dcm(pose.T @ goal.T.T)
             # As flown: agents on a line do not show how it spins.
             state = slot_derivatives(leg.reference, leg.motion, np.array([leg.arrival]), 2)[0]
             x, y = (about_cm(part, masses)[None] for part in state)
             spin = pose.T @ mean_axis_rates(x, y, masses)[0] - goal.omega
-            meets |= {
-                "attitude": math.degrees(np.linalg.norm(turn)),
-                "rates": math.degrees(np.linalg.norm(spin)),
-            }
+            turns = ("attitude", turn), ("rates", spin)
+            meets |= {what: math.degrees(np.linalg.norm(x)) for what, x in turns}
         for what, off in meets.items():
             if off > (1.0 + _CLEARLY) * WAYPOINT_TOLERANCE[what]:
                 yield _miss_remark(mission, planned, what, off, exact=exact)
@@ -346,19 +334,15 @@ def _limits_of_reference(
 ) -> Iterator[Remark]:
     """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
     over = timing.broken(mission, planned.leg)
-    if not over or over[0].limit.of.name_in_words in hopeless:
+    if not over or (topic := over[0].limit.of.name_in_words) in hopeless:
         return
     key, least = timing.least_time(mission, planned.leg)
     if least is None:
         remedy = f"no {key} of this phase keeps all limits"
-        hopeless.add(over[0].limit.of.name_in_words)
+        hopeless.add(topic)
     else:
         remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
-    yield Remark(
-        "fails",
-        over[0].limit.of.name_in_words,
-        f"{timing.said(over[0], planned.leg.phase)}; {remedy}",
-    )
+    yield Remark("fails", topic, f"{timing.said(over[0], planned.leg.phase)}; {remedy}")
 
 
 def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:

@@ -53,12 +53,8 @@ def report(
         ``results`` holds what is neither a flight nor a path.
     """
     target = as_path(path)
-    write_file(
-        target,
-        html_page(
-            results, labels=labels, verdicts=verdicts, rehearsed=rehearsed, abort=abort
-        ).encode(),
-    )
+    page = html_page(results, labels=labels, verdicts=verdicts, rehearsed=rehearsed, abort=abort)
+    write_file(target, page.encode())
 
 
 def html_page(
@@ -66,10 +62,9 @@ def html_page(
     *,
     labels: Sequence[str] | None = None,
     verdicts: Sequence[Verdict] | None = None,
-    rehearsed: Sequence[str] = (),
-    abort: Sequence[str] = (),
+    **beside: Sequence[str],
 ) -> str:
-    """The page that `report` writes."""
+    """The page that `report` writes; ``beside`` are what was rehearsed, and how the flight is aborted."""
     from rigidfleet._common.templates import templates
     from rigidfleet.reporting.contents import contents
     from rigidfleet.web.policy import content_policy
@@ -82,7 +77,7 @@ def html_page(
     environment = templates("rigidfleet.reporting")
     style = environment.get_template("style.css").render()
     return environment.get_template("page.html").render(
-        contents(flights, labels, verdicts, rehearsed=rehearsed, abort=abort),
+        contents(flights, labels, verdicts, **beside),
         policy=content_policy(style=style),
         style=style,
     )

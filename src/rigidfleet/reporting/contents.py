@@ -65,6 +65,8 @@ def contents(
     # Trajectories that others made have no gains.
     controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
     response = overlay.response(missions, names) if controlled else None
+    # The summary has its own page.
+    drawn = [name for name in plotting.figure_names(flights[0]) if name != "summary"]
     first: dict[str, Any] = {"brief": [], "sketch": None}
     if not several:
         falls = falls_of(flights[0])
@@ -75,7 +77,7 @@ def contents(
         "several": several,
         "flights": pages,
         **first,
-        "figures": [] if several else _figures(flights[0]),
+        "figures": [] if several else [_figure(flights[0], name) for name in drawn],
         "passed": all(verdict.passed for verdict in judged),
         "safety": _safety_table(flights, judged, names),
         "numbers": _numbers_table(flights, judged, names) if several else None,
@@ -328,11 +330,6 @@ def _flat_keys(data: Any, key: str = "") -> Iterator[tuple[str, str]]:
 
 
 # -- figures -----------------------------------------------------------------------------------------
-
-
-def _figures(result: Result) -> list[dict[str, str]]:
-    """All figures except the summary, which has its own page."""
-    return [_figure(result, name) for name in plotting.figure_names(result) if name != "summary"]
 
 
 def _figure(result: Result, name: str) -> dict[str, str]:

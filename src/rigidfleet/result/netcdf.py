@@ -105,19 +105,13 @@ def file_content(
     buffer = io.BytesIO()
     with h5netcdf.File(buffer, "w") as file:
         file.dimensions = sizes
-        file.attrs.update(
-            {
-                "Conventions": "CF-1.11",
-                "title": "flight of a virtual rigid body formation",
-                _MARK: SCHEMA_VERSION,
-            }
-        )
+        file.attrs["Conventions"] = "CF-1.11"
+        file.attrs["title"] = "flight of a virtual rigid body formation"
+        file.attrs[_MARK] = SCHEMA_VERSION
         for name, kind in ATTRIBUTES.items():
             # Attributes can be text or numbers, but not dict, bool or None: those are stored as JSON.
-            value = attributes[name]
-            file.attrs[_attribute_name(name)] = (
-                kind(value) if kind in (int, str) else plain_text(value)
-            )
+            plain = kind if kind in (int, str) else plain_text
+            file.attrs[_attribute_name(name)] = plain(attributes[name])
         for name, names in labels.items():
             names_along = file.create_variable(name, (name,), text)
             if names:

@@ -132,10 +132,6 @@ def _boundary(result: Result, name: str) -> tuple[Any, ...]:
     return without_lost(result, values), lambda k, i: (i, int(number[k, i]))
 
 
-def _altitude(result: Result) -> tuple[Floats, ...]:
-    return (without_lost(result, result.position[..., 2]),)
-
-
 def _tilt(result: Result) -> tuple[Floats, ...]:
     """Tilt (K, N) [deg] of each vehicle; of points, of the thrust that the slots they track need."""
     q, wanted = result.vehicle_attitude, result.slot_acceleration
@@ -171,8 +167,7 @@ SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     "lost": _distance_to_lost,
     "geofence": _beyond_fence,
     **{name: partial(_boundary, name=name) for name in ("fence", "soft_fence", "people")},
-    "lowest": _altitude,
-    "highest": _altitude,
+    **dict.fromkeys(("lowest", "highest"), lambda r: (without_lost(r, r.position[..., 2]),)),
     "thrust": _thrust,
     "tilt": _tilt,
     "tracking_error": lambda r: (without_lost(r, length(r.position - r.slot_position)),),

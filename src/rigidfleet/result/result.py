@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import InitVar, asdict, dataclass, field, fields
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from importlib.metadata import PackageNotFoundError, version
-from inspect import Parameter, Signature
-from itertools import pairwise
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, get_type_hints
 
@@ -50,10 +49,6 @@ def _installed_versions() -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return versions
-
-
-def _timestamp() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -232,7 +227,7 @@ class Result(Shown):
     statistics: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=lambda: dict(_installed_versions()))
     platform: str = field(default_factory=platform.platform)
-    created: str = field(default_factory=_timestamp)
+    created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     def __post_init__(self, later: Later) -> None:
         values = self.__dict__
@@ -240,19 +235,17 @@ class Result(Shown):
         for name in self._later:
             del values[name]
         sizes: dict[str, int] = dict(_LABELLED)
-        for key, dims in (
-            ("time", ("time",)),
-            ("position", ("time", "agent")),
-            ("edges", ("edge",)),
-        ):
-            if isinstance(values[key], np.ndarray):
-                sizes.update(zip(dims, values[key].shape, strict=False))
-        for name in [name for name in values if name in _CHECKED]:
+        for name in "time", "position", "edges":
+            if isinstance(array := values[name], np.ndarray):
+                pairs = zip(VARIABLES[name].dims, array.shape, strict=False)
+                sizes.update(pair for pair in pairs if pair[0] not in _LABELLED)
+        for name in [name for name in values if name in VARIABLES]:
             value = values[name]
             if value is not None or not VARIABLES[name].optional:
                 self._set(name, value, sizes)
         if not later:  # what a flight of this process has made is right
             self._check(sizes)
+        self._sizes = sizes
 
     def _check(self, sizes: dict[str, int]) -> None:
         """Check values: they come from somewhere else."""
@@ -275,17 +268,16 @@ class Result(Shown):
             if who is not None and who.size and not least <= who.min() <= who.max() < n:
                 raise ValueError(f"{name} has agents outside {least} to {n - 1}")
         agents, rotors = range(n), range(4)
-        for phase in self.phases:
-            for name, x in phase.extremes.items():
-                # A clearance names an obstacle, a rotor's force its rotor
-                if name == "rotor_force":
-                    alone = x.other not in rotors
-                else:
-                    alone = not (-1 <= x.other < n and x.other != x.who)
-                    alone = alone and quantity(name).who not in PLACES
-                if alone or x.who not in agents:
-                    raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
-        for name in _QUATERNIONS:
+        for name, x in self._extremes():
+            # A clearance names an obstacle, a rotor's force its rotor
+            if name == "rotor_force":
+                alone = x.other not in rotors
+            else:
+                alone = not (-1 <= x.other < n and x.other != x.who)
+                alone = alone and quantity(name).who not in PLACES
+            if alone or x.who not in agents:
+                raise ValueError(f"extreme {name} must name different agents from 0 to {n - 1}")
+        for name in (name for name, v in VARIABLES.items() if "quaternion" in v.dims):
             q = values.get(name)  # most have a scalar part, which is found in a fifth of the time
             if q is not None and not q[..., 0].all() and not q.any(axis=-1).all():
                 raise ValueError(f"{name} has a quaternion of norm zero")
@@ -294,8 +286,10 @@ class Result(Shown):
 
     def _set(self, name: str, array: Any, sizes: dict[str, int]) -> None:
         """Set an array whose dimensions agree with ``sizes``, which learns new ones."""
-        dims, dtype = _CHECKED[name]
-        value = np.ascontiguousarray(array, dtype=dtype)
+        dims = VARIABLES[name].dims
+        value = np.ascontiguousarray(
+            array, dtype=np.int64 if VARIABLES[name].integers else np.float64
+        )
         expected = tuple([sizes.get(dim, "any") for dim in dims])
         known = [sizes.setdefault(*pair) for pair in zip(dims, value.shape, strict=False)]
         if value.ndim != len(dims) or (*known,) != value.shape:
@@ -311,16 +305,11 @@ class Result(Shown):
             if name in self.__dict__:  # another thread has just made it
                 return self.__dict__[name]
             raise AttributeError(f"a result has no {name!r}")
-        sizes = _LABELLED | {
-            "time": len(self.time),
-            "agent": self.n_agents,
-            "edge": len(self.edges),
-        }
         made = make()
         for key, value in made.items():
             if key in self._later and key not in self.__dict__:  # nor has somebody set it
                 if key in VARIABLES:
-                    self._set(key, value, sizes)
+                    self._set(key, value, self._sizes)
                 else:
                     setattr(self, key, value)
         # Another one, as a copy of this result may have to make the same.
@@ -414,13 +403,9 @@ class Result(Shown):
             return "the file has spans of other agents"
         if not np.array_equal(mission.edges, self.edges):
             return "the edges of its formations differ from those of the arrays"
-        named = [
-            x.other for p in self.phases for n, x in p.extremes.items() if n.startswith("clear")
-        ]
-        obstacles = range(len(mission.obstacles))
-        if self.clearance_obstacle.max() >= max(len(obstacles), 1) or not set(named) <= set(
-            obstacles
-        ):
+        named = [x.other for key, x in self._extremes() if key.startswith("clear")]
+        n = len(mission.obstacles)
+        if self.clearance_obstacle.max() >= max(n, 1) or not {*named} <= {*range(n)}:
             return "the arrays name more obstacles than it has"
         if unknown := {p.kind for p in self.phases} - {*KINDS}:
             return f"there is no kind of phase {min(map(repr, unknown))}"
@@ -455,12 +440,9 @@ class Result(Shown):
         over = over - self.mission.height_at(*np.moveaxis(self.position, 2, 0))
         down = self.left & (over <= PAD)
         for i, phase in enumerate(self.phases):
-            k = self.samples(i).stop - 1
-            if (
-                KINDS[phase.kind].lands
-                and k >= self.samples(i).start
-                and self.time[k] >= phase.t_end
-            ):
+            rows = self.samples(i)
+            k = rows.stop - 1
+            if KINDS[phase.kind].lands and k >= rows.start and self.time[k] >= phase.t_end:
                 off = np.where(down[k:].all(axis=0), np.minimum(off, self.time[k]), off)
         return off
 
@@ -473,12 +455,17 @@ class Result(Shown):
         first, last = np.searchsorted(self.phase, [index, index + 1])
         return slice(int(first), int(last))
 
+    def _extremes(self) -> Iterator[tuple[str, Extremum]]:
+        """Names and worst values of all phases."""
+        for phase in self.phases:
+            yield from phase.extremes.items()
+
     def extreme(self, name: str) -> Extremum | None:
         """Worst value of a quantity over the whole flight, in continuous time; None if unknown.
 
         Names are those of `PhaseRecord.extremes`.
         """
-        every = [p.extremes[name] for p in self.phases if name in p.extremes]
+        every = [x for key, x in self._extremes() if key == name]
         rank = quantity(name).rank
         return max(every, key=lambda x: rank(x.value), default=None)
 
@@ -515,8 +502,9 @@ class Result(Shown):
         except MemoryError as error:
             raise ResultError(f"{path}: there is not enough memory to read this result.") from error
         except Exception as error:  # a damaged file can cause almost any error
+            why = " ".join(str(error).split()) or type(error).__name__
             raise ResultError(
-                f"{path}: the result is damaged ({_one_line(error)}). Fly its mission again or use another copy."
+                f"{path}: the result is damaged ({why}). Fly its mission again or use another copy."
             ) from error
 
     def setpoints(self, rate: float | None = None, *, flown: bool = False) -> Setpoints:
@@ -538,23 +526,15 @@ class Result(Shown):
 
     def motion(self, *, flown: bool = False) -> Setpoints:
         """The setpoints of every sample, of which there are two at a change of phase; see `setpoints`."""
-        references = [
-            self.slot_position,
-            self.slot_velocity,
-            self.slot_acceleration,
-            self.slot_jerk,
-        ]
+        references = self.slot_position, self.slot_velocity, self.slot_acceleration, self.slot_jerk
         nothing = np.full(self.position.shape, np.nan)
         state = np.stack([nothing if x is None else x for x in references], axis=1)
         if flown:
             motion = self.position, self.velocity, self.acceleration
             # Forces jump where two samples have one time: at a change of phase and at a loss.
             jumps = np.flatnonzero(np.nextafter(self.time[:-1], np.inf) >= self.time[1:]) + 1
-            ends = [0, *jumps.tolist(), len(self.time)]
-            parts = [slice(*pair) for pair in pairwise(ends)]
-            state = np.concatenate(
-                [states_of_motion(*(x[part] for x in (*motion, self.time))) for part in parts]
-            )
+            parts = zip(*(np.split(x, jumps) for x in (*motion, self.time)), strict=True)
+            state = np.concatenate([states_of_motion(*part) for part in parts])
         yaw = [nothing[:, :, 0] if x is None else x for x in (self.yaw, self.yaw_rate)]
         return Setpoints(self.time, state, *yaw)
 
@@ -575,14 +555,8 @@ class Result(Shown):
         write_file(as_path(path), csv_text(self.setpoints(rate, flown=flown)).encode())
 
 
-#: Signature that `help` shows first. The forty arrays are left out: their units stand at their declarations.
-_FIELDS = [
-    Parameter("self", Parameter.POSITIONAL_ONLY),
-    Parameter("fields", Parameter.VAR_KEYWORD),
-]
-
-
-vars(Result.__init__)["__signature__"] = Signature(_FIELDS)
+# `help` shows this signature first. The forty arrays are left out: their units stand at their declarations.
+vars(Result.__init__)["__signature__"] = signature(lambda self, **fields: None)
 
 
 _HINTS = get_type_hints(Result, include_extras=True)
@@ -620,14 +594,6 @@ for _name in (*LATER, *SEEN, "disturbance_force"):
     delattr(Result, _name)
 
 
-#: Dimensions and type of each array, by name, and the arrays of quaternions.
-_CHECKED = {
-    name: (v.dims, np.dtype(np.int64 if v.integers else np.float64))
-    for name, v in VARIABLES.items()
-}
-_QUATERNIONS = [name for name, v in VARIABLES.items() if "quaternion" in v.dims]
-
-
 def presence(time: Floats, spans: Sequence[Sequence[float]], n: int) -> Bools:
     """Mask (K, N) of n agents that are there at times (K,) [s], each after the begin of its span and up to its end [s].
 
@@ -652,7 +618,3 @@ def as_result(value: Result | str | Path) -> Result:
     if isinstance(value, str | Path):
         return Result.load(value)
     raise wrong_type("a flight (a Result or the path of one that was saved)", value)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

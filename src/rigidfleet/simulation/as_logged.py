@@ -268,11 +268,8 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
     grid = np.arange(begin, end, _NEAR if mission.obstacles else np.inf)
     records = []
     for record in plan.phases[: at_phase[-1] + 1]:
-        since, until, extremes = (
-            max(record.t_start, begin),
-            min(record.t_end, end),
-            dict[str, Extremum](),
-        )
+        since, until = max(record.t_start, begin), min(record.t_end, end)
+        extremes: dict[str, Extremum] = {}
         if until - since > 1e-9:
             fastest = watch_curve(watch, way.between(since, until), grid, spans)
             extremes = watch.phase() | fastest

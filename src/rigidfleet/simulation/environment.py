@@ -83,13 +83,9 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         Flight(self.mission, agent=self._act)  # or it says why not
         net, self.dt = network_of(self.mission), 1.0 / self.mission.autopilot.formation_rate
         #: Neighbours of each vehicle, in the order of an observation.
-        self.neighbours = [
-            net.links[slice(*net.first[i : i + 2]), 1].tolist()
-            for i in range(len(self.possible_agents))
-        ]
-        most = max(map(len, self.neighbours))
+        self.neighbours = [x.tolist() for x in np.split(net.links[:, 1], net.first[1:-1])]
         self.width = _NEIGHBOUR + numbers
-        self.size = _SELF + most * self.width
+        self.size = _SELF + max(map(len, self.neighbours)) * self.width
         self.observation_spaces = {
             name: Box(-np.inf, np.inf, (self.size,), np.float32) for name in self.possible_agents
         }
@@ -139,17 +135,13 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         flight, self._actions, self.ticks = self.flight, actions, self.ticks + 1
         active, until, goes_on = flight.under_way(), self.ticks * self.dt, True
         while goes_on and flight.t < until - _SAME:
-            active = flight.under_way()
             goes_on = flight.advance(until - flight.t) or flight.begin()
-        if goes_on:
-            active = flight.under_way()
+            active = flight.under_way() if goes_on else active
         observations, rewards = self._observations(active), self._rewards(active)
         failed = {name: bool(flight.ending) or name not in observations for name in self.agents}
         over = dict.fromkeys(self.agents, not goes_on and not flight.ending)
-        last, self.agents = (
-            self.agents,
-            [name for name in self.agents if goes_on and not failed[name]],
-        )
+        last = self.agents
+        self.agents = [name for name in last if goes_on and not failed[name]]
         none = np.zeros(self.size, dtype=np.float32)  # of one that is lost
         return (
             {name: observations.get(name, none) for name in last}, {name: rewards[name] for name in last},

@@ -109,32 +109,26 @@ class OwnLaws:
             A law raised an exception, or did not return a force and a message. It names the vehicle and the tick.
         """
         said: list[Any] = [None] * len(self.laws)
+        k = int(state.count[TICKS])
+        where = f"at tick {k}, t = {k * self.tick:.3f} s"
         for i, view in enumerate(self.views(phase, problem, w, flight, state)):
             if view is None:
                 continue
             try:
                 answer = self.laws[i](view)
             except Exception as error:
-                raise self._failure(
-                    i, f"raised {type(error).__name__}", str(error), state
-                ) from error
+                what = f"the law of agent {i + 1} raised {type(error).__name__} {where}: {error}"
+                raise FlightError(what) from error
             try:
-                force, message = answer
-            except (TypeError, ValueError):
-                more = "return a force (3,) [N] and a message"
-                raise self._failure(i, f"returned {answer!r}", more, state) from None
-            state.f_u[i] = self._force(i, force, state)
-            try:
-                said[i], numbers = (None, 0) if message is None else plain_copy(message)
-            except TypeError as error:
-                remedy = f"it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
-                raise self._failure(
-                    i, "returned a message that cannot be sent", remedy, state
-                ) from None
+                state.f_u[i], said[i], numbers = _answer_of(answer)
+            except _AnswerError as unfit:
+                what, remedy = unfit.args
+                what = f"the law of agent {i + 1} returned {what} {where}: {remedy}"
+                raise FlightError(what) from None
             self.numbers = max(self.numbers, numbers)
-            state.mail.mute[i] = message is None
+            state.mail.mute[i] = said[i] is None
         self.said.append(said)
-        state.count[ANSWERED] = state.count[TICKS] + 1
+        state.count[ANSWERED] = k + 1
 
     def views(
         self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
@@ -164,7 +158,8 @@ class OwnLaws:
                     self.newest[l] = written, content
                 if written >= 0:
                     inbox[j] = Message(content, (k - written) * self.tick)
-            rotors = () if self.points[i] else np.split(state.S[i, 6:].copy(), (4, 7))
+            body = state.S[i, 6:].copy()
+            rotors = () if self.points[i] else (body[:4], body[4:7], body[7:])
             r, v, r_ref, v_ref, a_ref = known[i].copy()
             views[i] = View(
                 i, t, dt, phase, masses[i], g, r, v, r_ref, v_ref, a_ref, {j: d[l] for l, j in links if has_edge[l]},
@@ -173,26 +168,34 @@ class OwnLaws:
         self.last = k, problem, views
         return views
 
-    def _force(self, i: int, force: ArrayLike, state: SampledState) -> Floats:
-        try:
-            f = np.array(force)
-        except (TypeError, ValueError):
-            f = np.array(None)
-        if f.dtype.kind not in "biuf":
-            what, more = f"the force {force!r}", _FORCE
-        elif f.shape != (3,):
-            what, more = f"a force of shape {f.shape}", _FORCE
-        elif not all(map(math.isfinite, f.tolist())):
-            what, more = "a force that is not finite", str(f.tolist())
-        else:
-            return f
-        raise self._failure(i, f"returned {what}", more, state)
 
-    def _failure(self, i: int, what: str, more: str, state: SampledState) -> FlightError:
-        k = int(state.count[TICKS])
-        return FlightError(
-            f"the law of agent {i + 1} {what} at tick {k}, t = {k * self.tick:.3f} s: {more}"
+class _AnswerError(Exception):
+    """What a law returned cannot be flown: what it was, and the remedy."""
+
+
+def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
+    """Force (3,) [N] of what a law returned, a copy of its message, and how many numbers that has."""
+    try:
+        force, message = answer
+    except (TypeError, ValueError):
+        raise _AnswerError(repr(answer), "return a force (3,) [N] and a message") from None
+    try:
+        f = np.array(force)
+    except (TypeError, ValueError):
+        f = np.array(None)
+    if f.dtype.kind not in "biuf":
+        raise _AnswerError(f"the force {force!r}", _FORCE)
+    if f.shape != (3,):
+        raise _AnswerError(f"a force of shape {f.shape}", _FORCE)
+    if not all(map(math.isfinite, f.tolist())):
+        raise _AnswerError("a force that is not finite", f.tolist())
+    try:
+        return f, *((None, 0) if message is None else plain_copy(message))
+    except TypeError as error:
+        remedy = (
+            f"it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
         )
+        raise _AnswerError("a message that cannot be sent", remedy) from None
 
 
 def plain_copy(x: Any) -> tuple[Any, int]:

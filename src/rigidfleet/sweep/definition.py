@@ -27,14 +27,14 @@ from rigidfleet.mission import Mission, load_mission, mission_names
 from rigidfleet.mission.findings import FindingCollector, Keys, look_up, unknown_key
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.mission.text import parse_toml, read_text
-from rigidfleet.mission.values import Part, key
+from rigidfleet.mission.values import Part, key, required_key
 from rigidfleet.sweep import controllers, faults, keypaths
 from rigidfleet.sweep.faults import Drill
 from rigidfleet.sweep.variation import (
     KINDS,
     Gridded,
+    NotationError,
     Variation,
-    WrongLine,
     from_line,
     is_number,
 )
@@ -55,9 +55,11 @@ _LATER = {"random_numbers", "controller", "rate", "agent", "drill"}
 class SweepHeader(Part):
     """Keys at the top of a sweep file."""
 
-    mission: str = key("a shipped mission, or the path of a mission file relative to this file")
+    mission: str = required_key(
+        "a shipped mission, or the path of a mission file relative to this file"
+    )
     runs: Annotated[int, Strict(), Field(ge=1, le=_RUNS)] | None = key(
-        "number of runs; default: one per point of the grid", None
+        "number of runs; default: one per point of the grid"
     )
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**63)] = key("seed of the random numbers", 0)
     evaluate: Literal["flight", "final"] = key(
@@ -83,7 +85,7 @@ class SweepHeader(Part):
         " new object; for missions with [network]; default: the laws of the mission",
         "",
     )
-    drill: Drill | None = key("faults of the day, in turn, instead of what varies: [drill]", None)
+    drill: Drill | None = key("faults of the day, in turn, instead of what varies: [drill]")
 
     @property
     def own(self) -> tuple[str, str]:
@@ -172,7 +174,7 @@ class Sweep:
         if isinstance(vary, str | bytes) or not isinstance(vary, Iterable):
             raise wrong_type("a list of variations", vary)
         data = {"mission": mission.name, "vary": list(vary), **keys}
-        variations, header = _check(data, origin, mission)
+        variations, header = _Check(data, origin, mission).parts()
         ending = "" if header.drill is None else "-drill"
         return cls(mission, variations, header, name or mission.name + ending)
 
@@ -207,7 +209,7 @@ class Sweep:
         if isinstance(own := data.get("vary", []), list):
             data["vary"] = [*own, *more]
         controllers.add_search_folder(path.parent)
-        variations, header = _check(data, origin, mission)
+        variations, header = _Check(data, origin, mission).parts()
         assert mission is not None  # otherwise the check has raised
         if header.drill:
             drill = header.drill.from_folder(path.parent)
@@ -299,31 +301,29 @@ class Sweep:
         stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
         drawn = sum(column.grid is None for column in self.columns)
         fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
-        point, places, reversed_values = run, {}, []
+        point, places = run, {}
         for axis, size in reversed(self.grid_sizes.items()):  # the last grid varies fastest
             point, places[axis] = divmod(point, size)
-        for k, column in reversed([*enumerate(self.columns)]):
-            if column.grid is None:
-                reversed_values.append(column.variation.quantile(fractions.pop()))
-            else:
-                reversed_values.append(column.grid[places[_axis(column, k)]])
-        return reversed_values[::-1]
+        return [
+            column.variation.quantile(fractions.pop(0))
+            if column.grid is None
+            else column.grid[places[_axis(column, k)]]
+            for k, column in enumerate(self.columns)
+        ]
 
-    def varied(self, run: int, values: Sequence[Any] | None = None) -> dict[str, Any]:
+    def varied(
+        self, run: int, values: Sequence[Any] | None = None, mission: Mission | None = None
+    ) -> dict[str, Any]:
         """The mission of a run as plain data, not yet checked.
 
-        ``values`` are those of the run, if they are known.
+        ``values`` are those of the run, if they are known; ``mission`` is that of the sweep with its ways, if it has
+        some.
         """
-        return self._document_of(self.mission, run, values)
-
-    def _document_of(
-        self, mission: Mission, run: int, values: Sequence[Any] | None = None
-    ) -> dict[str, Any]:
         varied = {column.keys for column in self.columns}
-        document, values = mission.to_dict(), values or self.values(run)
+        document, values = (mission or self.mission).to_dict(), values or self.values(run)
         if self.drill:
             stream = faults.stream_of(self.seed, run, 2)
-            faults.disturb(document, *values[:2], stream, mission.n_agents, self._end)
+            faults.disturb(document, *values[:2], stream, self.mission.n_agents, self._end)
         for column, value in zip(self.columns, values, strict=True) if not self.drill else ():
             apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
@@ -345,9 +345,8 @@ class Sweep:
         """
         if self._mission_with_ways is not self.mission:
             with suppress(MissionError):  # errors are told of the mission as written
-                return Mission.from_plain(
-                    self._document_of(self._mission_with_ways, run, values), f"run {run}"
-                )
+                document = self.varied(run, values, self._mission_with_ways)
+                return Mission.from_plain(document, f"run {run}")
         return Mission.from_plain(self.varied(run, values), f"run {run}")
 
     @cached_property
@@ -422,194 +421,193 @@ def apply_value(
 # -- the check ---------------------------------------------------------------------------------------
 
 
-def _check(
-    data: dict[str, Any], origin: str, mission: Mission | None
-) -> tuple[list[Variation], SweepHeader]:
-    """Check a sweep and return its variations and header."""
-    data = {key: value for key, value in data.items() if value is not None}
-    wrong: dict[int, WrongLine] = {}
-    if isinstance(entries := data.get("vary"), list):
-        parsed = [from_line(entry) if isinstance(entry, str) else entry for entry in entries]
-        wrong = {k: entry for k, entry in enumerate(parsed) if isinstance(entry, WrongLine)}
-        data["vary"] = [entries[k] if k in wrong else entry for k, entry in enumerate(parsed)]
-    collector = FindingCollector(data, origin)
-    known = [*SweepHeader.model_fields, "vary"]
-    for name in data:
-        if name not in known:
-            collector.add((name,), *unknown_key(name, known))
-    own = {key: value for key, value in data.items() if key in SweepHeader.model_fields}
-    header = collector.validate(SweepHeader, own, ())
-    by_final_states = header is not None and header.evaluate == "final"
-    if data.get("drill") is not None:
-        cases = [] if header is None else _cases(collector, header.drill or Drill(), mission)
-        if collector.findings or header is None:
-            raise SweepError(collector.findings)
-        return cases, header
-    whole = None if mission is None else keypaths.whole_document(mission)
-    variations: list[Variation] = []
-    lacked: list[tuple[int, SweepColumn]] = []
-    for k, entry in enumerate(collector.tables("vary")):
-        if k in wrong:
-            collector.add(("vary", k), wrong[k].problem, wrong[k].remedy)
-            continue
-        variation = _variation(collector, entry, k)
-        if whole is not None and isinstance(entry, dict) and isinstance(entry.get("path"), str):
-            _fits(collector, k, entry["path"], variation, whole, lacked, starts=by_final_states)
-        variations += [] if variation is None else [variation]
-    if by_final_states and mission is not None:
-        from rigidfleet.simulation.ensemble import unfit
+class _Check:
+    """The check of a sweep: its data, the mission that varies, unless it cannot be read, and what is wrong.
 
-        if (why := unfit(mission)) is not None:
-            collector.add(("evaluate",), why, _WHOLE, "final")
-    if mission is not None and whole is not None:
-        _taken(collector, lacked, mission, whole)
-    if header is not None and header.own[1]:
-        key, name = header.own
+    Attributes
+    ----------
+    whole : the mission as plain data with all defaults
+    lacked : places of keys that the mission does not have, each with the number of its variation
+    """
+
+    def __init__(self, data: dict[str, Any], origin: str, mission: Mission | None) -> None:
+        self.data = {key: value for key, value in data.items() if value is not None}
+        if isinstance(entries := self.data.get("vary"), list):
+            self.data["vary"] = [*entries]  # in which tables replace the lines that stand for them
+        self.collector, self.mission = FindingCollector(self.data, origin), mission
+        self.add = self.collector.add
+        self.whole = {} if mission is None else keypaths.whole_document(mission)
+        self.lacked: list[tuple[int, SweepColumn]] = []
+
+    def parts(self) -> tuple[list[Variation], SweepHeader]:
+        """Variations and header.
+
+        Raises
+        ------
+        SweepError
+            With a finding for each error.
+        """
+        known = [*SweepHeader.model_fields, "vary"]
+        for name in self.data:
+            if name not in known:
+                self.add((name,), *unknown_key(name, known))
+        own = {key: value for key, value in self.data.items() if key in SweepHeader.model_fields}
+        header = self.collector.validate(SweepHeader, own, ())
+        if "drill" not in self.data:
+            variations = self._variations(header)
+        else:
+            variations = [] if header is None else self._cases(header.drill or Drill())
+        if self.collector.findings or header is None:
+            raise SweepError(self.collector.findings)
+        return variations, header
+
+    def _cases(self, drill: Drill) -> list[Variation]:
+        """The cases of a drill; nothing else varies."""
+        for name, default in (("vary", []), ("evaluate", "flight")):
+            if self.data.get(name, default) != default:
+                self.add((name,), "has no effect on a drill", "remove it, or [drill]")
+        if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
+            self.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
+        if drill.links and self.mission is not None and self.mission.network is None:
+            problem = "has no effect: without [network], one law knows all states"
+            self.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
+        n = 1 if self.mission is None else self.mission.n_agents
+        for name, most in faults.most_of(n).items():
+            if name in drill.model_fields_set and max(getattr(drill, name), default=0) > most:
+                self.add(("drill", name), f"is too much for {n} vehicles", f"give at most {most}")
+        grids = drill.grids(n)
+        if not (grids or self.collector.findings):
+            self.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
+        return grids
+
+    def _variations(self, header: SweepHeader | None) -> list[Variation]:
+        """What varies, by grids or distributions, and whether it suits the mission and the other keys."""
+        by_final_states = header is not None and header.evaluate == "final"
+        variations: list[Variation] = []
+        for k, entry in enumerate(self.collector.tables("vary")):
+            variation = self._variation(k, entry)
+            path = look_up(self.data, ("vary", k, "path"))
+            if self.mission is not None and isinstance(path, str):
+                self._check_places(k, path, variation, starts=by_final_states)
+            variations += [] if variation is None else [variation]
+        if by_final_states and self.mission is not None:
+            from rigidfleet.simulation.ensemble import unfit
+
+            if (why := unfit(self.mission)) is not None:
+                self.add(("evaluate",), why, _WHOLE, "final")
+        if self.mission is not None:
+            self._check_values(self.mission)
+        if header is not None and header.own[1]:
+            self._check_law(*header.own, header)
+        if "rate" in self.data and not self.data.get("controller"):
+            self.add(("rate",), "is that of a controller", "give a controller, or remove rate")
+        self._check_groups(variations)
+        if self.data.get("vary", []) == []:
+            remedy = 'for example, give --vary "agents.mass.* *= normal(1, 0.05)"'
+            self.add(("vary",), "nothing varies", remedy)
+        gridded = any(isinstance(v, Gridded) for v in variations)
+        if "runs" not in self.data and variations and not gridded:
+            self.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
+        return variations
+
+    def _variation(self, k: int, entry: Any) -> Variation | None:
+        """Check a variation by itself; None if it has errors."""
+        where, before = ("vary", k), len(self.collector.findings)
+        if isinstance(entry, str):
+            try:
+                entry = self.data["vary"][k] = from_line(entry)
+            except NotationError as error:
+                self.add(where, error.problem, error.remedy)
+                return None
+        model = self.collector.kind(entry, where, KINDS)
+        variation = None if model is None else self.collector.validate(model, entry, where)
+        if variation is None or len(self.collector.findings) > before:
+            return None
+        if problem := variation.wrong():
+            key, *words = problem
+            self.add((*where, key), *words, getattr(variation, key))
+            return None
+        return variation
+
+    def _check_places(self, k: int, path: str, v: Variation | None, *, starts: bool) -> None:
+        """Check that the path of a variation exists in the mission and can take its values.
+
+        With ``starts``, only start states can vary.
+        """
+        where = ("vary", k, "path")
+        try:
+            places = keypaths.expand(self.whole, path)
+        except NotationError as error:
+            self.add(where, error.problem, error.remedy, path)
+            return
+        if v is None:
+            return
+        values = getattr(v, "values", ())
+        numeric = all(map(is_number, values))
+        for word in values:
+            if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
+                self.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
+        for keys in places:
+            leaves = keypaths.flatten(look_up(self.whole, keys))
+            absent = any(x is None for x in leaves)
+            table = next((x for x in leaves if isinstance(x, dict)), None)
+            words = [x for x in leaves if not is_number(x)]
+            if table is not None:
+                problem = "is a table"
+                remedy = f"continue the path with one of its keys: {', '.join(table)}"
+            elif absent and v.change != "set":
+                problem = f"the mission has no value to {v.change} to"
+                remedy = "set the value by =, or write one in the mission"
+            elif numeric and words and not absent:
+                problem = f"has the value {words[0]!r}, which is not a number"
+                remedy = f"vary it by a choice or grid of words, as grid({json.dumps(words[0])})"
+            elif starts and not (numeric and keys[:2] in _STARTS):
+                problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
+                remedy = f"remove it, or {_WHOLE}"
+            else:
+                if absent or keypaths.is_absent(self.whole, keys):
+                    self.lacked.append((k, SweepColumn(v, keys, None)))
+                continue
+            self.add(where, problem, remedy, path)
+
+    def _check_values(self, mission: Mission) -> None:
+        """Check that the mission accepts values for the keys that it does not have, all of them together."""
+        document = mission.to_dict()
+        for _, column in self.lacked:
+            v = column.variation
+            value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
+            apply_value(document, self.whole, column, value)
+        try:
+            Mission.from_plain(document, "<dict>")
+        except MissionError as error:
+            for finding in error.findings:
+                names = [[c.name, finding.key.replace("[", ".")] for _, c in self.lacked]
+                near = [len(commonprefix(pair)) for pair in names]  # noqa: RUF071
+                k, column = self.lacked[near.index(max(near))]
+                problem = f"the mission does not accept a value: {finding.key} {finding.problem}"
+                remedy = f"in the mission, {finding.remedy}"
+                self.add(("vary", k, "path"), problem, remedy, column.variation.path)
+
+    def _check_law(self, key: str, name: str, header: SweepHeader) -> None:
+        """Check that the user's law can be imported, and suits the mission."""
         try:
             controllers.import_law(name)
         except ImportError as error:
-            collector.add((key,), str(error), controllers.REMEDY)
-        if by_final_states:
-            collector.add((key,), "does not act on final states alone", _WHOLE)
-        if key == "agent" and mission is not None and mission.network is None:
-            collector.add(
-                (key,), "needs a network", "add [network] to the mission, or remove agent"
-            )
+            self.add((key,), str(error), controllers.REMEDY)
+        if header.evaluate == "final":
+            self.add((key,), "does not act on final states alone", _WHOLE)
+        if key == "agent" and self.mission is not None and self.mission.network is None:
+            self.add((key,), "needs a network", "add [network] to the mission, or remove agent")
         if key == "agent" and header.controller:
-            collector.add((key,), "does not go with a controller", "give one of them")
-    if "rate" in data and not data.get("controller"):
-        collector.add(("rate",), "is that of a controller", "give a controller, or remove rate")
-    _same_length(collector, variations)
-    if "vary" not in data or data["vary"] == []:
-        remedy = 'for example, give --vary "agents.mass.* *= normal(1, 0.05)"'
-        collector.add(("vary",), "nothing varies", remedy)
-    gridded = any(isinstance(v, Gridded) for v in variations)
-    if "runs" not in data and variations and not gridded:
-        collector.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
-    if collector.findings or header is None:
-        raise SweepError(collector.findings)
-    return variations, header
+            self.add((key,), "does not go with a controller", "give one of them")
 
-
-def _cases(collector: FindingCollector, drill: Drill, mission: Mission | None) -> list[Variation]:
-    """The cases of a drill; nothing else varies."""
-    for name, default in (("vary", []), ("evaluate", "flight")):
-        if collector.data.get(name, default) != default:
-            collector.add((name,), "has no effect on a drill", "remove it, or [drill]")
-    if drill.files and (flown := drill.model_fields_set & faults.FLOWN.keys()):
-        collector.add(("drill", *flown), "needs a mission that is flown", "remove it, or files")
-    if drill.links and mission is not None and mission.network is None:
-        problem = "has no effect: without [network], one law knows all states"
-        collector.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
-    n = 1 if mission is None else mission.n_agents
-    for name, most in faults.most_of(n).items():
-        if name in drill.model_fields_set and max(getattr(drill, name), default=0) > most:
-            remedy = f"give at most {most}"
-            collector.add(("drill", name), f"is too much for {n} vehicles", remedy)
-    grids = drill.grids(n)
-    if not (grids or collector.findings):
-        collector.add(("drill",), "has no magnitude", "give some, such as late = [1, 2]")
-    return grids
-
-
-def _variation(collector: FindingCollector, entry: Any, k: int) -> Variation | None:
-    """Check a variation by itself; None if it has errors."""
-    before = len(collector.findings)
-    model = collector.kind(entry, ("vary", k), KINDS)
-    variation = None if model is None else collector.validate(model, entry, ("vary", k))
-    if (
-        variation is not None
-        and len(collector.findings) == before
-        and (problem := variation.wrong())
-    ):
-        key, *words = problem
-        collector.add(("vary", k, key), *words, getattr(variation, key))
-    return variation if len(collector.findings) == before else None
-
-
-def _fits(
-    collector: FindingCollector,
-    k: int,
-    path: str,
-    v: Variation | None,
-    whole: dict[str, Any],
-    lacked: list[tuple[int, SweepColumn]],
-    *,
-    starts: bool,
-) -> None:
-    """Check that the path of a variation exists in the mission and can take its values.
-
-    Places of keys that the mission does not have are added to those that are ``lacked``. With ``starts``, only start
-    states can vary.
-    """
-    where = ("vary", k, "path")
-    try:
-        places = keypaths.expand(whole, path)
-    except keypaths.PathError as error:
-        collector.add(where, error.problem, error.remedy, path)
-        return
-    if v is None:
-        return
-    values = getattr(v, "values", ())
-    numeric = all(map(is_number, values))
-    for word in values:
-        if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
-            collector.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
-    for keys in places:
-        leaves = keypaths.flatten(look_up(whole, keys))
-        absent = any(x is None for x in leaves)
-        table = next((x for x in leaves if isinstance(x, dict)), None)
-        words = [x for x in leaves if not is_number(x)]
-        if table is not None:
-            problem = "is a table"
-            remedy = f"continue the path with one of its keys: {', '.join(table)}"
-        elif absent and v.change != "set":
-            problem = f"the mission has no value to {v.change} to"
-            remedy = "set the value by =, or write one in the mission"
-        elif numeric and words and not absent:
-            problem = f"has the value {words[0]!r}, which is not a number"
-            remedy = f"vary it by a choice or grid of words, as grid({json.dumps(words[0])})"
-        elif starts and not (numeric and keys[:2] in _STARTS):
-            problem = "with final states alone, only numbers in agents.position and agents.velocity can vary"
-            remedy = f"remove it, or {_WHOLE}"
-        else:
-            if absent or keypaths.is_absent(whole, keys):
-                lacked.append((k, SweepColumn(v, keys, None)))
-            continue
-        collector.add(where, problem, remedy, path)
-
-
-def _same_length(collector: FindingCollector, variations: list[Variation]) -> None:
-    """Check that grids of a group have as many values."""
-    sizes: dict[str, int] = {}
-    for k, v in enumerate(variations):
-        if isinstance(v, Gridded) and v.group:
-            size = sizes.setdefault(v.group, len(v.grid))
-            if len(v.grid) != size:
-                problem = f"has a grid of {len(v.grid)} values here, and one of {size} before"
-                remedy = "give all grids of a group as many values"
-                collector.add(("vary", k, "group"), problem, remedy, v.group)
-
-
-def _taken(
-    collector: FindingCollector,
-    lacked: list[tuple[int, SweepColumn]],
-    mission: Mission,
-    whole: dict[str, Any],
-) -> None:
-    """Check that the mission accepts values for the keys that it does not have, all of them together."""
-    document = mission.to_dict()
-    for _, column in lacked:
-        v = column.variation
-        value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
-        apply_value(document, whole, column, value)
-    try:
-        Mission.from_plain(document, "<dict>")
-    except MissionError as error:
-        for finding in error.findings:
-            names = [[c.name, finding.key.replace("[", ".")] for _, c in lacked]
-            near = [len(commonprefix(pair)) for pair in names]  # noqa: RUF071
-            k, column = lacked[near.index(max(near))]
-            problem = f"the mission does not accept a value: {finding.key} {finding.problem}"
-            remedy = f"in the mission, {finding.remedy}"
-            collector.add(("vary", k, "path"), problem, remedy, column.variation.path)
+    def _check_groups(self, variations: list[Variation]) -> None:
+        """Check that grids of a group have as many values."""
+        sizes: dict[str, int] = {}
+        for k, v in enumerate(variations):
+            if isinstance(v, Gridded) and v.group:
+                size = sizes.setdefault(v.group, len(v.grid))
+                if len(v.grid) != size:
+                    problem = f"has a grid of {len(v.grid)} values here, and one of {size} before"
+                    remedy = "give all grids of a group as many values"
+                    self.add(("vary", k, "group"), problem, remedy, v.group)

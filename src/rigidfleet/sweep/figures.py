@@ -153,6 +153,8 @@ def shares(table: Table) -> Figure | None:
 
 def histograms(table: Table) -> Figure | None:
     """Histogram of every metric, for passed and failed runs, with its limit."""
+    from matplotlib.ticker import LogLocator, MaxNLocator
+
     names = [name for name in outcomes(table) if name != "success"]
     if not names:
         return None
@@ -172,7 +174,10 @@ def histograms(table: Table) -> Figure | None:
         ax.set_xscale(scale)
         ax.set_xlim(low, high)
         ax.grid(visible=False, axis="x")
-        _set_ticks(ax, scale)
+        if scale == "log":
+            ax.minorticks_off()
+        ax.xaxis.set_major_locator(LogLocator(numticks=4) if scale == "log" else MaxNLocator(3))
+        ax.yaxis.set_major_locator(MaxNLocator(3, integer=True))
         ax.set_xlabel(_metric_label(name))
         if name in limits and low <= limits[name] <= high:
             ax.axvline(limits[name], color=st.ALERT, linewidth=1.0, linestyle=(0, (6, 2)))
@@ -370,15 +375,6 @@ def _metric_limits(table: Table) -> dict[str, float]:
 def _scale(x: Floats) -> str:
     wide = len(x) and x.min() > 0 and x.max() > _LOGARITHMIC * x.min()
     return "log" if wide else "linear"
-
-
-def _set_ticks(ax: Axes, scale: str) -> None:
-    from matplotlib.ticker import LogLocator, MaxNLocator
-
-    if scale == "log":
-        ax.minorticks_off()
-    ax.xaxis.set_major_locator(LogLocator(numticks=4) if scale == "log" else MaxNLocator(3))
-    ax.yaxis.set_major_locator(MaxNLocator(3, integer=True))
 
 
 def _spacing(table: Table, name: str) -> str:

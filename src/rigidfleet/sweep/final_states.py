@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +47,6 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     "handedness" are those of `rigidfleet.assess`. The metrics are those of the shape, and the number of evaluations,
     which the eight runs of a vector share.
     """
-    _compile_kernel(sweep)
     begun = perf_counter()
     values = [sweep.values(run) for run in runs]
     r, v = start_states(sweep, values)
@@ -85,13 +83,6 @@ def start_states(sweep: Sweep, values: Sequence[Sequence[Any]]) -> tuple[Floats,
             by = drawn.reshape(-1, *(1,) * (place.ndim - 1))
             place[:] = column.variation.apply(place, by)
     return states["position"], states["velocity"]
-
-
-@lru_cache(maxsize=4)
-def _compile_kernel(sweep: Sweep) -> None:
-    """Fly the unvaried mission once, so that the time of compiling does not count for any run."""
-    agents = sweep.mission.agents
-    establish(sweep.mission, [agents.position], [agents.velocity])
 
 
 def _refusals(

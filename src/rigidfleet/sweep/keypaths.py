@@ -15,10 +15,10 @@ from typing import Any, get_args
 from pydantic.fields import FieldInfo
 
 from rigidfleet._common.toml import toml_key
-from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission import Mission
 from rigidfleet.mission.findings import Keys, look_up, model_of
 from rigidfleet.mission.values import Part, PerAgent, PerAgentError, PerAxis
+from rigidfleet.sweep.variation import NotationError
 
 #: Stands for any index or name.
 ANY = "*"
@@ -34,14 +34,6 @@ class Absent(dict[str, Any]):
     """Defaults of a table that a mission does not have."""
 
 
-class PathError(RigidfleetError):
-    """A path that does not exist, with problem and remedy."""
-
-    def __init__(self, problem: str, remedy: str) -> None:
-        super().__init__(problem, remedy)
-        self.problem, self.remedy = problem, remedy
-
-
 def name_of(keys: Keys) -> str:
     """Keys as a path: (`agents`, `mass`, 1) becomes `agents.mass.2`."""
     return ".".join(str(k + 1) if isinstance(k, int) else toml_key(k) for k in keys)
@@ -52,17 +44,17 @@ def expand(whole: Mapping[str, Any], path: str) -> list[Keys]:
 
     Raises
     ------
-    PathError
+    NotationError
         No place matches.
     """
     if not _PATH.fullmatch("." + path):
         remedy = "write agents.mass.2, or agents.position.*.3 for every agent"
-        raise PathError("is not a valid path", remedy)
+        raise NotationError("is not a valid path", remedy)
     steps = [quoted or index or word for quoted, index, word in _STEP.findall(path)]
     places, depth = _matches(whole, steps)
     if depth < len(steps):
         problem = f"there is no '{steps[depth]}' in {'.'.join(steps[:depth]) or 'the mission'}"
-        raise PathError(problem, _remedy(whole, places[0][1], steps, depth))
+        raise NotationError(problem, _remedy(whole, places[0][1], steps, depth))
     return [keys for keys, _ in places]
 
 

@@ -27,7 +27,7 @@ from rigidfleet.typing import Bools
 #: Approximate duration of a chunk [s]: the work that kill -9 loses per worker, and the interval of progress.
 _CHUNK = 1.0
 #: Work below which no further processes are started, as starting them may take one or two seconds [s].
-_WORTH = 6.0
+WORTH = 6.0
 #: Number of chunks per worker: one in work and one waiting.
 _AHEAD = 2
 #: Maximum time until new workers are noticed [s].
@@ -152,7 +152,7 @@ class _Sweeping:
     def alone(self, *, until_worth: bool) -> None:
         """Fly in this process: all runs, or until the remaining work justifies more processes."""
         while self.missing:
-            if until_worth and self.pace * GROUP * len(self.missing) > _WORTH:
+            if until_worth and self.pace * GROUP * len(self.missing) > WORTH:
                 return
             self.keep(fly_runs(self.sweep, self.take(1)))
             self.report(1)

@@ -166,12 +166,6 @@ class Store:
             self.db.executemany("INSERT OR REPLACE INTO sweep VALUES (?, ?)", entries.items())
 
 
-def _definition(db: sqlite3.Connection) -> tuple[Sweep, dict[str, str]]:
-    """The sweep of a store, and all that is kept of its definition."""
-    entries = dict(db.execute("SELECT key, value FROM sweep"))
-    return Sweep.from_json(entries["sweep"]), entries
-
-
 def _column_names(db: sqlite3.Connection) -> set[str]:
     """Columns of a store: one that an earlier version wrote may lack metrics."""
     return {name for _, name, *_ in db.execute("PRAGMA table_info(runs)")}
@@ -180,18 +174,6 @@ def _column_names(db: sqlite3.Connection) -> set[str]:
 def is_store(folder: Path) -> bool:
     """Whether a folder contains a sweep."""
     return (folder / FILE).is_file()
-
-
-def read_sweep(folder: Path) -> Sweep:
-    """Definition of the sweep in a folder.
-
-    Raises
-    ------
-    ResultError
-        The folder does not contain a sweep.
-    """
-    with _open_to_read(folder) as db:
-        return _definition(db)[0]
 
 
 def read(folder: str | Path) -> Table:
@@ -228,7 +210,8 @@ def contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]
         The folder does not contain a sweep.
     """
     with _open_to_read(folder) as db:
-        sweep, entries = _definition(db)
+        entries = dict(db.execute("SELECT key, value FROM sweep"))
+        sweep = Sweep.from_json(entries["sweep"])
         shards = int(entries.get("shard", "").partition("/")[2] or 1)
         common = {"number of runs": sweep.runs, "number of shards": shards}
         known = _column_names(db)

@@ -175,20 +175,23 @@ class Summary(Shown):
         return Sheet(self.name, f"{self.flown} of {self.runs} runs", parts)
 
     def rehearsals(self) -> list[str]:
-        """What a drill has shown, a sentence or two for each fault: for the first page of a report."""
-        lines = []
-        for fault, same_fault in groupby(self.drill, lambda x: x.fault):
-            cases, harmless, dangerous = [*same_fault], [], []
+        """What a drill has shown, first of all faults, then of each, in a sentence: for the first page of a report."""
+        lines = [f"{self.success.count:,} of {self.flown:,} faults are harmless."]
+        if more := self.runs - self.flown:
+            lines.append(f"{more:,} more are planned and were not tried.")
+        for (fault, unit), cases in groupby(self.drill, lambda x: (x.fault, x.unit)):
+            harmless, dangerous, why = [], [], ""
             for size, same_size in groupby(cases, lambda x: x.magnitude):
-                rates = [x.failed for x in same_size]
-                count, by = sum(r.count for r in rates), f"{size:g} {display_unit(cases[0].unit)}"
-                share = f" ({count} of {sum(r.of for r in rates)} runs)" if count else ""
-                (dangerous if count else harmless).append(by.strip() + share)
-            parts = ("no failure", harmless), ("failures", dangerous)
-            words = "; ".join(f"{name} by {', '.join(some)}" for name, some in parts if some)
-            details = [x.worst.detail for x in cases if x.worst]
-            least = f" The last of these: {details[-1]}." if details else ""
-            lines.append(f"{fault.capitalize()}: {words}.{least}")
+                every = [*same_size]
+                if failed := sum(x.failed.count for x in every):
+                    of = sum(x.failed.of for x in every)
+                    dangerous.append(f"{failed} of {of} fail by {size:g}")
+                    why = why or next(f": {x.worst.detail}" for x in every if x.worst)
+                else:
+                    harmless.append(f"{size:g}")
+            parts = [f"none fails by {', '.join(harmless)}"] * bool(harmless) + dangerous
+            words = f"{'; '.join(parts)} {display_unit(unit)}".rstrip()
+            lines.append(f"{fault.capitalize()}: {words}{why}.")
         return lines
 
     def _cases(self) -> list[FactTable]:

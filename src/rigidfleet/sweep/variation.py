@@ -10,10 +10,10 @@ constraint.solver = choice(iterated, exact)
 from __future__ import annotations
 
 import json
+import operator
 import re
 import sys
 from abc import abstractmethod
-from dataclasses import dataclass
 from functools import cached_property
 from statistics import NormalDist
 from typing import Annotated, Any, Literal, get_args
@@ -21,21 +21,29 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 from pydantic import Field, Strict
 
+from rigidfleet.errors import RigidfleetError
 from rigidfleet.mission.findings import suggest
-from rigidfleet.mission.values import Number, Part, Positive, key
+from rigidfleet.mission.values import Number, Part, Positive, key, required_key
 
-#: Signs in a line, and the change that each stands for.
-SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
-
-
+#: Signs in a line, and the change that each stands for; what each change makes of a number and a value.
+_SIGNS = {"=": "set", "+=": "add", "*=": "scale"}
+_CHANGES = {"set": lambda _, value: value, "add": operator.add, "scale": operator.mul}
 #: Greatest number, as an integer may be beyond.
 _MOST = sys.float_info.max
+
+
+class NotationError(RigidfleetError):
+    """A path or a line that is not valid, with problem and remedy."""
+
+    def __init__(self, problem: str, remedy: str) -> None:
+        super().__init__(problem, remedy)
+        self.problem, self.remedy = problem, remedy
 
 
 class Variation(Part):
     """A variation: a path in the mission, and the values there."""
 
-    path: str = key(
+    path: str = required_key(
         "path in the mission, counted from 1: agents.mass.2; * stands for all entries, each with its own value"
     )
     change: Literal["set", "add", "scale"] = key(
@@ -44,12 +52,7 @@ class Variation(Part):
 
     def apply(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
-        match self.change:
-            case "add":
-                return there + value
-            case "scale":
-                return there * value
-        return value
+        return _CHANGES[self.change](there, value)
 
     def quantile(self, u: float) -> Any:
         """Value at the fraction u of a distribution, in (0, 1)."""
@@ -86,9 +89,9 @@ class Gridded(Variation):
 class Normal(Variation):
     """A normal distribution."""
 
-    kind: Literal["normal"] = key("normal distribution")
-    mean: Number = key("mean")
-    sd: Positive = key("standard deviation, > 0")
+    kind: Literal["normal"] = required_key("normal distribution")
+    mean: Number = required_key("mean")
+    sd: Positive = required_key("standard deviation, > 0")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
@@ -98,8 +101,8 @@ class Normal(Variation):
 class _Between(Variation):
     """A distribution between two ends."""
 
-    low: Number = key("lower end")
-    high: Number = key("upper end, > low")
+    low: Number = required_key("lower end")
+    high: Number = required_key("upper end, > low")
 
     def wrong(self) -> tuple[str, str, str] | None:
         """Ends in the wrong order."""
@@ -112,7 +115,7 @@ class _Between(Variation):
 class Uniform(_Between):
     """A uniform distribution."""
 
-    kind: Literal["uniform"] = key("uniform distribution")
+    kind: Literal["uniform"] = required_key("uniform distribution")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
@@ -122,8 +125,8 @@ class Uniform(_Between):
 class LogUniform(_Between):
     """A distribution whose logarithm is uniform."""
 
-    kind: Literal["log-uniform"] = key("distribution whose logarithm is uniform")
-    low: Positive = key("lower end, > 0")
+    kind: Literal["log-uniform"] = required_key("distribution whose logarithm is uniform")
+    low: Positive = required_key("lower end, > 0")
 
     def quantile(self, u: float) -> float:
         """Value at the fraction u."""
@@ -133,7 +136,7 @@ class LogUniform(_Between):
 class _Listed(Variation):
     """A list of values."""
 
-    values: Annotated[tuple[Any, ...], Field(min_length=1)] = key(
+    values: Annotated[tuple[Any, ...], Field(min_length=1)] = required_key(
         "values: numbers, words, true or false, lists"
     )
 
@@ -163,7 +166,7 @@ class _Listed(Variation):
 class Choice(_Listed):
     """One of several values with equal probability."""
 
-    kind: Literal["choice"] = key("one of several values with equal probability")
+    kind: Literal["choice"] = required_key("one of several values with equal probability")
 
     def quantile(self, u: float) -> Any:
         """Value at the fraction u."""
@@ -173,7 +176,7 @@ class Choice(_Listed):
 class Grid(_Listed, Gridded):
     """A grid of listed values."""
 
-    kind: Literal["grid"] = key("grid of listed values")
+    kind: Literal["grid"] = required_key("grid of listed values")
 
     @property
     def grid(self) -> tuple[Any, ...]:
@@ -184,7 +187,9 @@ class Grid(_Listed, Gridded):
 class _Spaced(Gridded):
     """A grid of spaced numbers, both ends included."""
 
-    count: Annotated[int, Strict(), Field(ge=2, le=10**6)] = key(
+    low: Number = required_key("first value")
+    high: Number = required_key("last value")
+    count: Annotated[int, Strict(), Field(ge=2, le=10**6)] = required_key(
         "number of values, both ends included, >= 2"
     )
 
@@ -192,9 +197,7 @@ class _Spaced(Gridded):
 class Linspace(_Spaced):
     """A grid with equal differences."""
 
-    kind: Literal["linspace"] = key("grid with equal differences")
-    low: Number = key("first value")
-    high: Number = key("last value")
+    kind: Literal["linspace"] = required_key("grid with equal differences")
 
     @property
     def grid(self) -> tuple[float, ...]:
@@ -205,9 +208,9 @@ class Linspace(_Spaced):
 class Geomspace(_Spaced):
     """A grid with equal ratios."""
 
-    kind: Literal["geomspace"] = key("grid with equal ratios")
-    low: Positive = key("first value, > 0")
-    high: Positive = key("last value, > 0")
+    kind: Literal["geomspace"] = required_key("grid with equal ratios")
+    low: Positive = required_key("first value, > 0")
+    high: Positive = required_key("last value, > 0")
 
     @property
     def grid(self) -> tuple[float, ...]:
@@ -220,43 +223,35 @@ KINDS: dict[str, type[Variation]] = {
     get_args(model.model_fields["kind"].annotation)[0]: model
     for model in (Normal, Uniform, LogUniform, Choice, Grid, Linspace, Geomspace)
 }
-#: Keys of a variation in the order of a line; those that are missing here take a list of values.
-_KEYS = {
-    "normal": ("mean", "sd"),
-    "uniform": ("low", "high"),
-    "log-uniform": ("low", "high"),
-    "linspace": ("low", "high", "count"),
-    "geomspace": ("low", "high", "count"),
-}
+#: Keys that stand elsewhere in a line than in the brackets.
+_SHARED = {*Gridded.model_fields, "kind"}
 _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL)
 _FORM = "write PATH = KIND(NUMBERS), as in agents.mass.* *= normal(1, 0.05)"
 
 
-@dataclass(frozen=True)
-class WrongLine:
-    """Problem and remedy of an invalid line."""
+def from_line(line: str) -> dict[str, Any]:
+    """Parse a line into the table that it stands for.
 
-    problem: str
-    remedy: str
-
-
-def from_line(line: str) -> dict[str, Any] | WrongLine:
-    """Parse a line into the table that it stands for."""
+    Raises
+    ------
+    NotationError
+        The line is not valid.
+    """
     match = _LINE.fullmatch(line)
     if match is None:
-        return WrongLine("is not a valid variation", _FORM)
+        raise NotationError("is not a valid variation", _FORM)
     path, sign, kind, inside = match.groups()
-    data = {"path": path, "change": SIGNS[sign], "kind": kind}
+    data = {"path": path, "change": _SIGNS[sign], "kind": kind}
     if kind not in KINDS:
         remedy = suggest(kind, KINDS) or f"use one of {', '.join(KINDS)}"
-        return WrongLine(f"there is no distribution or grid '{kind}'", remedy)
+        raise NotationError(f"there is no distribution or grid '{kind}'", remedy)
     values = [_parse_word(word) for word in _split_words(inside)]
-    if kind not in _KEYS:
+    keys = [name for name in KINDS[kind].model_fields if name not in _SHARED]
+    if keys == ["values"]:
         return data | {"values": values}
-    keys = _KEYS[kind]
     if len(values) != len(keys):
         problem = f"{kind} takes {len(keys)} numbers, not {len(values)}"
-        return WrongLine(problem, f"write {kind}({', '.join(keys)})")
+        raise NotationError(problem, f"write {kind}({', '.join(keys)})")
     return data | dict(zip(keys, values, strict=True))
 
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import connection
-from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import TYPE_CHECKING, Any
 
 from rigidfleet._common.processes import safe_path
@@ -56,16 +55,18 @@ def processes(count: int) -> Generator[Executor]:
 
     before = set(multiprocessing.active_children())
     forked = _has_one_thread()
-    context: Any = _fork_context() if forked else _Context()
+    context: Any = _fork_context() if forked else multiprocessing.get_context("spawn")
     own = None if forked else bequeath()
-    with safe_path():  # for multiprocessing's resource tracker
+    # Before a spawned process receives the module path of its parent, it would search the current folder first, even
+    # for modules of the standard library; so would multiprocessing's resource tracker.
+    with safe_path():
         pool = ProcessPoolExecutor(count, context, _begin_worker, (own,))
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - before:
-            process.terminate()
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(multiprocessing.active_children()) - before:
+                process.terminate()
 
 
 def _has_one_thread() -> bool:
@@ -95,23 +96,6 @@ def _fork_context() -> Any:
     context: Any = ForkContext()
     context.Process = Process
     return context
-
-
-class _Process(SpawnProcess):
-    @staticmethod
-    def _Popen(process_obj: Any) -> Any:  # noqa: N802
-        with safe_path():
-            return SpawnProcess._Popen(process_obj)
-
-
-class _Context(SpawnContext):
-    """Spawn processes that import nothing from the current folder while they start.
-
-    Before a spawned process receives the module path of its parent, it would search the current folder first, even for
-    modules of the standard library.
-    """
-
-    Process = _Process
 
 
 def _begin_worker(inheritance: Inheritance | None) -> None:

@@ -14,7 +14,7 @@ import json
 import math
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -32,6 +32,7 @@ from rigidfleet.mission import Mission
 from rigidfleet.mission.loading import as_mission
 from rigidfleet.sweep import Sweep, SweepProgress, Table, fly
 from rigidfleet.sweep.record import BROKEN, REFUSED
+from rigidfleet.sweep.runner import WORTH
 from rigidfleet.sweep.workers import processes
 from rigidfleet.tuning.gains import Gains, GainSpace, Screen, feasible_points, own_gains, with_gains
 from rigidfleet.tuning.outcome import Flown, Tuned
@@ -55,8 +56,6 @@ _GENERATIONS = 500
 _FAILED, _ENDED = 1e3, 1e6
 #: Reasons of a run without a whole flight.
 _NOT_FLOWN = {"complete", REFUSED, BROKEN}
-#: Work below which no further processes are started [s].
-_WORTH = 6.0
 
 
 def tune(
@@ -119,16 +118,16 @@ def tune(
         "objective": objective, "seeds": seeds, "validation": validation, "seed": seed,
         "margin_share": margin_share,
     }  # fmt: skip
-    _check_options(flown, budget, options)
+    if problem := next(_problems(flown, budget, options), ""):
+        raise RigidfleetError(problem)
     folder = as_path(folder)
     claim = _Claim(
         folder, {"version": __version__, "mission": flown.text, **options}, own_mission.name
     )
     claim.take(replace=replace)
     count = cores() if workers is None else workers
-    flights = _StudySweeps(paths, budget, count, progress)
-    study = _Study(flown, folder, objective, budget, margin_share, seed, flights)
-    with flights.stack:
+    study = _Study(flown, folder, options, paths, budget, count, progress)
+    with study.stack:
         tuned = study.search(range(seed, seed + seeds))
         study.validate(tuned, range(seed + seeds, seed + seeds + validation))
         chosen = tuned.before if tuned.worse else tuned.after
@@ -142,39 +141,29 @@ def _tracking_of_phases(mission: Mission) -> set[bool]:
     return {phase.control == "tracking" for phase in mission.phases}
 
 
-def _check_options(mission: Mission, budget: int, options: Mapping[str, Any]) -> None:
-    """Refuse wrong options, and missions in which there is nothing to tune."""
-    if options["objective"] not in OBJECTIVES:
-        known = ", ".join(OBJECTIVES)
-        raise RigidfleetError(f"objective = {options['objective']!r}: use one of {known}.")
-    for name, least in (("seeds", 1), ("validation", 0), ("seed", 0)):
-        if options[name] < least:
-            raise RigidfleetError(f"{name} = {options[name]}: must be at least {least}.")
-    if not 0 <= options["margin_share"] <= 1:
-        raise RigidfleetError(
-            f"margin share = {options['margin_share']}: must be from 0 (stable) to 1 (no smaller margins)."
-        )
-    least = _POPULATION * options["seeds"]
+def _problems(mission: Mission, budget: int, options: Mapping[str, Any]) -> Iterator[str]:
+    """What is wrong with options, or with a mission in which there is nothing to tune."""
+    name, objective = mission.name, options["objective"]
+    if objective not in OBJECTIVES:
+        yield f"objective = {objective!r}: use one of {', '.join(OBJECTIVES)}."
+    for key, least in (("seeds", 1), ("validation", 0), ("seed", 0)):
+        if options[key] < least:
+            yield f"{key} = {options[key]}: must be at least {least}."
+    if not 0 <= (share := options["margin_share"]) <= 1:
+        yield f"margin share = {share}: must be from 0 (stable) to 1 (no smaller margins)."
+    seeds, least = options["seeds"], _POPULATION * options["seeds"]
     if budget < least:
-        raise RigidfleetError(
-            f"budget = {budget}: must be at least {least}, for {_POPULATION} candidates on"
-            f" {options['seeds']} seed{'s' * (options['seeds'] != 1)}. Use fewer seeds or a larger budget."
-        )
+        on = f"{_POPULATION} candidates on {seeds} seed{'s' * (seeds != 1)}"
+        yield f"budget = {budget}: must be at least {least}, for {on}. Use fewer seeds or a larger budget."
     if not own_gains(mission):
-        raise RigidfleetError(
-            f"{mission.name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
-        )
-    slots = options["objective"] != "shape-forces"
+        yield f"{name}: has no gains to tune: no phase tracks slots, and no edges are stabilised."
+    slots = objective != "shape-forces"
     if slots not in _tracking_of_phases(mission):
         which, other = ("no", "shape-forces") if slots else ("every", "shape")
-        raise RigidfleetError(
-            f"objective = {options['objective']!r}: {which} phase of {mission.name} tracks slots. Use {other}."
-        )
+        yield f"objective = {objective!r}: {which} phase of {name} tracks slots. Use {other}."
     if mission.vehicle_models is None and mission.disturbances is None:
-        raise RigidfleetError(
-            f"{mission.name}: higher gains are always better for points without disturbances. Add [vehicles] or"
-            " [disturbances], or assume them for the study."
-        )
+        why = "higher gains are always better for points without disturbances"
+        yield f"{name}: {why}. Add [vehicles] or [disturbances], or assume them for the study."
 
 
 def _merge(document: dict[str, Any], assume: Mapping[str, Any]) -> dict[str, Any]:
@@ -200,59 +189,6 @@ def _seed_paths(mission: Mission) -> list[str]:
     return [f"{name}.seed" for name, acts in acting.items() if acts]
 
 
-class _StudySweeps:
-    """Sweeps of a study, one after the other, by at most ``count`` processes, which end with the context ``stack``.
-
-    Seeds are the same for noise, gusts and the network, at their ``paths``: each draws its own numbers from them.
-    """
-
-    def __init__(
-        self,
-        paths: Sequence[str],
-        total: int,
-        count: int,
-        progress: Callable[[SweepProgress], None] | None,
-    ) -> None:
-        self.paths, self.total, self.count, self.progress = paths, total, count, progress
-        self.begun = perf_counter()
-        #: Numbers of runs that are done, flown and failed: of the sweeps before, and of the present one.
-        self.before = self.now = np.zeros(3, dtype=np.int64)
-        self.first = True
-        self.stack = ExitStack()
-        self.pool: Executor | None = None
-
-    def fly(
-        self, mission: Mission, candidates: Sequence[Gains], seeds: range, folder: Path
-    ) -> list[Flown]:
-        """Fly every candidate on every seed, as a sweep in a folder, and return what was measured of each."""
-        vary = [
-            {"path": path, "kind": "grid", "values": [c[path] for c in candidates], "group": "gains"}
-            for path in candidates[0]
-        ]  # fmt: skip
-        vary += [
-            {"path": path, "kind": "grid", "values": list(seeds), "group": "seeds"}
-            for path in self.paths
-        ]
-        sweep = Sweep.of(mission, vary, name=folder.name, origin="rigidfleet tune")
-        # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
-        first, self.first = self.first, False
-        if self.count > 1 and not first and self.pool is None:
-            self.pool = self.stack.enter_context(processes(self.count))
-        workers = self.count if self.pool else 1
-        table = fly(sweep, folder, workers=workers, progress=self._tell, pool=self.pool)
-        self.before, self.now = self.before + self.now, self.now * 0
-        if first and np.median(table.wall) * self.total < _WORTH:
-            self.count = 1
-        return _measurements(table, candidates, len(seeds))
-
-    def _tell(self, now: SweepProgress) -> None:
-        self.now = np.array([now.done, now.flown, now.failed])
-        if self.progress is not None:
-            done, flown, failed = (self.before + self.now).tolist()
-            wall = perf_counter() - self.begun
-            self.progress(SweepProgress(done, self.total, flown, failed, wall, self.count))
-
-
 def _measurements(table: Table, candidates: Sequence[Gains], seeds: int) -> list[Flown]:
     """What was measured of each candidate; its flights are consecutive runs."""
     measurements = []
@@ -273,26 +209,34 @@ class _SpentError(Exception):
 
 
 class _Study:
-    """A study that is running."""
+    """A study that is running: sweeps, one after the other, by processes that end with the context ``stack``.
+
+    Seeds are the same for noise, gusts and the network, at their ``paths``: each draws its own numbers from them.
+    """
 
     def __init__(
-        self,
-        mission: Mission,
-        folder: Path,
-        objective: str,
-        budget: int,
-        margin_share: float,
-        seed: int,
-        flights: _StudySweeps,
-    ) -> None:
-        self.mission, self.folder, self.objective = mission, folder, objective
-        self.budget, self.seed, self.flights = budget, seed, flights
-        self.screen = Screen(mission, margin_share)
+        self, mission: Mission, folder: Path, options: Mapping[str, Any], paths: Sequence[str], budget: int,
+        workers: int, progress: Callable[[SweepProgress], None] | None,
+    ) -> None:  # fmt: skip
+        self.mission, self.folder, self.paths, self.budget = mission, folder, paths, budget
+        self.seed, self.objective = options["seed"], options["objective"]
+        self.metric = OBJECTIVES[self.objective]
+        self.screen = Screen(mission, options["margin_share"])
         self.space = GainSpace(self.screen.gains)
         #: Candidates that were flown, and slack of the margins of all that were proposed.
         self.flown: dict[tuple[float, ...], Flown] = {}
         self.slacks: dict[tuple[float, ...], float] = {}
         self.rounds = 0
+        self.begun, self.total, self.count, self.progress = (
+            perf_counter(),
+            budget,
+            workers,
+            progress,
+        )
+        #: Numbers of runs that are done, flown and failed: of the sweeps before, and of the present one.
+        self.before = self.now = np.zeros(3, dtype=np.int64)
+        self.stack = ExitStack()
+        self.pool: Executor | None = None
 
     def search(self, seeds: range) -> Tuned:
         """Search for the best gains on some seeds."""
@@ -316,11 +260,11 @@ class _Study:
                 polish=False,
                 rng=rng,
             )
-        best = min(self.flown.values(), key=self._cost)
+        best = min(self.flown.values(), key=lambda flown: cost(flown, self.metric))
         margins = self.screen.own, self.screen.margins(best.gains)
         refused = sum(slack < 0 for slack in self.slacks.values())
         return Tuned(
-            self.mission.name, self.objective, OBJECTIVES[self.objective], before, best, margins,
+            self.mission.name, self.objective, self.metric, before, best, margins,
             len(self.flown) * len(seeds), len(self.flown), refused,
         )  # fmt: skip
 
@@ -330,14 +274,11 @@ class _Study:
             return
         every, judged = list(self.flown), []
         pair = {_gain_values(f.gains): f.gains for f in (tuned.before, tuned.after)}
-        self.flights.total = int(self.flights.before[0]) + len(pair) * len(seeds)
+        self.total = int(self.before[0]) + len(pair) * len(seeds)
         for key, gains in pair.items():
             folder = self.folder / _VALIDATION / f"{every.index(key):04}"
-            judged += self.flights.fly(self.mission, [gains], seeds, folder)
+            judged += self._sweep([gains], seeds, folder)
         tuned.validation = judged[0], judged[-1]
-
-    def _cost(self, flown: Flown) -> float:
-        return cost(flown, OBJECTIVES[self.objective])
 
     def slack(self, gains: Gains) -> float:
         """Slack of the margins; computed once."""
@@ -354,15 +295,37 @@ class _Study:
             raise _SpentError
         if new:
             self._fly(list(new.values()), seeds)
-        return [self._cost(self.flown[_gain_values(g)]) for g in every]
+        return [cost(self.flown[_gain_values(g)], self.metric) for g in every]
 
     def _fly(self, candidates: list[Gains], seeds: range) -> list[Flown]:
         """Fly new candidates as the next round."""
-        folder = self.folder / _ROUNDS / f"{self.rounds:03}"
-        flown = self.flights.fly(self.mission, candidates, seeds, folder)
+        flown = self._sweep(candidates, seeds, self.folder / _ROUNDS / f"{self.rounds:03}")
         self.rounds += 1
         self.flown |= {_gain_values(f.gains): f for f in flown}
         return flown
+
+    def _sweep(self, candidates: Sequence[Gains], seeds: range, folder: Path) -> list[Flown]:
+        """Fly every candidate on every seed, as a sweep in a folder, and return what was measured of each."""
+        grids = [("gains", path, [c[path] for c in candidates]) for path in candidates[0]]
+        grids += [("seeds", path, [*seeds]) for path in self.paths]
+        vary = [{"path": p, "kind": "grid", "values": x, "group": group} for group, p, x in grids]
+        sweep = Sweep.of(self.mission, vary, name=folder.name, origin="rigidfleet tune")
+        # The first sweep is flown here: it compiles what the processes find, and tells how long a flight takes.
+        if self.count > 1 and self.rounds and self.pool is None:
+            self.pool = self.stack.enter_context(processes(self.count))
+        workers = self.count if self.pool else 1
+        table = fly(sweep, folder, workers=workers, progress=self._tell, pool=self.pool)
+        self.before, self.now = self.before + self.now, self.now * 0
+        if not self.rounds and np.median(table.wall) * self.total < WORTH:
+            self.count = 1
+        return _measurements(table, candidates, len(seeds))
+
+    def _tell(self, now: SweepProgress) -> None:
+        self.now = np.array([now.done, now.flown, now.failed])
+        if self.progress is not None:
+            done, flown, failed = (self.before + self.now).tolist()
+            wall = perf_counter() - self.begun
+            self.progress(SweepProgress(done, self.total, flown, failed, wall, self.count))
 
 
 def cost(flown: Flown, metric: str) -> float:
@@ -389,7 +352,6 @@ class _Claim:
         if replace:
             for name in (_ROUNDS, _VALIDATION):
                 shutil.rmtree(self.folder / name, ignore_errors=True)
-            before = {}
         elif before and before.get("definition") != self.definition:
             old = before.get("definition", {})
             other = [key for key in self.definition if old.get(key) != self.definition[key]]
@@ -397,16 +359,12 @@ class _Claim:
                 f"{self.folder}: contains another study; it differs in: {', '.join(other)}. Use --force to overwrite,"
                 " or --out to choose another folder."
             )
-        if (
-            not replace
-            and self.tuned.exists()
-            and self.tuned.read_text("utf-8") != before.get("text")
-        ):
+        elif self.tuned.exists() and self.tuned.read_text("utf-8") != before.get("text"):
             raise ResultError(
                 f"{self.tuned}: is not what a study wrote; use --force to overwrite or --out to choose another place."
             )
         make_folder(self.folder)
-        if not before:
+        if replace or not before:
             self._write({"definition": self.definition})
 
     def write(self, tuned: Tuned) -> None:

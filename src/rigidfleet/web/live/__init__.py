@@ -58,13 +58,7 @@ def live(
     for name, function in (("ready", ready), ("landed", landed)):
         if not (function is None or callable(function)):
             raise wrong_type(f"a function for {name}", function)
-    flown: list[Result] = []
-
-    def keep(result: Result) -> str:
-        flown[:] = [result]
-        return landed(result) if landed is not None else ""
-
-    session = Session(as_mission(mission), keep)
+    session = Session(as_mission(mission), landed)
     with Server(session, port) as server:
         try:
             if ready is not None:
@@ -74,4 +68,4 @@ def live(
             session.run()
         except KeyboardInterrupt:
             pass
-    return flown[0] if flown else None
+    return session.flown

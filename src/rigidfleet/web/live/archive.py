@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ from rigidfleet.result import Result
 from rigidfleet.simulation.recording import Piece
 from rigidfleet.typing import Bools, Floats
 
-#: Greatest number of values kept, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond it,
-#: every second sample is dropped, and the step doubles.
+#: Greatest number of values kept in records, 8 bytes each: 10 minutes of 50 vehicles with 144 edges at 0.05 s. Beyond
+#: it, every second sample is dropped, and the step doubles.
 _MOST = 3.0e7
 _JOINED = 256  # ticks joined into one piece: few large arrays instead of many small ones
 
@@ -26,8 +26,8 @@ class ArchivedPhase:
     """
 
     pieces: list[Piece] = field(default_factory=list)
-    last: Piece | None = None
-    worst: dict[str, tuple[float, Piece]] = field(default_factory=dict)
+    #: The end, and the worst moments, with how bad each is.
+    moments: dict[str, tuple[float, Piece]] = field(default_factory=dict)
 
 
 class Archive:
@@ -41,51 +41,36 @@ class Archive:
     def __init__(self, step: float, most: float = _MOST) -> None:
         self.step, self.most = step, most
         self.phases: dict[tuple[int, int], ArchivedPhase] = {}  # by phase and number of edges
-        self.size = 0.0
+        self.size = 0
 
     def add(self, pieces: Sequence[Piece], record: Result) -> None:
         """Store the samples of a tick; ``record`` is that of its end."""
         for piece in pieces:
-            key = (piece.phase, len(piece.edges))
-            fresh, archived = key not in self.phases, self.phases.setdefault(key, ArchivedPhase())
-            archived.last = rows(piece, [-1])
+            archived = self.phases.setdefault((piece.phase, len(piece.edges)), ArchivedPhase())
             keep = self._even(piece.time)
-            keep[0] |= fresh
+            keep[0] |= not archived.moments  # the start
+            archived.moments["end"] = np.inf, rows(piece, [-1])
             if keep.any():
                 archived.pieces.append(rows(piece, keep))
-                self.size += _count_numbers(archived.pieces[-1])
+                self.size += _size(archived.pieces[-1])
             if len(archived.pieces) >= _JOINED and len(archived.pieces[-1].time) < _JOINED:
-                archived.pieces = _as_one(archived.pieces)
-        if pieces:
-            self._note(self.phases[pieces[-1].phase, len(pieces[-1].edges)], record)
+                archived.pieces = [_join(archived.pieces)]
+            if piece is pieces[-1]:
+                _note_worst(archived.moments, record)
         while self.size > self.most:
             self._thin()
 
     def pieces(self) -> list[Piece]:
-        """All stored samples, in order of time."""
-        pieces_by_phase = []
+        """All stored samples, in order of time and without duplicates."""
+        pieces = []
         for archived in self.phases.values():
-            extra = [archived.last, *(piece for _, piece in archived.worst.values())]
-            pieces = [*archived.pieces, *(piece for piece in extra if piece is not None)]
-            pieces_by_phase.append(_in_order(_join(pieces)))
-        return pieces_by_phase
+            every = _join([*archived.pieces, *(piece for _, piece in archived.moments.values())])
+            pieces.append(rows(every, np.unique(every.time, return_index=True)[1].tolist()))
+        return pieces
 
     def begun(self, phase: int) -> bool:
         """Whether there is a sample of a phase."""
         return any(key[0] == phase for key in self.phases)
-
-    def _note(self, archived: ArchivedPhase, record: Result) -> None:
-        """Keep the moment of a tick's end if it is a worst one of its phase."""
-        assert archived.last is not None
-        worst = {
-            "separation": -float(record.separation[-1]),
-            "clearance": -float(record.clearance[-1]),
-            "thrust": float(np.max(record.thrust[-1])),
-            "speed": float(np.linalg.norm(record.velocity[-1], axis=1).max()),
-        }
-        for name, value in worst.items():
-            if value > archived.worst.get(name, (-np.inf, None))[0]:
-                archived.worst[name] = (value, archived.last)
 
     def _even(self, time: Floats) -> Bools:
         """Which times are multiples of the step."""
@@ -95,34 +80,36 @@ class Archive:
     def _thin(self) -> None:
         """Double the step: drop every second sample."""
         self.step *= 2.0
-        self.size = 0.0
         for archived in self.phases.values():
-            pieces = _as_one(archived.pieces)
-            keep = self._even(pieces[0].time)
+            whole = _join(archived.pieces)
+            keep = self._even(whole.time)
             keep[0] = True  # the start
-            archived.pieces = [rows(pieces[0], keep)]
-            self.size += _count_numbers(archived.pieces[0])
+            archived.pieces = [rows(whole, keep)]
+        self.size = sum(_size(archived.pieces[0]) for archived in self.phases.values())
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
 
-def _count_numbers(piece: Piece) -> float:
-    arrays = (
-        *piece.record,
-        piece.integral,
-        piece.frame,
-        *(piece.vehicles or ()),
-        *(piece.layers or ()),
-    )
-    return float(sum(x.size for x in arrays))
+def _size(piece: Piece) -> int:
+    """Number of values in the record of a piece."""
+    return sum(x.size for x in piece.record)
+
+
+def _note_worst(moments: dict[str, tuple[float, Piece]], record: Result) -> None:
+    """Keep the end of a tick if it is a worst moment of its phase."""
+    worst = {
+        "separation": -float(record.separation[-1]),
+        "clearance": -float(record.clearance[-1]),
+        "thrust": float(np.max(record.thrust[-1])),
+        "speed": float(np.linalg.norm(record.velocity[-1], axis=1).max()),
+    }
+    for name, value in worst.items():
+        if value > moments.get(name, (-np.inf,))[0]:
+            moments[name] = value, moments["end"][1]
 
 
 def rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     return _combine([piece], lambda x: x[0][which])
-
-
-def _as_one(pieces: list[Piece]) -> list[Piece]:
-    return [_join(pieces)] if len(pieces) > 1 else pieces
 
 
 def _join(pieces: list[Piece]) -> Piece:
@@ -138,17 +125,10 @@ def _combine(pieces: Sequence[Piece], array: Callable[[Sequence[Any]], Any]) -> 
             return type(each[0])(*map(combine, zip(*each, strict=True)))
         return None if each[0] is None else array(each)
 
-    names = ("time", "record", "integral", "frame", "vehicles", "layers")
-    time, record, integral, frame, vehicles, layers = (
-        combine([getattr(p, name) for p in pieces]) for name in names
+    names = "time", "integral", "frame", "vehicles", "layers"
+    return replace(
+        pieces[0],
+        source=combine([p.record for p in pieces]),
+        followed=tuple(step for p in pieces for step in p.followed),
+        **{name: combine([getattr(p, name) for p in pieces]) for name in names},
     )
-    first, leading = pieces[0], tuple(step for p in pieces for step in p.followed)
-    return Piece(
-        first.phase, time, record, integral, frame, first.edges, first.attached, leading, vehicles, layers
-    )  # fmt: skip
-
-
-def _in_order(piece: Piece) -> Piece:
-    """The piece with its samples sorted by time, without duplicates."""
-    _, first = np.unique(piece.time, return_index=True)
-    return rows(piece, first.tolist())

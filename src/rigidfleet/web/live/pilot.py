@@ -18,7 +18,7 @@ from rigidfleet.math import proximity
 from rigidfleet.mission import Establish, Hold, Mission, Phase, Reshape
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import Pose
-from rigidfleet.result import PhaseRecord, Result
+from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight
 from rigidfleet.simulation.recording import assemble
 from rigidfleet.typing import Floats, Ints
@@ -77,6 +77,11 @@ class Gust:
         pulse = np.where((x > 0.0) & (x < 1.0), 0.5 - 0.5 * np.cos(2 * math.pi * x), 0.0)
         return (self.strength * pulse * masses)[:, None] * self.direction
 
+    def has_passed(self, t: float, r: Floats) -> bool:
+        """Whether it passed all vehicles at r (N, 3) [m] a second before t [s]."""
+        far = float((r @ self.direction).max()) - self.origin
+        return t >= self.start + self.length + far / self.speed + 1.0
+
 
 class Pilot:
     """A flight that advances tick by tick under the user's commands.
@@ -120,12 +125,16 @@ class Pilot:
         self.fastest = 0.7 * mission.limits.speed if mission.limits.speed else math.inf
         self.commanded: list[Phase] = []  # each phase as it was begun
         self.ticks = 0
-        self._begin_formation(self._first_formation(), establish=True)
+        shaped = [p.shaping.formation for p in mission.phases if p.shaping is not None]
+        first = next((name for name in shaped if name in self.formations), self.formations[0])
+        self._begin_formation(first, establish=True)
         self.pose = self._reference()
         self.a, self.alpha = np.zeros(3), np.zeros(3)
-        self.target = PilotTarget(
-            self._place_to_turn(self.pose.r), att.euler_from_dcm(self.pose.T) * [0, 0, 1]
-        )
+        x, y, z = self.pose.r
+        size = np.linalg.norm(self._slots, axis=1).max() + max(mission.agents.radius)
+        clear = float(mission.height_at(x, y, z)) + size + 0.5  # to rotate above the ground
+        heading = att.euler_from_dcm(self.pose.T) * [0, 0, 1]
+        self.target = PilotTarget(np.array([x, y, max(z, clear)]), heading)
         self.last: Result | None = None
 
     @property
@@ -134,19 +143,9 @@ class Pilot:
         return self.flight.t
 
     @property
-    def phases(self) -> list[PhaseRecord]:
-        """Records of the phases begun."""
-        return self.flight.phases
-
-    @property
-    def ending(self) -> str:
-        """Why the flight cannot go on, "" while it can."""
-        return self.flight.ending
-
-    @property
     def formation(self) -> str:
         """The current formation, or the one being formed."""
-        return self.phases[-1].formation or ""
+        return self.flight.phases[-1].formation or ""
 
     @property
     def busy(self) -> bool:
@@ -154,7 +153,7 @@ class Pilot:
         phase = self.commanded[-1]
         settle = _STEADY if phase.control == "open" else 0.0
         blend = phase.shaping.least_time if phase.shaping is not None else 0.0
-        return self.t < self.phases[-1].t_start + blend + settle - 1e-9
+        return self.t < self.flight.phases[-1].t_start + blend + settle - 1e-9
 
     # -- commands --------------------------------------------------------------------------------
 
@@ -172,13 +171,12 @@ class Pilot:
         ValueError
             It has no room where the target is.
         """
-        slots, before = self.mission.formation_slots(formation), self.flight.plan.slots
+        slots, before = self.mission.formation_slots(formation), self._slots
         assert slots is not None  # of all formations flown
-        assert before is not None
         far = float(np.linalg.norm(slots - before, axis=1).max())
         share = np.linspace(0.0, 1.0, math.ceil(far / _LOOK) + 2)[1:, None, None]
         way = before + share * (slots - before)  # straight and in step
-        room, agent, which = self._least_room(self.target.r + way @ self.target.attitude)
+        room, agent, which = self._least_room(way, self.target.r[None, None], self.target.attitude)
         k = int(room.argmin())
         if formation != self.formation and room[k] < 0.0:
             name = self.at_rest[which[k]].name
@@ -189,7 +187,7 @@ class Pilot:
 
     def gust(self, direction: Floats, strength: float) -> None:
         """Send a gust along ``direction`` (3,), at most ``strength`` [N/kg]."""
-        if self.ending:
+        if self.flight.ending:
             return
         d = direction / np.linalg.norm(direction)
         self.gusted = True
@@ -265,7 +263,7 @@ class Pilot:
     def step(self) -> Result:
         """Fly one tick; return the record of its end alone.
 
-        A flight that cannot go on sets ``ending`` and stops.
+        A flight that cannot go on says why in ``flight.ending``, and stops.
         """
         flight = self.flight
         flight.pieces.clear()
@@ -275,7 +273,12 @@ class Pilot:
                 self._begin_formation(self.waiting)
                 self.waiting = None
             elif self.commanded[-1].control == "open":
-                self._begin_hold()
+                self._begin_phase(
+                    Hold(kind="hold", name="by hand", duration=_ENDLESS, control="body")
+                )
+                if not flight.ending:
+                    self.pose = flight.pose()
+                    self.a, self.alpha = np.zeros(3), np.zeros(3)
         if not flight.ending:
             self._follow_target(TICK)
             self._update_obstacles()
@@ -283,18 +286,17 @@ class Pilot:
             flight.advance(self.ticks * TICK - t)
             for ball in self.flying:
                 ball.move(self.t - t)
-            self._end_on_contact()
+            if not flight.ending and (met := flight.contact()) is not None:
+                name = flight.mission.obstacles[met.other].name
+                flight.ending = f"agent {met.who + 1} met '{name}' at {met.time:.2f} s"
         if flight.pieces or self.last is None:
             end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
             # A record of one moment has no extremes
-            phases = [replace(p, extremes={}) for p in self.phases]
-            mission = flight.mission  # with the balls
-            result = assemble(
-                mission, phases, end, ending="", statistics={}, network=flight.network
-            )
-            result.mission = mission  # so that it is not parsed again
-            self.last = result
-            self.archive.add(flight.pieces, result)
+            phases = [replace(p, extremes={}) for p in self.flight.phases]
+            now: dict[str, Any] = {"ending": "", "statistics": {}, "network": flight.network}
+            self.last = assemble(flight.mission, phases, end, **now)
+            self.last.mission = flight.mission  # with the balls, and not parsed again
+            self.archive.add(flight.pieces, self.last)
         return self.last
 
     def result(self) -> Result:
@@ -302,28 +304,22 @@ class Pilot:
 
         Its mission has the phases as they were flown.
         """
-        ending = self.ending
+        ending = self.flight.ending
         if not ending and self.busy:
             ending = f"ended by hand on the way to '{self.formation}'"
-        now = self.flight.mission.obstacles
+        flight, now = self.flight, self.flight.mission
         flown = [ball.flown_sphere(self.t) for ball in self.balls if ball.turns]
-        self.flight.mission = self.flight.mission.model_copy(
-            update={"obstacles": (*self.mission.obstacles, *flown)}
-        )
-        result = self.flight.record(
-            self.archive.pieces(), self.commanded, step=self.archive.step, ending=ending
-        )
-        self.flight.mission = self.flight.mission.model_copy(update={"obstacles": now})
+        every = {"obstacles": (*self.mission.obstacles, *flown)}
+        flight.mission = now.model_copy(update=every)
+        pieces, step = self.archive.pieces(), self.archive.step
+        result = flight.record(pieces, self.commanded, step=step, ending=ending)
+        flight.mission = now
         if not self.gusted:
             result.statistics.pop("pushed", None)
         result.statistics["simulated_s"] = float(result.time[-1])
         return result
 
     # -- phases -----------------------------------------------------------------------------------
-
-    def _first_formation(self) -> str:
-        names = [p.shaping.formation for p in self.mission.phases if p.shaping is not None]
-        return next((n for n in names if n in self.formations), self.formations[0])
 
     def _begin_formation(self, formation: str, *, establish: bool = False) -> None:
         """Establish a formation, or change to it."""
@@ -335,12 +331,6 @@ class Pilot:
         else:
             self._begin_phase(Reshape(kind="reshape", name=f"change to {formation}", **common))
 
-    def _begin_hold(self) -> None:
-        self._begin_phase(Hold(kind="hold", name="by hand", duration=_ENDLESS, control="body"))
-        if not self.ending:
-            self.pose = self.flight.pose()
-            self.a, self.alpha = np.zeros(3), np.zeros(3)
-
     def _begin_phase(self, phase: Phase) -> None:
         if self.flight.begin(phase):
             self.commanded.append(phase)
@@ -350,7 +340,7 @@ class Pilot:
         step = self.archive.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.arange(low, high) * step
-        begun = self.archive.begun(len(self.phases) - 1)
+        begun = self.archive.begun(len(self.flight.phases) - 1)
         start = [] if begun else [t and np.nextafter(t, math.inf)]
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 
@@ -371,14 +361,6 @@ class Pilot:
         cm, v = self.masses @ seen.position / total, self.masses @ seen.velocity / total
         return Pose(cm, v, frame if frame is not None else np.eye(3), np.zeros(3))
 
-    def _place_to_turn(self, r: Floats) -> Floats:
-        """A point (3,) [m] at or above ``r``, high enough for the first formation to rotate about it."""
-        slots = self.flight.plan.slots
-        assert slots is not None  # every formation flown has slots
-        size = np.linalg.norm(slots, axis=1).max() + max(self.mission.agents.radius)
-        ground = float(self.mission.height_at(*r))
-        return np.array([r[0], r[1], max(r[2], ground + size + 0.5)])
-
     def _follow_target(self, h: float) -> None:
         """Move the target as commanded, and the reference after it, over the next tick."""
         target, pose = self.target, self.pose
@@ -388,7 +370,9 @@ class Pilot:
         r, v, a = _step_towards(target.r - pose.r, pose.v, self.a, h, _ACCELERATION)
         phi, omega, alpha = _step_towards(away, pose.omega, self.alpha, h, _TURN)
         if self.commanded[-1].control != "open":
-            force = self._drop_passed_gusts()
+            places = self._positions() if self.gusts else np.zeros((0, 3))
+            self.gusts = [gust for gust in self.gusts if not gust.has_passed(self.t, places)]
+            force = bool(self.gusts)
             ends = (r, v, a), (phi, omega, alpha)
             self.flight.steer(h, pose, *ends, a=self.a, alpha=self.alpha, force=force)
             T = att.dcm_from_rotation_vector(phi) @ pose.T
@@ -397,44 +381,48 @@ class Pilot:
 
     def _move_target(self, h: float) -> None:
         """Move and turn the target as commanded, but no slot deeper into an obstacle or the ground."""
-        target, held_off = self.target, ""
+        target, slots = self.target, self._slots
+        room, _, _ = self._least_room(slots, target.r[None, None], target.attitude)
+        least = min(float(room[0]), 0.0)
+
+        def obstacle_on(path: Floats, T: Floats) -> str:
+            """What a slot would be deeper in somewhere on a path (K, 3), "" for nothing."""
+            after, _, which = self._least_room(slots, path[:, None], T)
+            return "" if (after >= least).all() else self.at_rest[which[int(after.argmin())]].name
+
         turned = target.euler + h * target.turn
         turned[1] = np.clip(turned[1], -1.2, 1.2)  # clear of the poles
-        room, _, _ = self._least_room(self._slots_at(target.r[None], target.attitude))
-        least = min(float(room[0]), 0.0)
-        if target.turn.any():
-            after, _, which = self._least_room(
-                self._slots_at(target.r[None], att.dcm_from_euler(turned))
-            )
-            if after[0] >= least:
-                target.euler = turned
-            else:
-                held_off = self.at_rest[which[0]].name
+        held_off = obstacle_on(target.r[None], att.dcm_from_euler(turned))
+        if not held_off:
+            target.euler = turned
         way = h * target.move
         parts = [way] if np.count_nonzero(way) < 2 else [way, *(way * row for row in np.eye(3))]
-        for k, part in enumerate(parts):  # along what stands in the way
+        for part in parts:  # along what stands in the way
             looks = math.ceil(float(np.linalg.norm(part)) / _LOOK)
             if not looks:
                 continue
             path = target.r + np.linspace(0.0, 1.0, looks + 1)[1:, None] * part
-            after, _, which = self._least_room(self._slots_at(path, target.attitude))
-            if (after >= least).all():
-                target.r = target.r + part
-                if k == 0:
-                    break
-            else:
-                held_off = self.at_rest[which[int(after.argmin())]].name
+            if name := obstacle_on(path, target.attitude):
+                held_off = name
+                continue
+            target.r = target.r + part
+            if part is way:
+                break
         self.held_off = held_off
 
-    def _least_room(self, places: Floats) -> tuple[Floats, Ints, Ints]:
-        """Least room (K,) [m] of vehicles at places (K, N, 3) beside obstacles at rest, agent and obstacle (K,)."""
-        return proximity.clearance(places, self.mission.fleet.radius, self.at_rest)
-
-    def _slots_at(self, r: Floats, T: Floats) -> Floats:
-        """Places (K, N, 3) [m] of the slots with the body at r (K, 3) in an attitude T (3, 3)."""
+    @property
+    def _slots(self) -> Floats:
+        """Slots (N, 3) [m] of the formation, body axes."""
         slots = self.flight.plan.slots
         assert slots is not None  # every formation flown has slots
-        return r[:, None] + slots @ T
+        return slots
+
+    def _least_room(self, slots: Floats, r: Floats, T: Floats) -> tuple[Floats, Ints, Ints]:
+        """Least room (K,) [m] of slots (N, 3) or (K, N, 3) beside obstacles at rest, agent and obstacle (K,).
+
+        The body is at r (K or 1, 1, 3), in an attitude T (3, 3).
+        """
+        return proximity.clearance(r + slots @ T, self.mission.fleet.radius, self.at_rest)
 
     # -- obstacles --------------------------------------------------------------------------------
 
@@ -442,10 +430,10 @@ class Pilot:
         """Tell the flight of balls that are new, gone, or fly another way."""
         for ball in self.flying:
             ball.follow_goal()
-        fresh = [ball for ball in self.flying if ball.changed]
-        for ball in fresh:
-            ball.note_turn(self.t)
-        if fresh or self.moved:
+            if ball.changed:
+                ball.note_turn(self.t)
+                self.moved = True
+        if self.moved:
             self.moved = False
             seen = [
                 ball.predicted_sphere(self.t) if ball.until is None else ball.flown_sphere(self.t)
@@ -453,32 +441,10 @@ class Pilot:
             ]
             self.flight.among((*self.mission.obstacles, *seen))
 
-    def _end_on_contact(self) -> None:
-        """End the flight if a vehicle has met an obstacle."""
-        met = None if self.flight.ending else self.flight.contact()
-        if met is not None:
-            name = self.flight.mission.obstacles[met.other].name
-            self.flight.ending = f"agent {met.who + 1} met '{name}' at {met.time:.2f} s"
-
     # -- wind -------------------------------------------------------------------------------------
 
-    def _drop_passed_gusts(self) -> bool:
-        """Remove gusts that have passed; return whether one remains."""
-        if not self.gusts:
-            return False
-        r, t = self._positions(), self.t
-        self.gusts = [
-            g
-            for g in self.gusts
-            if t < g.start + g.length + (float((r @ g.direction).max()) - g.origin) / g.speed + 1.0
-        ]
-        return bool(self.gusts)
-
     def _wind_force(self, t: float, r: Floats, _v: Floats) -> Floats:
-        force = np.zeros_like(r)
-        for gust in self.gusts:
-            force += gust.force(t, r, self.masses)
-        return force
+        return sum((gust.force(t, r, self.masses) for gust in self.gusts), np.zeros_like(r))
 
 
 def _step_towards(

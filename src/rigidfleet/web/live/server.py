@@ -121,13 +121,10 @@ class _Handler(BaseHTTPRequestHandler):
         """Whether our page sends the request, to our own address; a command also names its origin."""
         hosts_named, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
-        if (
-            len(hosts_named) != 1
-            or hosts_named[0] not in hosts
-            or not self.path.startswith(self.base)
-        ):
+        host = hosts_named[0] if len(hosts_named) == 1 else ""
+        if host not in hosts or not self.path.startswith(self.base):
             return False
-        return origins == [f"http://{hosts_named[0]}"] or (not origins and self.command == "GET")
+        return origins == [f"http://{host}"] or (not origins and self.command == "GET")
 
     def _answer(self, status: HTTPStatus, text: str, kind: str = "text/plain") -> None:
         data = text.encode()

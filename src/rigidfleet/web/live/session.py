@@ -9,6 +9,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ class Session:
     def __init__(self, mission: Mission, landed: Callable[[Result], str] | None = None) -> None:
         self.mission, self.unguarded = with_avoidance(mission)
         self.landed = landed
+        self.flown: Result | None = None  # the last flight that ended
         self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
         self.tension = _TENSION * weight(mission)
@@ -93,9 +95,10 @@ class Session:
         }
 
     def land(self) -> None:
-        """Pass the flight to ``landed``."""
-        if self.pilot.ticks > 1 and self.landed is not None:
-            self.farewell = self.landed(self.pilot.result())
+        """Keep the flight, and pass it to ``landed``."""
+        if self.pilot.ticks > 1:
+            self.flown = self.pilot.result()
+            self.farewell = self.landed(self.flown) if self.landed is not None else ""
 
     # -- pages ------------------------------------------------------------------------------------
 
@@ -111,9 +114,9 @@ class Session:
         return {
             "phases": [
                 {"name": p.name, "start": p.t_start, "end": p.t_end, "position": None}
-                for p in pilot.phases
+                for p in pilot.flight.phases
             ],
-            "ending": pilot.ending,
+            "ending": pilot.flight.ending,
             "formation": pilot.formation,
             "waiting": pilot.waiting,
             "busy": pilot.busy,
@@ -144,10 +147,8 @@ class Session:
     def _send_to_pages(self, message: bytes) -> None:
         with self.lock:
             for messages in self.pages:
-                try:
+                with suppress(queue.Full):
                     messages.put_nowait(message)
-                except queue.Full:
-                    continue
 
     def _sample_event(self) -> bytes:
         """The last sample as numbers: time and the columns of the page, one after the other."""
@@ -187,10 +188,9 @@ class Session:
                 case {"ball": place, "radius": radius, "velocity": velocity}:
                     place, velocity = _vector(place, _FARTHEST), _vector(velocity, _FASTEST)
                     self.pilot.push_in(place, _number(radius, _FARTHEST), velocity)
-                case {"pull": int(slot), "to": None}:
-                    self.pilot.pull(slot, None)
                 case {"pull": int(slot), "to": place}:
-                    self.pilot.pull(slot, _vector(place, _FARTHEST))
+                    goal = None if place is None else _vector(place, _FARTHEST)
+                    self.pilot.pull(slot, goal)
                 case {"remove": int(slot)}:
                     self.pilot.take_out(slot)
                 case {"loss": share}:
@@ -247,7 +247,7 @@ class Session:
                 self.pace = round(flown * TICK / (now - measured) / self.speed, 1)
                 measured, flown = now, 0
             with self.lock:
-                if self.pages and not (self.paused or self.pilot.ending):
+                if self.pages and not (self.paused or self.pilot.flight.ending):
                     self.result = self.pilot.step()
                     flown += 1
                     self._send_to_pages(self._sample_event())

@@ -11,7 +11,7 @@ from rigidfleet.math import attitude as att
 from rigidfleet.plotting import agent_colours
 from rigidfleet.plotting.areas import falls_of
 from rigidfleet.plotting.logged import off_plan
-from rigidfleet.plotting.quadrotors import rotor_forces, rotor_limits
+from rigidfleet.plotting.quadrotors import has_rotors, rotor_forces, rotor_limits
 from rigidfleet.result import quantities
 from rigidfleet.result.lights import has_lights, lights
 from rigidfleet.solids.distance import displacement
@@ -22,7 +22,7 @@ from rigidfleet.web.replay.pack import PackedColumn
 
 if TYPE_CHECKING:
     from rigidfleet.mission import Mission, Obstacle
-    from rigidfleet.mission.fences import Fence, People
+    from rigidfleet.mission.fences import Area
     from rigidfleet.result import Result
 
 _LINES = 12  # greatest number of lines in a plot; for more agents, the least and the greatest value
@@ -41,13 +41,13 @@ def describe(result: Result, shown: Ints, tension: float) -> dict[str, Any]:
     mission = result.mission
     boxes = [(o.name, o.corners) for o in mission.obstacles if is_plain_box(o) and o.corners]
     fence = mission.limits.geofence
-    rotors = np.isfinite(rotor_limits(mission))  # of a fleet of points, nothing
+    rotors = {"rotors": np.isfinite(rotor_limits(mission)).tolist()} if has_rotors(result) else {}
     return {
         "name": mission.name,
         "title": mission.title,
         "radius": mission.agents.radius,
         "colours": agent_colours(mission.n_agents),
-        **({"rotors": rotors.tolist()} if rotors.any() else {}),
+        **rotors,
         "edges": result.edges[shown],
         "tension": tension,
         "boxes": [{"name": name, "min": ends[:3], "max": ends[3:]} for name, ends in boxes],
@@ -85,17 +85,20 @@ def _solid(thing: Obstacle) -> dict[str, Any]:
 
 def _areas(mission: Mission) -> list[dict[str, Any]]:
     """Fences and places with people: their rings (m, 2) [m], and their heights [m], None where they have no end."""
-
-    def entry(area: Fence | People, kind: str, *, hatched: bool) -> dict[str, Any]:
-        rings = [ring for rings in area.polygons(mission.geodetic_origin) for ring in rings]
-        heights = [x if np.isfinite(x) else None for x in area.heights(mission.ground)]
-        return {"name": area.name, "kind": kind, "hatched": hatched, "rings": rings, "heights": heights}  # fmt: skip
-
-    fences = [
-        entry(x, "soft" if x.soft else "fence", hatched=x.kind == "exclusion")
-        for x in mission.fences
+    areas: list[tuple[Area, str, bool]] = [
+        (x, "soft" if x.soft else "fence", x.kind == "exclusion") for x in mission.fences
     ]
-    return [*fences, *(entry(x, "people", hatched=True) for x in mission.people)]
+    areas += [(x, "people", True) for x in mission.people]
+    return [
+        {
+            "name": area.name,
+            "kind": kind,
+            "hatched": hatched,
+            "rings": area.rings(mission.geodetic_origin),
+            "heights": [x if np.isfinite(x) else None for x in area.heights(mission.ground)],
+        }
+        for area, kind, hatched in areas
+    ]
 
 
 def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
@@ -105,12 +108,8 @@ def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColu
     fine = max(typical_reach(result), *mission.agents.radius, 1e-9) / 20_000
     return {
         "position": PackedColumn(result.position, fine),
-        **_attitude_columns(result),
-        **_avoidance_columns(result),
-        **_light_columns(result),
-        **_silence_columns(result, shown),
-        **_boundary_columns(result, fine),
-        **_doubt_columns(result, fine),
+        **dict(_attitude_columns(result)),
+        **dict(_further_columns(result, shown, fine)),
         "slot": PackedColumn(result.slot_position - result.position, fine),
         "cm": PackedColumn(result.cm, fine),
         "attitude": PackedColumn(result.attitude, 1e-4),
@@ -126,67 +125,44 @@ def _tensions(result: Result, shown: Ints) -> Floats:
     return np.where(np.isfinite(result.constraint[:, shown]), np.nan_to_num(tension), tension)
 
 
-def _attitude_columns(result: Result) -> dict[str, PackedColumn]:
+def _attitude_columns(result: Result) -> Iterator[tuple[str, PackedColumn]]:
     """Samples that turn vehicles: attitudes and shares of the rotors' limits, and of points the thrust's direction."""
-    mission, columns = result.mission, {}
+    mission = result.mission
     limits = rotor_limits(mission)
-    known = np.isfinite(limits)
+    known = np.isfinite(limits) & has_rotors(result)
     if not known.all():
         force = result.input_force + result.constraint_force
-        columns["thrust"] = PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
-    if known.any():
-        q, force, saturated = result.vehicle_attitude, result.rotor_force, result.saturated
-        assert q is not None
-        assert force is not None
-        assert saturated is not None
+        yield "thrust", PackedColumn(thrust_directions(force, mission.fleet.mass), 5e-4)
+    q, force, saturated = result.vehicle_attitude, result.rotor_force, result.saturated
+    if known.any() and q is not None and force is not None and saturated is not None:
         share = np.where(known[:, None], force / np.where(known, limits, 1.0)[:, None], 0.0)
-        columns["turn"] = PackedColumn(att.unwrap_quaternion(q.swapaxes(0, 1)).swapaxes(0, 1), 1e-3)
-        columns["rotors"] = PackedColumn(share, 0.01)
-        columns["saturated"] = PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
-    return columns
+        yield "turn", PackedColumn(att.unwrap_quaternion(q.swapaxes(0, 1)).swapaxes(0, 1), 1e-3)
+        yield "rotors", PackedColumn(share, 0.01)
+        yield "saturated", PackedColumn(np.where(result.left, saturated != 0, 0.0), 1.0)
 
 
-def _avoidance_columns(result: Result) -> dict[str, PackedColumn]:
-    """Samples of the layers of avoidance: the clock's rate, the body's way [m]; 1 where barriers act, 2 the guard."""
-    layers, rate, way = result.avoidance_layers, result.clock_rate, result.body_displacement
-    if layers is None or rate is None or way is None:
-        return {}
-    acts = np.where(layers > 1, 2.0, np.where(layers == 1, 1.0, 0.0))
-    return {
-        "clock": PackedColumn(rate, 0.01),
-        "aside": PackedColumn(np.linalg.norm(way, axis=1), 0.01),
-        "acts": PackedColumn(acts, 1.0),
-    }
-
-
-def _silence_columns(result: Result, shown: Ints) -> dict[str, PackedColumn]:
-    """Samples of links: how near an edge is to being let go for want of messages, from 0 to 1."""
-    age, net = result.message_age, result.mission.network
-    if age is None or net is None:
-        return {}
-    oldest = np.where(np.isnan(age), np.inf, age)[:, shown].max(axis=2)
-    return {"silent": PackedColumn(np.minimum(oldest / net.silence, 1.0), 0.01)}
-
-
-def _boundary_columns(result: Result, fine: float) -> dict[str, PackedColumn]:
-    """Samples of places beside fences and people: where each vehicle falls that fails then."""
-    mission = result.mission
-    if not (mission.fences or mission.people):
-        return {}
-    return {"fall": PackedColumn(falls_of(result), fine)}
-
-
-def _doubt_columns(result: Result, fine: float) -> dict[str, PackedColumn]:
-    """Samples of a log beside its plan: how far the place of each vehicle is in doubt."""
-    off = off_plan(result)
-    return {} if off is None else {"doubt": PackedColumn(off.doubt, fine)}
-
-
-def _light_columns(result: Result) -> dict[str, PackedColumn]:
-    """Samples of each vehicle's light: red, green and blue; nothing by day."""
-    if not has_lights(result):
-        return {}
-    return {"light": PackedColumn(lights(result, result.time), 1 / 255)}
+def _further_columns(
+    result: Result, shown: Ints, fine: float
+) -> Iterator[tuple[str, PackedColumn]]:
+    """Samples that some flights have: layers of avoidance, lights, ages of messages, falls, doubt."""
+    mission, layers, age = result.mission, result.avoidance_layers, result.message_age
+    way = result.body_displacement
+    if layers is not None and way is not None and result.clock_rate is not None:
+        yield "clock", PackedColumn(result.clock_rate, 0.01)
+        yield "aside", PackedColumn(np.linalg.norm(way, axis=1), 0.01)
+        # 1 where barriers act, 2 the guard
+        acts = np.where(layers > 1, 2.0, np.where(layers == 1, 1.0, 0.0))
+        yield "acts", PackedColumn(acts, 1.0)
+    if has_lights(result):  # red, green and blue
+        yield "light", PackedColumn(lights(result, result.time), 1 / 255)
+    if age is not None and (net := mission.network) is not None:
+        # How near an edge is to being let go for want of messages, from 0 to 1
+        oldest = np.where(np.isnan(age), np.inf, age)[:, shown].max(axis=2)
+        yield "silent", PackedColumn(np.minimum(oldest / net.silence, 1.0), 0.01)
+    if mission.fences or mission.people:
+        yield "fall", PackedColumn(falls_of(result), fine)
+    if (off := off_plan(result)) is not None:
+        yield "doubt", PackedColumn(off.doubt, fine)
 
 
 def sight_points(
@@ -199,7 +175,7 @@ def sight_points(
     [s].
     """
     reach = max(float(np.linalg.norm(high - low)), 1e-6)
-    seen = []
+    boxes = []
     for box in mission.solids:  # of a height map only what is drawn
         ends = extent(box.solid)
         if box.kind == "heights":
@@ -207,14 +183,13 @@ def sight_points(
         far = reach
         if box.solid.moves:
             ends, far = _box_of_passing(box.solid, low, high, begin, end), _BESIDE * reach
-        near = np.maximum(ends[0], low - far), np.minimum(ends[1], high + far)
-        seen += [near] if (near[0] <= near[1]).all() else []
+        boxes.append((*ends, far))
     for area in _areas(mission):
         flat, (floor, ceiling) = np.concatenate(area["rings"]), area["heights"]
         heights = low[2] if floor is None else floor, high[2] if ceiling is None else ceiling
-        ends = np.column_stack([[flat.min(axis=0), flat.max(axis=0)], heights])
-        near = np.maximum(ends[0], low - reach), np.minimum(ends[1], high + reach)
-        seen += [near] if (near[0] <= near[1]).all() else []
+        boxes.append((*np.column_stack([[flat.min(axis=0), flat.max(axis=0)], heights]), reach))
+    near = [(np.maximum(a, low - far), np.minimum(b, high + far)) for a, b, far in boxes]
+    seen = [ends for ends in near if (ends[0] <= ends[1]).all()]
     if len(seen) > _BOXES:
         seen = [(np.min([a for a, _ in seen], axis=0), np.max([b for _, b in seen], axis=0))]
     ends = np.array([(low, high), *seen])  # (1 + boxes, 2, 3)
@@ -257,11 +232,6 @@ def weight(mission: Mission) -> float:
     return float(np.mean(mission.agents.mass)) * max(mission.gravity, 1.0)
 
 
-def _line_colours(n: int) -> list[str]:
-    """Colours of `_lines` of n vehicles."""
-    return agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
-
-
 def _lines(values: Floats) -> Floats:
     """Lines (K, L) of a plot: the values (K, N) of each vehicle, or of many the least and the greatest."""
     if values.shape[1] <= _LINES:
@@ -272,7 +242,8 @@ def _lines(values: Floats) -> Floats:
 def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
     """Quantities drawn over time, as the page knows them, each with its samples."""
     mission, off, n = result.mission, off_plan(result), result.n_agents
-    limits, rotors, colours = mission.limits, rotor_limits(mission), _line_colours(n)
+    limits = mission.limits
+    colours = agent_colours(n) if n <= _LINES else ["#8FA3B8", "#20262D"]
 
     def plot(name: str, title: str, values: Floats, step: float, **look: Any) -> Any:
         basic = {
@@ -281,8 +252,8 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
         }  # fmt: skip
         return basic | look, PackedColumn(values, step)
 
-    if off is None and np.isfinite(rotors).any():
-        share = 100.0 * rotor_forces(result).max(axis=2) / rotors
+    if has_rotors(result):
+        share = 100.0 * rotor_forces(result).max(axis=2) / rotor_limits(mission)
         look: dict[str, Any] = {"unit": "%", "colours": colours, "limits": [100.0] * len(colours)}
         yield plot("rotor", "Rotors, share of limit", _lines(share), 0.1, **look)
     elif off is None and result.interpolation is None:  # else nobody knows the thrust
@@ -294,7 +265,7 @@ def _plots(result: Result) -> Iterator[tuple[dict[str, Any], PackedColumn]]:
                 title, thrust = f"{title}, as share of limit", 100.0 * thrust / most
                 look |= {"unit": "%", "limits": [None, 100.0]}
         yield plot("thrust", title, _lines(thrust), 1e-3, **look)
-    if off is not None or np.isfinite(rotors).any():
+    if off is not None or has_rotors(result):
         worst, limit = quantities.samples(result, "tracking_error").worst, limits.tracking_error
         if off is not None:  # beside the line, the band that it may be in
             worst = np.stack([worst, *np.fmax.reduce(off.interval, axis=2)], axis=1)
