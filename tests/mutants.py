@@ -452,7 +452,7 @@ def fly_with(plain: str) -> None:
 
     compiler.compiled_copy = copied
     from rigidfleet.kernel import guard, monitor, obstacles
-    from rigidfleet.kernel.engine import native, packing, sampled
+    from rigidfleet.kernel.engine import native, packing
 
     def record(_: int, p: Any, w: Any, segment: int, out: int) -> None:
         of = packing.pack(p).address, packing.pack(w).address
@@ -474,8 +474,7 @@ def fly_with(plain: str) -> None:
         monitor.watch_forces(int(last), problem, work, state, watch.monitor)
 
     def avoid(*addresses: int) -> int:
-        kept = (*sampled._last.packed, *packing._last.packed.values())
-        of = {x.address: x.of for x in kept}
+        of = {x.address: x.of for x in packing._last.packed.values()}
         flight, state, avoidance = (of[x] for x in addresses[:3])
         problem, work = (of[int(x)] for x in avoidance.law)
         with np.errstate(all="ignore"):

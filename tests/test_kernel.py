@@ -25,7 +25,6 @@ from rigidfleet.kernel import (
     references,
     rigid_body,
 )
-from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.cache import cache_directory
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.engine.native import is_compiled
@@ -828,9 +827,7 @@ def test_a_second_process_makes_what_is_apart(helped):
     """It is not made again; if the second process fails, the first one makes it."""
     code = f"""
 import subprocess
-from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.engine import build, objects
-numba_internals.translate_only()
 second = subprocess.Popen(objects.build_command("apart"), stdout=subprocess.PIPE)
 if not {helped}:
     second.kill()
@@ -841,35 +838,6 @@ assert len(made) == {int(not helped)}
 """
     environment = os.environ | {"NUMBA_OPT": "0"}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)
-
-
-@pytest.mark.long
-def test_a_numba_that_was_not_tested_builds_the_same_kernel():
-    """Where Numba's internals are not known, its public functions alone build the kernel; flights are the same bits."""
-    code = """
-import hashlib, sys
-from rigidfleet.kernel.compiler import numba_internals
-if sys.argv[1] == "other":
-    numba_internals.TESTED = ()
-    assert not numba_internals.known()
-    from rigidfleet.kernel.engine import build, native
-    native._loaded["flight"] = native._link("flight", *native._of_objects(build.machine_code()))
-import rigidfleet as rf
-print(hashlib.sha256(rf.simulate("establish-triangle").position.tobytes()).hexdigest())
-"""
-    environment = os.environ | {"NUMBA_OPT": "0"}
-    ours, theirs = (
-        subprocess.run(
-            [sys.executable, "-c", code, which], check=True, env=environment, capture_output=True
-        ).stdout
-        for which in ("tested", "other")
-    )
-    assert ours == theirs
-
-
-def test_numba_is_one_that_was_tested():
-    """Who updates Numba tries the build, and names the version beside what is taken from it."""
-    assert numba.__version__ in numba_internals.TESTED
 
 
 @pytest.mark.parametrize("change", ["type", "order", "dimensions"])

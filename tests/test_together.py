@@ -227,8 +227,9 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
     problems = [plan.problem for plan, _ in plans]
     assert batch.fit_together(problems)
     begin, end = plans[0][0].start, plans[0][0].t_end
-    tables = codegen.Tables([p.disturbance for p in problems]).between(begin, end)
-    ready = codegen.unrolled_together(problems, tables)
+    ready = codegen.unrolled_together(
+        problems, codegen.tables_of([p.disturbance for p in problems])
+    )
     random = np.random.default_rng(0)
     middle = 0.7 * begin + 0.3 * end
     # The last stage of a step is at the moment of the one before.

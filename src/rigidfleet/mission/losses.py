@@ -132,10 +132,8 @@ def in_time(m: Draft, time: float, path: Keys) -> Breaches:
         yield Breach((*path, "time"), problem, "give an earlier time or remove the entry")
 
 
-def under_way(
-    phases: Sequence[AnyPhase], t: float, *, ever_after: bool = False
-) -> Iterator[tuple[int, AnyPhase]]:
-    """Phases that may be under way at a time [s], or also later: one that settles may do so early or late."""
+def under_way(phases: Sequence[AnyPhase], t: float) -> Iterator[tuple[int, AnyPhase]]:
+    """Phases that may be under way at a time [s]: one that settles may do so early or late."""
     first = last = 0.0
     for k, p in enumerate(phases):
         begin = first
@@ -147,7 +145,7 @@ def under_way(
             length = seconds(p.duration or 0.0)
             known = math.isfinite(length)
             first, last = first + (length if known else 0.0), last + (length if known else math.inf)
-        if last >= t and (begin <= t or ever_after):
+        if begin <= t <= last:
             yield k, p
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from rigidfleet.mission import Settle
 from rigidfleet.planning.disturbances import without
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.vehicles import YawTurn
 from rigidfleet.simulation.callbacks import (
     Command,
     Controller,
@@ -26,10 +25,8 @@ from rigidfleet.simulation.callbacks import (
     call_user,
     checked_force,
 )
-from rigidfleet.simulation.diagnosis import Place
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.recording import (
-    FollowedReferences,
     LayerSamples,
     Piece,
     Unevaluated,
@@ -56,6 +53,8 @@ class Stepper:
     delay = 0.0
     #: Time by which the plan's references are behind now, in the mean of the vehicles' own clocks [s].
     behind = 0.0
+    #: How vehicles turn about the vertical, a `YawTurn`; None of points.
+    turn: Any = None
 
     def __init__(self, phase: ActivePhase) -> None:
         self.phase = phase
@@ -72,11 +71,6 @@ class Stepper:
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
         raise NotImplementedError
-
-    @property
-    def turn_about_vertical(self) -> YawTurn | None:
-        """How vehicles turn about the vertical, if they do."""
-        return None
 
     def decide(self, *, by_law: bool) -> float:
         """Decide how to fly on, ``by_law`` or under a controller; returns until when that holds [s]."""
@@ -169,11 +163,6 @@ class ActivePhase:
     def flew(self) -> bool:
         """Whether anything of the phase was flown, or was to be when the flight stopped."""
         return self.begun or self.t > self.plan.start
-
-    @property
-    def place(self) -> Place:
-        """The current state of the phase, for a diagnosis."""
-        return Place(self.plan, self.t, self.state, self.workspace, self.solver)
 
     @property
     def has_settled(self) -> bool | None:
@@ -386,28 +375,12 @@ class ActivePhase:
         vehicles: VehicleSamples | None = None,
         layers: LayerSamples | None = None,
     ) -> None:
-        """Store a piece of the phase."""
-        edges, attached = self.plan.edges, self.plan.attached
-        references = self._references(times)
+        """Store a piece of the phase, with what the slots follow if they are tracked."""
+        plan, followed = self.plan, ()
+        problem, turn = plan.problem, self.stepper.turn
+        if problem.control.kind == TRACKING and len(times):
+            followed = ((times[0], problem.reference, problem.motion, turn),)
+        samples = times, source, integral, frame
         self.pieces.append(
-            Piece(
-                self.index,
-                times,
-                source,
-                integral,
-                frame,
-                edges,
-                attached,
-                references,
-                vehicles,
-                layers,
-            )
+            Piece(self.index, *samples, plan.edges, plan.attached, followed, vehicles, layers)
         )
-
-    def _references(self, times: Floats) -> FollowedReferences:
-        """What the slots follow at the samples, if they are tracked, and how the vehicles turn."""
-        plan = self.plan
-        if plan.problem.control.kind != TRACKING or not len(times):
-            return ()
-        turn = self.stepper.turn_about_vertical
-        return ((times[0], plan.problem.reference, plan.problem.motion, turn),)

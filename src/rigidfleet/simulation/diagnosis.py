@@ -3,33 +3,25 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import Workspace
-from rigidfleet.kernel.records import ACCEPTED, NEXT_STEP, REJECTED, IntegratorState
+from rigidfleet.kernel.records import ACCEPTED, NEXT_STEP, REJECTED
 from rigidfleet.math.constraint_jacobian import jacobian
 from rigidfleet.planning import solvers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 
+if TYPE_CHECKING:
+    from rigidfleet.simulation.active_phase import ActivePhase
+
 #: What to do about distance errors that no feedback corrects.
 _FEEDBACK = '; without feedback, errors grow: stabilisation = "pid" corrects them'
 
 
-class Place(NamedTuple):
-    """The current state of a phase under way."""
-
-    plan: PhasePlan
-    t: float  # [s]
-    state: IntegratorState
-    workspace: Workspace
-    solver: Any  # of large systems, or None
-
-
-def diagnose(at: Place, *, own_force: bool, collapsed: bool) -> str:
+def diagnose(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
     """Say when, where and why the integrator could not go on, and what to try.
 
     ``own_force``: whether a user's force function acts on the agents; ``collapsed``: whether the step size has
@@ -90,7 +82,7 @@ def _smoother(plan: PhasePlan) -> str:
     return words
 
 
-def _remedy(at: Place, *, own_force: bool, collapsed: bool) -> str:
+def _remedy(at: ActivePhase, *, own_force: bool, collapsed: bool) -> str:
     """What to try if J is not the cause."""
     beyond = at.t + 1e-9 * max(1.0, at.t)  # a jump at at.t shows only after it
     native.closed_loop(beyond, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)
@@ -123,7 +115,7 @@ def _remedy(at: Place, *, own_force: bool, collapsed: bool) -> str:
     )
 
 
-def _jacobian(at: Place) -> tuple[Floats, int, float]:
+def _jacobian(at: ActivePhase) -> tuple[Floats, int, float]:
     """J (m, 3N) at the integrator's state, the shortest edge and its length [m]."""
     edges = at.plan.edges
     native.closed_loop(at.t, at.state.y, np.empty_like(at.state.y), at.plan.problem, at.workspace)

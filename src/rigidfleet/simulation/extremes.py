@@ -152,17 +152,19 @@ class CurveWatch:
         deepest = min(contacts, key=lambda x: x.value, default=None)
         return deepest if deepest is not None and deepest.value < -_TOUCH else None
 
-    def take_path(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
-        """Evaluate the paths alone of the steps in a trail, not the forces."""
+    def take_path(
+        self, problem: Problem, work: Workspace, state: records.IntegratorState, first: int = 0
+    ) -> None:
+        """Evaluate the paths alone of the steps in a trail from ``first`` on, not the forces."""
         steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, 0, steps)
-        self._take_boundaries(problem, state, 0, steps)
+        self._take_solids(problem, state, first, steps)
+        self._take_boundaries(problem, state, first, steps)
         if self.n > _FEW:
-            for step in range(steps):
+            for step in range(first, steps):
                 self._step(problem, work, state, step)
             return
-        self.monitor.distances(problem, state, 0, steps)
-        self._find_contacts(problem, work, state, np.arange(steps))
+        self.monitor.distances(problem, state, first, steps)
+        self._find_contacts(problem, work, state, np.arange(first, steps))
 
     def _find_contacts(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, some: Ints
@@ -411,16 +413,7 @@ class Extremes(CurveWatch):
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
-        first = int(self.monitor.monitor.count[records.STAYED])
-        steps = int(state.count[records.TRAILED])
-        self._take_solids(problem, state, first, steps)
-        self._take_boundaries(problem, state, first, steps)
-        if self.n > _FEW:
-            for step in range(first, steps):
-                self._step(problem, work, state, step)
-        else:
-            self.monitor.distances(problem, state, first, steps)
-        self._find_contacts(problem, work, state, np.arange(first, steps))
+        self.take_path(problem, work, state, int(self.monitor.monitor.count[records.STAYED]))
         self.monitor.forces(problem, work, state, last=last)
 
     def room(self, state: records.IntegratorState) -> int:

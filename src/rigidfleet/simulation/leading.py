@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -105,7 +106,6 @@ class Leader:
         self.now: LeaderState | None = None
         self.leads = False  # whether the reference flown is another than the plan's
         self.calm = True  # whether no barrier asks for more than the deviation's own decay
-        self._unscalable: bool | None = None
         n = max(1, round(_PERIOD / self.period))
         self.period *= n
 
@@ -317,7 +317,7 @@ class Leader:
         for o in np.flatnonzero(sight.moves == 0):
             more, least, _ = self._barriers(o, r, v, rise, arms, limit, a)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
-        if self._scales():
+        if self._any_scale([self.deviation]) or self._scalable:
             more, least = scale_rows(self.deviation)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         else:
@@ -331,17 +331,15 @@ class Leader:
         greatest = greatest_acceleration(change, arms, z)
         return accelerations + min(1.0, limit / max(greatest, 1e-12)) * change
 
-    def _scales(self) -> bool:
+    @cached_property
+    def _scalable(self) -> bool:
         """Whether slots may be scaled: their distances are those of the edges."""
-        if not self._any_scale([self.deviation]) and self._unscalable is None:
-            plan = self.plan
-            if plan.slots is None:
-                self._unscalable = True
-            else:
-                i, j = plan.edges.T
-                d = np.linalg.norm(plan.slots[i] - plan.slots[j], axis=1)
-                self._unscalable = not np.allclose(d, plan.distances, rtol=0.0, atol=1e-6)
-        return not self._unscalable
+        plan = self.plan
+        if plan.slots is None:
+            return False
+        i, j = plan.edges.T
+        d = np.linalg.norm(plan.slots[i] - plan.slots[j], axis=1)
+        return np.allclose(d, plan.distances, rtol=0.0, atol=1e-6)
 
     def _slots(self, t: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Slots (N, 3), velocities, accelerations without those of the deviation, and arms from the body's origin."""

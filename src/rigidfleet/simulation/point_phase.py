@@ -97,7 +97,7 @@ class PointPhase(Stepper):
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
             own_force = phase.external is not None
-            raise StoppedError(diagnose(phase.place, own_force=own_force, collapsed=collapsed))
+            raise StoppedError(diagnose(phase, own_force=own_force, collapsed=collapsed))
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes.

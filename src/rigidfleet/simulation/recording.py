@@ -339,12 +339,9 @@ def distances(
     close = proximity.closeness(
         places.positions, mission.agents.radius, mission.obstacles, time, left
     )
-    own = {
-        name: getattr(close, name).copy()
-        for name in ("separation", "pair", "clearance", "agent", "obstacle")
-    }
-    _put(worst, time, close._replace(**own))
-    return dict(zip(CLOSE, own.values(), strict=True))
+    _put(worst, time, close)
+    arrays = close.separation, close.pair, close.clearance, close.agent, close.obstacle
+    return dict(zip(CLOSE, arrays, strict=True))
 
 
 def _references(

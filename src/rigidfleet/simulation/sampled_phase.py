@@ -104,6 +104,7 @@ class SampledPhase(Stepper):
     """
 
     by_ticks = True
+    turn: YawTurn
 
     def __init__(self, phase: ActivePhase, vehicles: FleetState) -> None:
         super().__init__(phase)
@@ -219,11 +220,6 @@ class SampledPhase(Stepper):
         plan.through = tuple(at | {"time": postponed_time(at["time"])} for at in plan.through)
         if self.slowed is None and (self.sampled.tau[:, PACE] < _SLOWED).any():
             self.slowed = t, int(self.sampled.tau[:, WORST].argmax())
-
-    @property
-    def turn_about_vertical(self) -> YawTurn:
-        """How vehicles turn about the vertical."""
-        return self.turn
 
     def steer(self, problem: Problem) -> None:
         """Take up a problem that was made by hand: the layers above the barriers then rest."""
@@ -381,7 +377,7 @@ class SampledPhase(Stepper):
             )
         if status != records.FINISHED:
             own = phase.external is not None
-            raise StoppedError(diagnose(phase.place, own_force=own, collapsed=True))
+            raise StoppedError(diagnose(phase, own_force=own, collapsed=True))
 
     def _supply(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""

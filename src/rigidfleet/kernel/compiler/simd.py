@@ -272,22 +272,6 @@ def fill_lanes(_context, x):
 
 
 @intrinsic
-def gather(_context, addresses, offset):
-    """Lanes of the numbers at eight addresses (8,), plus an offset in numbers."""
-
-    def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        places = context.make_array(sig.args[0])(context, builder, args[0]).data
-        pointer, vector = ir.DoubleType().as_pointer(), ir.Constant(VECTOR, ir.Undefined)
-        for lane in range(WIDTH):
-            place = builder.load(builder.gep(places, [ir.Constant(_INDEX, lane)]))
-            place = builder.gep(builder.inttoptr(place, pointer), [args[1]])
-            vector = builder.insert_element(vector, builder.load(place), ir.Constant(_INDEX, lane))
-        return vector
-
-    return lanes(addresses, types.int64), generate
-
-
-@intrinsic
 def spread(_context, x, addresses, offset):
     """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
 

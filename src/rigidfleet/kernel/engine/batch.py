@@ -15,10 +15,10 @@ from rigidfleet.kernel.compiler.pointers import by_address
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
 from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
-    Tables,
     addresses,
     integrate,
     packed,
+    tables_of,
     unrolled,
     unrolled_together,
 )
@@ -175,7 +175,7 @@ class Vector:
     """
 
     def __init__(self, disturbances: Sequence[Disturbance]) -> None:
-        self._tables = Tables(disturbances)
+        self._tables = tables_of(disturbances)
 
     def begin(
         self,
@@ -199,8 +199,7 @@ class Vector:
             The problems take different branches.
         """
         self._states, self._t_end, self._times = states, t_end, times
-        tables = self._tables.between(float(states[0].clock[TIME]), t_end)
-        ready = unrolled_together(problems, tables)
+        ready = unrolled_together(problems, self._tables)
         first = states[0]
         n, (rows, forces) = len(first.y), first.trail.gauge.shape
         trails = [addresses([getattr(x.trail, name) for x in states]) for name in lane_steps.TRAIL]

@@ -27,7 +27,6 @@ from rigidfleet.kernel import (
     recursion,
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
-from rigidfleet.kernel.compiler import numba_internals
 from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
 from rigidfleet.kernel.engine import objects, packing
@@ -273,8 +272,6 @@ def _passes(level: int) -> Any:
 
 def main(part: str) -> None:
     """Write machine code to standard output: of "flight", for which a second process is started, or of a library."""
-    if numba_internals.known():
-        numba_internals.translate_only()
     if part in LIBRARIES:
         codes = LIBRARIES[part]()
     else:

@@ -19,8 +19,8 @@ from numba.extending import intrinsic
 
 from rigidfleet.kernel import dopri5
 from rigidfleet.kernel.compiler import simd
-from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, jit, jit_inline
-from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, gather, unpack
+from rigidfleet.kernel.compiler.jit import compiled_copy, compiled_for_c, jit_inline
+from rigidfleet.kernel.compiler.simd import VECTOR, WIDTH, LaneArray, unpack
 from rigidfleet.kernel.disturbances import spline_weights
 from rigidfleet.kernel.engine import lane_steps
 from rigidfleet.kernel.engine.tracer import (
@@ -58,13 +58,10 @@ class UnrolledProblem(NamedTuple):
     T_b: float  # [s]
     knots: Floats  # of the reference motion [s]
     motion: LaneArray  # (pieces, 36) its coefficients
-    # Rows of gusts and noise that count in the phase, the first of them, and the number of all: see `Tables`.
     gust_step: float  # [s]
-    gust_first: int
     gust_rows: int
     gust: LaneArray  # (K, 3N)
     noise_step: float  # [s]
-    noise_first: int
     noise_rows: int
     noise_r: LaneArray  # (K, 3N)
     noise_v: LaneArray  # (K, 3N)
@@ -86,7 +83,7 @@ def unrolled(problem: Problem) -> UnrolledProblem:
 
 
 def unrolled_together(problems: Sequence[Problem], tables: dict[str, Any]) -> UnrolledProblem:
-    """Prepare eight problems, which `batch.fit_together`, of one flight each; with rows of their `Tables`.
+    """Prepare eight problems, which `batch.fit_together`, of one flight each; with their `tables_of` gusts and noise.
 
     Raises
     ------
@@ -115,37 +112,17 @@ _BARELY = np.array([[0.0], [0.0], [1e-150]])
 _STILL = 1e-30
 
 
-class Tables:
-    """Gusts and noise of eight flights, of which a phase needs some rows.
-
-    These rows alone become lanes: they stay in the cache while it is flown.
-    """
-
-    def __init__(self, disturbances: Sequence[Disturbance]) -> None:
-        self._steps = {"gust": disturbances[0].gust_step, "noise": disturbances[0].noise_step}
-        self._whole = {
-            name: [np.ascontiguousarray(getattr(x, name)) for x in disturbances] for name in _TABLES
-        }
-        self._addresses = {name: addresses(parts) for name, parts in self._whole.items()}
-
-    def between(self, begin: float, end: float) -> dict[str, Any]:
-        """Fields of an `UnrolledProblem` for a phase from ``begin`` to ``end`` [s]."""
-        fields: dict[str, Any] = {}
-        for name, (parts, *_) in self._whole.items():
-            rows, agents, _ = parts.shape
-            kind = name.split("_")[0]
-            step = self._steps[kind]
-            # A row more on both sides than counts by `spline_weights`, whose rounding is not looked at here.
-            first = max(min(int(begin / step) - 1, rows - 4), 0)
-            count = min(int(end / step) + 5, rows) - first
-            made = simd.empty((count * 3 * agents,))
-            _interleave(self._addresses[name], first * 3 * agents, made)
-            fields |= {f"{kind}_step": step, f"{kind}_first": first, f"{kind}_rows": rows}
-            fields[name] = made.reshape(count, 3 * agents)
-        return fields
-
-
-_TABLES = "gust", "noise_r", "noise_v"
+def tables_of(disturbances: Sequence[Disturbance]) -> dict[str, Any]:
+    """Fields of an `UnrolledProblem` with the gusts and the noise of eight flights."""
+    first = disturbances[0]
+    tables = {
+        name: packed(
+            [x.reshape(-1, 3 * x.shape[1]) for x in (getattr(d, name) for d in disturbances)]
+        )
+        for name in ("gust", "noise_r", "noise_v")
+    }
+    rows = {"gust_rows": len(first.gust), "noise_rows": len(first.noise_r)}
+    return {"gust_step": first.gust_step, "noise_step": first.noise_step, **rows, **tables}
 
 
 def packed(parts: Sequence[Floats]) -> LaneArray:
@@ -156,12 +133,6 @@ def packed(parts: Sequence[Floats]) -> LaneArray:
 def addresses(arrays: Sequence[Floats]) -> Ints:
     """Addresses of the numbers of some arrays."""
     return np.array([x.ctypes.data for x in arrays])
-
-
-@jit
-def _interleave(addresses, first, made):
-    for k in range(made.shape[0]):
-        made[k] = gather(addresses, first + k)
 
 
 def _prepare(
@@ -182,7 +153,7 @@ def _prepare(
     return UnrolledProblem(
         address, uniform, lanes(len(problem.graph.edges)), np.zeros(MOMENT + 1), lanes(len(code.known)),
         lanes(len(code.gauge)), np.zeros(1, dtype=np.int64), reference.t0, reference.T_b, np.zeros(0), none,
-        1.0, 0, 0, none, 1.0, 0, 0, none, none, np.zeros(WIDTH, dtype=np.int64),
+        1.0, 0, none, 1.0, 0, none, none, np.zeros(WIDTH, dtype=np.int64),
         np.zeros((len(lane_steps.TRAIL), WIDTH), dtype=np.int64), simd.empty((2, 5, 0)),
     )  # fmt: skip
 
@@ -229,12 +200,10 @@ def _closed_loop(t, y, dy, p, w):
             piece, time[3], _ = piece_at(t, p.knots)
         if p.gust.shape[0] > 0:
             gust, time[4], time[5], time[6], time[7] = spline_weights(t, p.gust_step, p.gust_rows)
-            gust -= p.gust_first
         if p.noise_r.shape[0] > 0:
             noise, time[8], time[9], time[10], time[11] = spline_weights(
                 t, p.noise_step, p.noise_rows
             )
-            noise -= p.noise_first
     if stage == 0 or stage == lane_steps.STAGES - 1:  # the start, the middle and the end of a step
         wanted += OF_GAUGE
     _call_code(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from typing import Any
-
 import numpy as np
 
 from rigidfleet.kernel.avoidance import AvoidanceArrays
@@ -30,34 +27,6 @@ def fly_ticks(
     caller sets to 0 for a new segment. The problem must be in the inertial formulation, and without disturbances: the
     flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
-    arguments = problem, workspace, flight, state, segment, avoidance
-    if not _last.arguments or any(
-        a is not b for a, b in zip(arguments, _last.arguments, strict=True)
-    ):
-        _last.packed, _last.arguments = _pack(*arguments), arguments
-    return native.library("sampled").fly_ticks(*(a.address for a in _last.packed[:5]))
-
-
-class _LastCall(threading.local):
-    """The arguments of a thread's last call, checked and packed: a flight pauses and goes on with the same ones."""
-
-    def __init__(self) -> None:
-        self.arguments: tuple[Any, ...] = ()
-        self.packed: tuple[Packed, ...] = ()
-
-
-_last = _LastCall()
-
-
-def _pack(
-    problem: Problem,
-    workspace: Workspace,
-    flight: SampledFlight,
-    state: SampledState,
-    segment: SampledSegment,
-    avoidance: AvoidanceArrays | None,
-) -> tuple[Packed, ...]:
-    """The arguments of the machine code, and what they point to."""
     work = state.work
     _check(flight, state, workspace)
     if problem.body_formulation or problem.disturbance.active:
@@ -65,18 +34,15 @@ def _pack(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
         )
     law = pack_anew(Segment(0.0, False, 0, work.law_time, work.law_state, work.law_rate))
-    recorded = pack(UNRECORDED)
     call = segment._replace(
-        recorder=native.recorder_address(), segment=law.address, record=recorded.address
+        recorder=native.recorder_address(), segment=law.address, record=pack(UNRECORDED).address
     )
-    states = pack(problem), pack(workspace), pack(flight), pack(state)
-    if avoidance is None:
-        return *states, pack_anew(call), law, recorded
-    kept = _of(avoidance, problem, workspace)
-    call = call._replace(
-        guard=native.library("avoidance").addresses["avoid"], avoidance=kept.address
-    )
-    return *states, pack_anew(call), law, recorded, kept
+    if avoidance is not None:
+        own = _of(avoidance, problem, workspace)
+        guard = native.library("avoidance").addresses["avoid"]
+        call = call._replace(guard=guard, avoidance=own.address)
+    arguments = *map(pack, (problem, workspace, flight, state)), pack_anew(call)
+    return native.library("sampled").fly_ticks(*(x.address for x in arguments))
 
 
 def avoid(
