@@ -25,6 +25,10 @@ PUBLIC: dict[str, Any] = json.loads((DATA / "public_names.json").read_text())
 GONE = {
     "rigidfleet.interchange.Format.extra": "a format names the distribution that pip installs",
     "rigidfleet.mission.kinds.Attitude.angles": "every kind of phase has it, by AnyPhase",
+    "rigidfleet.kernel.engine.codegen.UnrolledProblem": "flights side by side keep their own trails",
+    "rigidfleet.kernel.engine.codegen.Tables": "as above",
+    "rigidfleet.kernel.engine.codegen.interleaved": "as above",
+    "rigidfleet.kernel.problem.cleared": "workspaces are made anew",
     "rigidfleet.mission.schema.Links": "[network] replaces the table",
     "rigidfleet.mission.schema.Disturbances.links": "[network] replaces the table",
 }

@@ -152,7 +152,7 @@ def test_many_vehicles_are_flown_one_by_one(monkeypatch):
         "schema_version": 1, "name": "row", "output_step": 0.5,
         "agents": {"mass": 1.0, "position": [[2.0 * i, 0.0, 1.0] for i in range(n)]},
         "formations": {"row": {"slots": [[2.0 * i, 0.0, 0.0] for i in range(n)], "edges": []}},
-        "phases": [{"kind": "establish", "formation": "row", "control": "tracking", "duration": 2.0}],
+        "phases": [{"kind": "establish", "formation": "row", "control": "tracking", "blend": 1.0, "duration": 2.0}],
     }  # fmt: skip
     missions = [
         Mission.from_dict(data | {"disturbances": {"wind": [by, 0.0, 0.0]}}) for by in (0.0, 1.0)

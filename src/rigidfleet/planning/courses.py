@@ -99,12 +99,23 @@ def _reshape(mission: Mission, phase: Reshape, now: PhaseState, t_end: float) ->
     return rest._replace(lift=Lift(control[-1] - control[0], blend, now.t + knots, ways, keeps=True))  # fmt: skip
 
 
-def _steer(mission: Mission, phase: Fly | Turn, now: PhaseState, t_end: float) -> Course:
-    """Go to a waypoint, or stay, and turn to an attitude if there is one, within ``travel`` or by the end."""
+def _fly(mission: Mission, phase: Fly, now: PhaseState, t_end: float) -> Course:
+    """Go to a waypoint, and perhaps an attitude."""
+    velocity = np.zeros(3) if phase.free else np.array(phase.velocity)
+    return _steer(mission, phase, now, t_end, np.array(phase.position), velocity)
+
+
+def _turn(mission: Mission, phase: Turn, now: PhaseState, t_end: float) -> Course:
+    """Turn to an attitude on the spot."""
     assert now.goal is not None  # a steering phase has a goal
-    r, v = now.goal.r, np.zeros(3)
-    if isinstance(phase, Fly):
-        r, v = np.array(phase.position), v if phase.free else np.array(phase.velocity)
+    return _steer(mission, phase, now, t_end, now.goal.r, np.zeros(3))
+
+
+def _steer(
+    mission: Mission, phase: Steering, now: PhaseState, t_end: float, r: Floats, v: Floats
+) -> Course:
+    """Go to a place (3,) with a velocity there and an attitude, within ``travel`` or by the end."""
+    assert now.goal is not None  # a steering phase has a goal
     arrival = t_end if phase.travel is None else now.t + seconds(phase.travel)
     angles = phase.attitude_deg
     T = now.goal.T if angles is None else att.dcm_from_euler(np.deg2rad(angles))
@@ -204,9 +215,12 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
 
 def course_conflict(phase: Phase, now: PhaseState) -> str:
     """What keeps a phase from following the ways that are given for it, from the state at its start; "" if nothing."""
-    if isinstance(phase, Follow):
-        return _vehicle_mismatch(phase, now)
-    if isinstance(phase, Reshape) and phase.bent:
+    return _MISMATCHES.get(phase.kind, lambda *_: "")(phase, now)
+
+
+def _slot_mismatch(phase: Reshape, now: PhaseState) -> str:
+    """What keeps a change of shape from following its bent ways, if it has any."""
+    if phase.bent:
         first = np.array(phase.control_points)[0]
         if now.slots is None or not np.abs(first - now.slots).max() < _START_TOLERANCES[0]:
             return "begins in other slots than the phase before has led to"
@@ -323,11 +337,16 @@ def regulators(mission: Mission, phase: Phase | Steering) -> Lqr:
 #: Function of each kind of phase that leads somewhere; in all others, the virtual body comes to rest.
 _COURSES: dict[str, Callable[[Mission, Any, PhaseState, float], Course]] = {
     "brake": _brake,
-    "fly": _steer,
+    "fly": _fly,
     "follow": _follow,
     "land": _vertical,
     "orbit": _orbit,
     "reshape": _reshape,
     "takeoff": _vertical,
-    "turn": _steer,
+    "turn": _turn,
+}
+#: Function of each kind of phase that may follow given ways, which says what keeps it from that.
+_MISMATCHES: dict[str, Callable[[Any, PhaseState], str]] = {
+    "follow": _vehicle_mismatch,
+    "reshape": _slot_mismatch,
 }
