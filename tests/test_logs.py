@@ -749,10 +749,13 @@ def test_the_command_says_what_it_took(log, capsys):
     assert "--origin: no file says where on the Earth it is" in capsys.readouterr().err
 
 
-@pytest.mark.skipif(not MORE, reason="RIGIDFLEET_LOGS names no folder with pyulog's test logs")
-@pytest.mark.parametrize("path", sorted(Path(MORE or ".").glob("*.ulg")), ids=lambda p: p.name)
-def test_public_logs_of_px4(path):
+@pytest.mark.parametrize(
+    "path", [*sorted(LOGS.glob("*.ulg.xz")), *sorted(Path(MORE).glob("*.ulg") if MORE else ())], ids=lambda p: p.name
+)  # fmt: skip
+def test_public_logs_of_px4(path, log):
     """Logs of several versions of PX4: what is read is what `pyulog` reads, where it is valid, or one error."""
+    pytest.importorskip("pyulog")
+    path = log(path.stem) if path.suffix == ".xz" else path
     data = {
         x.name: x.data
         for x in pytest.importorskip("pyulog").ULog(str(path)).data_list
@@ -779,3 +782,15 @@ def test_public_logs_of_px4(path):
         inside = (now > 0.0) & (now < time[-1] - time[0])
         local = read.curves[0].at(now[inside] + time[0])[:, :3]
         np.testing.assert_allclose(local, globally[inside], atol=0.3)
+
+
+def test_a_log_of_px4_without_a_valid_estimate_has_its_receivers_places(log):
+    """PX4's estimator had no position yet: those of the receiver of GNSS count, and a note says which topic did."""
+    data = {
+        x.name: x.data for x in pytest.importorskip("pyulog").ULog(str(log("cube.ulg"))).data_list
+    }
+    gps, read = data["vehicle_gps_position"], read_trajectories(log("cube.ulg"), gaps="bridge")
+    origin = read.read[0]["origin"]
+    place = flat(gps["lat"] / 1e7, gps["lon"] / 1e7, gps["alt"] / 1e3, origin)
+    np.testing.assert_allclose(at_samples(read)[1], place, atol=2e-3)
+    assert said(read, "vehicle_gps_position")
