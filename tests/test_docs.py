@@ -474,12 +474,15 @@ def test_commands_for_whom(tmp_path, monkeypatch, capsys):
 
     monkeypatch.chdir(tmp_path)
     text = (ROOT / "README.md").read_text("utf-8").split("\n## For whom")[1].split("\n## ")[0]
-    sweep, show, own = (shlex.split(c) for c in re.findall(r"`([^`]+)` \|$", text, re.MULTILINE))
+    sweep, show, home, own = (
+        shlex.split(c) for c in re.findall(r"`([^`]+)` \|$", text, re.MULTILINE)
+    )
     assert sweep[:2] == ["rigidfleet", "sweep"]
     fewer = [*sweep[1:-1], "2", "--workers", "1", "--no-figures"]
     assert main(fewer) == 0
     assert show[:2] == ["rigidfleet", "run"]
     assert show[2] in mission_names()
+    assert main(home[1:]) == 0
     assert (ROOT / own[1]).exists()
 
 
