@@ -82,6 +82,8 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
 
 #: Vehicles no higher above what is below them stand on it [m].
 _STANDING = 0.5
+#: The most vehicles of which it is said where they land.
+_LISTED = 60
 
 
 @with_earlier_names(linked="has_link")
@@ -509,7 +511,7 @@ class Mission(Contents, Shown):
         return r[:, 2] - self.fleet.radius - self.height_at(*r.T) <= _STANDING
 
     def landings_in_words(self, end: Floats) -> str:
-        """How many vehicles land where another one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
+        """Which vehicles land where which other one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
         start = self.fleet.position
         stand = self.standing(end)
         if len(end) < 2 or not (self.standing(start) & stand).any():
@@ -517,8 +519,13 @@ class Mission(Contents, Shown):
         from scipy.spatial import KDTree
 
         near = KDTree(start[:, :2]).query(end[:, :2])[1]
-        others = int((stand & (near != np.arange(len(end)))).sum())
-        return f"{others} of {len(end)} vehicles land where another one stood" if others else ""
+        others = np.flatnonzero(stand & (near != np.arange(len(end))))
+        who = [f"{i + 1} where {near[i] + 1} did" for i in others[:_LISTED]]
+        who += [f"and {len(others) - _LISTED} more"] if len(others) > _LISTED else []
+        words = (
+            f"{len(others)} of {len(end)} vehicles land where another one stood: {', '.join(who)}"
+        )
+        return words if others.size else ""
 
     @cached_property
     def tracking_gains(self) -> tuple[float, float]:
