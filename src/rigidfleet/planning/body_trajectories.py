@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,8 @@ def regulated_motion(
     return as_motion(t0 + times, pieces, goal.T)
 
 
+# The same in every run of a sweep: three fifths of a run of narrow-passage.
+@lru_cache(256)
 def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tuple[Floats, Floats]:
     """Knots (n + 1,) [s] of a way and of the rest after it, and quintics (2, 4, n * 6) between them.
 
