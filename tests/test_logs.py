@@ -754,7 +754,6 @@ def test_the_command_says_what_it_took(log, capsys):
 )  # fmt: skip
 def test_public_logs_of_px4(path, log):
     """Logs of several versions of PX4: what is read is what `pyulog` reads, where it is valid, or one error."""
-    pytest.importorskip("pyulog")
     path = log(path.stem) if path.suffix == ".xz" else path
     data = {
         x.name: x.data
