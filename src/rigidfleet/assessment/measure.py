@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.quantities import QUANTITIES, quantity
+from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
 from rigidfleet.assessment.fits import Fit, angle_between
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
@@ -102,8 +102,7 @@ class Measurements:
     def extreme_of(self, name: str, x: Extremum, phase: str) -> Extreme:
         """An extreme of a phase, as it was recorded."""
         q = quantity(name)
-        size = abs(x.value) if name == "constraint" else q.scale * x.value
-        return Extreme(size, x.time, owner_name(self.result, q, x.who, x.other), phase)
+        return Extreme(_size(q, x), x.time, owner_name(self.result, q, x.who, x.other), phase)
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
@@ -112,13 +111,11 @@ class Measurements:
 
     def worst_among(self, name: str, values: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``values`` at samples, or between them."""
-        rank = quantity(name).rank
-        every = [
-            self.extreme_of(name, p.extremes[name], p.name)
-            for p in self.result.phases
-            if name in p.extremes
-        ]
-        between = max(every, key=lambda e: rank(e.value), default=None)
+        q = quantity(name)
+        rank = q.rank
+        every = [(p.extremes[name], p.name) for p in self.result.phases if name in p.extremes]
+        worst = max(every, key=lambda each: rank(_size(q, each[0])), default=None)
+        between = None if worst is None else self.extreme_of(name, *worst)
         sampled = None if values is None else self.worst_sample(values, alone=between is None)
         if sampled is None or between is None:
             return sampled or between
@@ -364,6 +361,11 @@ class Measurements:
             miss, v = math.dist(result.cm[k].tolist(), point["position"]), point.get("velocity")
             off = None if v is None else math.dist(result.cm_velocity[k].tolist(), v)
             yield Waypoint(float(result.time[k]), miss, off, None, None)
+
+
+def _size(q: Quantity, x: Extremum) -> float:
+    """The value of an extreme in the unit of its quantity; of a constraint, its size."""
+    return abs(x.value) if q.name == "constraint" else q.scale * x.value
 
 
 def _greatest(values: Floats) -> float | None:
