@@ -43,8 +43,9 @@ QUANTITIES = VERTICAL_ACCELERATION + 1
 STAYED = 0
 #: Triple product of three unit vectors below which a pivot counts as lost.
 LOST_PIVOT = 1e-6
-#: Approximate size of a trail in bytes; the integrator pauses when it is full. With more, flights wait for memory.
-_TRAIL = 1 << 17
+#: Approximate sizes of trails in bytes, of points and of vehicles; a flight pauses when its trail is full. With more,
+#: eight flights side by side wait for memory. Vehicles take short steps: with less, their pauses take an eighth longer.
+POINTS_TRAIL, VEHICLES_TRAIL = 1 << 17, 1 << 20
 #: Greatest number of points in a search for a greatest force.
 _NODES = 27
 
@@ -74,10 +75,10 @@ class Trail(NamedTuple):
     start: Floats  # (3N + 2m or 5N + 2m,) at the start of the first step, after a jump
 
 
-def trail(states: int, agents: int, edges: int, directed: bool) -> Trail:
-    """Allocate a trail of an eighth of a megabyte, or of three steps; ``directed``: with accelerations by direction."""
+def trail(size: int, states: int, agents: int, edges: int, directed: bool) -> Trail:
+    """Allocate a trail of a ``size`` in bytes, or of three steps; ``directed``: with accelerations by direction."""
     gauge = (5 if directed else 3) * agents + 2 * edges
-    rows = max(3, _TRAIL // (8 * (5 * states + gauge)))
+    rows = max(3, size // (8 * (5 * states + gauge)))
     shapes = (rows, 2), (rows, 5, states), (rows, gauge), (gauge,)
     return Trail(*(np.empty(shape) for shape in shapes))
 

@@ -388,9 +388,10 @@ class Extremes(CurveWatch):
     ) -> records.IntegratorState:
         """Begin to monitor an integrator, which starts from state y (n,) at t [s]; its trail records its steps.
 
-        ``states``: how many the trail records, by default all.
+        ``states``: how many the trail records of vehicles; of points, it records all.
         """
-        trail = records.trail(states or len(y), self.n, edges, self.directed)
+        size = records.VEHICLES_TRAIL if states else records.POINTS_TRAIL
+        trail = records.trail(size, states or len(y), self.n, edges, self.directed)
         self._begin_monitor(states or len(y), trail.gauge.shape[1])
         return records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
 
