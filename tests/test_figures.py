@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 from PIL import Image
 from sample_flights import drifting, swarm
+from scipy.spatial import ConvexHull
 
 from rigidfleet import plotting, simulate
 from rigidfleet.errors import ResultError
@@ -24,8 +25,10 @@ from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.plotting import curves, sketches, space, style
+from rigidfleet.plotting.solids import convex_rim
 from rigidfleet.result import LABELS, VARIABLES, PhaseRecord, Result
 from rigidfleet.result.quantities import samples
+from rigidfleet.solids.outline import outline
 
 START = [[1.0, 6.0, 3.0], [8.0, 3.0, 3.0], [7.0, 6.0, 3.0]]
 TRIANGLE = {"shape": "triangle", "size": 4.0}
@@ -842,6 +845,17 @@ def test_the_figure_of_an_operator():
     assert np.asarray(line.get_ydata())[-1] == pytest.approx(flight.position[-1, 2, 2])
     with pytest.raises(ValueError, match="no agent 5"):
         plotting.operation(flight, [5])
+
+
+@pytest.mark.parametrize("name", ["statue", "bridge-inspection", "narrow-passage"])
+def test_the_rim_of_an_obstacle_is_its_hull(name):
+    """From above, obstacles are drawn by the corners of the convex hull that Qhull finds."""
+    for thing in load_mission(name).solids:
+        flat = np.clip(outline(thing.solid).triangles, -100.0, 100.0).reshape(-1, 3)[:, :2]
+        rim, hull = convex_rim(flat), flat[ConvexHull(flat).vertices]
+        assert len(rim) == len(hull)
+        first = int(np.linalg.norm(hull - rim[0], axis=1).argmin())
+        assert rim == pytest.approx(np.roll(hull, -first, axis=0), abs=1e-8)
 
 
 # -- files
