@@ -45,10 +45,14 @@ _LEVEL = 1e-3
 
 
 class Answer(NamedTuple):
-    """What follows a loss or an order: legs, and why they lead to no place that is proved; "" if they do."""
+    """What follows a loss or an order: legs, and why they lead to no place that is proved; "" if they do.
+
+    Of a way home that is proved, `promise` is the least separation [m].
+    """
 
     legs: list[Leg]
     problem: str = ""
+    promise: float | None = None
 
 
 def legs_from(
@@ -77,8 +81,9 @@ def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
         return Answer(after_loss(mission, now, plan))
     legs = plan()
     abort = Aborts(mission, legs, now.lost).at(now.t - mission.aborting.reaction)
-    phases = phases_of(mission, abort.steps, "abort: ")
-    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason)
+    phases, least = phases_of(mission, abort.steps, "abort: "), abort.least.separation
+    promise = least if abort.way and math.isfinite(least) else None
+    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason, promise)
 
 
 def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:

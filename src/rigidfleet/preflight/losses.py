@@ -36,7 +36,7 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         text = f"{what} after the planned paths, at {first:g} s: what follows is not checked"
         yield Remark("note", "loss", text)
         return
-    way, problem = planned_answer(mission, at, legs)
+    way, problem, _ = planned_answer(mission, at, legs)
     end = way[-1].end
     does = "hold to" if mission.on_loss == "hold" or problem else "land by"
     stop = way[0].after.r.mean(axis=0)
