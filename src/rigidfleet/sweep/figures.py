@@ -204,11 +204,10 @@ def _draw_worst(ax: Axes, table: Table, case: Borne) -> None:
     for i in who:
         ax.plot(*xy[since : now + 1, i].T, color=FAILED, linewidth=1.0)
         ax.plot(*xy[now, i], "o", color=FAILED, markersize=3.5)
-    if who:
-        middle = xy[now, who].mean(axis=0)
-        half = max(_NEAR, 1.1 * float(np.abs(xy[since : now + 1, who] - middle).max()))
-        ax.set(xlim=middle[0] + half * _BOTH, ylim=middle[1] + half * _BOTH)
-    ax.set_aspect("equal", adjustable="datalim")
+    shown = xy[since : now + 1, who] if who else xy[now : now + 1]
+    middle = shown[-1].mean(axis=0)
+    half = max(_NEAR, 1.1 * float(np.abs(shown - middle).max()))
+    ax.set(xlim=middle[0] + half * _BOTH, ylim=middle[1] + half * _BOTH, box_aspect=1.0)
     ax.set_title(
         f"{case.fault} {case.magnitude:g} {readable_unit(case.unit)}", loc="left", fontsize=8.5
     )
