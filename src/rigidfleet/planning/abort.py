@@ -54,11 +54,10 @@ BRAKING, JERK, SPEED = 2.0, 5.0, 5.0
 _SINKING = 2.5
 #: Height of the last straight way down [m], and the greatest speed [m/s] there.
 FINAL, DESCENT = 3.0, 1.0
-#: Shortest step [s], ratio of a time tried to the one before, and number of times tried; share that counts as kept: the
-#: state at the start may be beyond a limit by rounding.
-SHORTEST, _LONGER, _TRIES, _KEPT = 0.5, 1.1, 60, 1.0 + 1e-6
-#: Share of a limit that steps may use, which are looked at in samples alone.
-USED = 0.98
+#: Shortest step [s], ratio of a time tried to the one before, and number of times tried.
+SHORTEST, _LONGER, _TRIES = 0.5, 1.1, 60
+#: Share of a limit that steps may use, which are looked at in samples alone; share of that which counts as kept.
+_USED, _KEPT = 0.98, 1.0 + 1e-6
 #: Time between knots of the plan as polynomials of degree 7 [s], which differ from it by micrometres; knots that are
 #: nearer count as one.
 _KNOTS, _NEAR = 0.2, 0.01
@@ -235,12 +234,8 @@ class Aborts:
         allowed, most, d = limits.separation_allowance, limits.tracking_error, mission.disturbances
         steady = d is None or (d.noise is None and d.gusts is None and not np.any(d.mass_error))
         self.off = 0.0 if steady and mission.vehicle_models is None else allowed
-        if most is not None:
-            self.off = 2.0 * most if rotors else self.off
-            tracking = Limit(
-                QUANTITIES["tracking_error"], np.full(mission.n_agents, most), self._far_off
-            )
-            self.home_limits.append(tracking)
+        if rotors and most is not None:
+            self.off = 2.0 * most
         self.apart = widest + self.need + max(allowed, self.off)
         self.below = max(self.apart, widest + (limits.separation_below or 0.0))
         self.moves = any(x.solid.moves for x in mission.solids)
@@ -359,7 +354,7 @@ class Aborts:
         def excess(time: float) -> Floats:
             at, *rates = clock(time).states(time * share, 4)
             states = self.plan.states(at, 4)
-            allowed = np.maximum(self._shares(limits, states), USED)
+            allowed = np.maximum(self._shares(limits, states), _USED)
             return self._shares(limits, _at_rates(states, np.array(rates))) / allowed
 
         return least_time(first, excess)
@@ -371,35 +366,27 @@ class Aborts:
         who, x = self.left, x.swapaxes(0, 1)[:, :, self.left]
         return np.array([(q.values(x, who) / q.most[who]).max() for q in limits])
 
-    def _pushed(self, v: Floats, who: Ints) -> Floats:
-        """Where drag holds vehicles (n,) with velocities (K, n, 3) [m/s], off their ways (K, n, 3) [m].
+    def _off(self, way: Piecewise) -> float:
+        """By how much nearer than on their way two vehicles may be in flight [m].
 
-        It is in proportion to the speed of the air, and tracking answers to it as a spring does.
+        Drag in proportion to the speed holds vehicles off their ways that fly differently, as tracking answers to it.
         """
-        mission, d = self.mission, self.mission.disturbances
+        mission, who = self.mission, self.left
+        if not mission.drag.any() or len(who) < 2:
+            return self.off
+        v = way.states(np.linspace(0.0, way.time[-1], _LOOKS), 2)[1][:, who]
+        d = mission.disturbances
         push = air_force(mission, (np.zeros(3) if d is None else np.array(d.wind)) - v, who)
         if mission.tracking.drag_feedforward:
             push = push - air_force(mission, -v, who)
-        stiffness = mission.fleet.mass[who, None] * mission.tracking_gains[0]
-        return _OVERSHOOT * push / stiffness
-
-    def _far_off(self, x: Floats, who: Ints) -> Floats:
-        """How far off their ways drag holds vehicles in states (K, orders, n, 3), (K, n) [m]."""
-        return np.linalg.norm(self._pushed(x[:, 1], who), axis=2)
-
-    def _off(self, way: Piecewise) -> float:
-        """By how much nearer than on their way two vehicles may be in flight [m], as they fly differently."""
-        if not self.mission.drag.any() or len(self.left) < 2:
-            return self.off
-        v = way.states(np.linspace(0.0, way.time[-1], _LOOKS), 2)[1][:, self.left]
-        off = self._pushed(v, self.left)
-        apart = np.linalg.norm(off - off.mean(axis=1, keepdims=True), axis=2)
-        return self.off + 2.0 * float(apart.max())
+        push = push / (mission.fleet.mass[who, None] * mission.tracking_gains[0])
+        apart = np.linalg.norm(push - push.mean(axis=1, keepdims=True), axis=2)
+        return self.off + 2.0 * _OVERSHOOT * float(apart.max())
 
     def _straight(self, name: str, start: Floats, end: Floats) -> Step:
         """The step of straight ways (N, 3) [m], from rest to rest and in step, in the least time that keeps limits."""
         states = _from_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
-        allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), USED)  # at rest
+        allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), _USED)  # at rest
 
         def excess(time: float) -> Floats:
             moves = states * time ** -np.arange(4.0)[:, None, None, None]
@@ -662,16 +649,18 @@ class Aborts:
         ]
 
 
-def least_time(time: float, excess: Callable[[float], Floats]) -> tuple[float, Floats]:
+def least_time(
+    time: float, excess: Callable[[float], Floats], kept: float = _KEPT
+) -> tuple[float, Floats]:
     """The least time from a first one on [s], to within a tenth, that exceeds no limit, and the shares that it takes.
 
-    If every time exceeds one, the best of those that were tried.
+    A share up to ``kept`` exceeds none. If every time exceeds one, the best of those that were tried.
     """
     tries: list[tuple[float, Floats]] = []
     time = max(time, SHORTEST)
     for _ in range(_TRIES):
         tries.append((time, excess(time)))
-        if tries[-1][1].max(initial=0.0) <= _KEPT:
+        if tries[-1][1].max(initial=0.0) <= kept:
             return tries[-1]
         time *= _LONGER
     return min(tries, key=lambda x: x[1].max())

@@ -40,6 +40,8 @@ from rigidfleet.typing import Floats
 _DESCENDING = 0.5
 #: Peaks of speed and acceleration of a septic blend over unit way and time.
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.1875, 7.5132
+#: Share of a limit that counts as kept: from a state beyond it, some of its derivatives lead a bit farther.
+_KEPT = 1.01
 #: Tilt that counts as level [rad].
 _LEVEL = 1e-3
 
@@ -168,5 +170,5 @@ def _shortest(
         return np.array([x.share for x in use])
 
     allowed = np.maximum(shares(least, now.t + 1e-9 * max(1.0, now.t)), 1.0)
-    time, _ = least_time(least, lambda time: shares(time) / allowed)
+    time, _ = least_time(least, lambda time: shares(time) / allowed, _KEPT)
     return leg_from(mission, make(time), departure)

@@ -176,16 +176,11 @@ def worst_runs(table: Table) -> Figure | None:
             worst[case.fault] = case
     if not worst:
         return None
-    fig, axes = _small_axes(table, "The worst of each fault, from above [m]", list(worst), 2.4)
+    fig, axes = _small_axes(
+        table, "The worst of each fault from above [m]: ways into it", list(worst), 2.4
+    )
     for case, ax in zip(worst.values(), axes, strict=True):
         _draw_worst(ax, table, case)
-    fig.legend(
-        handles=[
-            st.legend_entry("who fails, and the way there", color=FAILED, marker="o", markersize=3),
-            st.legend_entry("others near, then", color=PASSED, marker="o", linestyle="", markersize=3),
-        ],
-        loc="outside lower left", ncols=2, fontsize=8,
-    )  # fmt: skip
     return fig
 
 
