@@ -169,11 +169,11 @@ def shares(table: Table) -> Figure | None:
 
 def worst_runs(table: Table) -> Figure | None:
     """Of each fault that fails, the worst run from above: whom it concerns when it fails, and their ways until then."""
-    worst: dict[str, Borne] = {}
-    for case in borne(table):
-        known = worst.get(case.fault, case)
-        if case.worst and (case is known or (case.separation or 0.0) < (known.separation or 0.0)):
-            worst[case.fault] = case
+    failed = [case for case in borne(table) if case.worst]
+    worst = {
+        name: min((x for x in failed if x.fault == name), key=lambda x: x.separation or 0.0)
+        for name in dict.fromkeys(case.fault for case in failed)
+    }
     if not worst:
         return None
     fig, axes = _small_axes(
