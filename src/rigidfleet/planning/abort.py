@@ -226,9 +226,10 @@ class Aborts:
         self.left, self.radius = np.flatnonzero(~self.lost), mission.fleet.radius
         self.limits = limits_of(mission)
         rotors = not all(model.point for model in mission.vehicle_models or ())
-        gentle = {"acceleration": BRAKING, "jerk": JERK, "speed": SPEED}
-        gentle |= {"vertical_speed": _SINKING} if rotors else {}
-        self.home_limits = gentle_limits(mission, **gentle)
+        sinking = _SINKING if rotors else math.inf
+        self.home_limits = gentle_limits(
+            mission, acceleration=BRAKING, jerk=JERK, speed=SPEED, vertical_speed=sinking
+        )
         self.need, widest = limits.separation or 0.0, 2.0 * float(self.radius.max())
         # In flight both are off their ways, as far as the verdict allows, but for points that only steady air pushes.
         allowed, most, d = limits.separation_allowance, limits.tracking_error, mission.disturbances
