@@ -412,10 +412,10 @@ def windy(k: int, runs: int = WINDY) -> float:
         return seconds(lambda: python("-m", "rigidfleet", *asked, "--out", folder))
 
 
-def python(*arguments: str, **environment: str) -> None:
-    """Run Python as a process of its own, with more in its environment."""
+def python(*arguments: str) -> None:
+    """Run Python as a process of its own."""
     # Bytecode is cached, as it is wherever packages are installed.
-    env = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | environment
+    env = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=env)
 
 
@@ -466,7 +466,7 @@ def bound() -> float:
 
 
 def processes(rounds: int) -> list[Row]:
-    """Whole processes with a warm cache against a bare interpreter, and the first flight ever."""
+    """Whole processes with a warm cache against a bare interpreter."""
     with tempfile.TemporaryDirectory() as folder:
         flight = ["run", "narrow-passage", "--no-figures", "--force", "--out", folder]
         commands = {
@@ -478,16 +478,12 @@ def processes(rounds: int) -> list[Row]:
             "figures": ["-m", "rigidfleet", *(x for x in flight if x != "--no-figures")],
         }
 
-        def call(name: str, **environment: str) -> None:
-            python(*commands[name], **environment)
-
-        for name in commands:
-            call(name)
+        for command in commands.values():
+            python(*command)
         spent = {name: [] for name in commands}
         for _ in range(rounds):
             for name, times in spent.items():
-                times.append(seconds(lambda name=name: call(name)))
-        first = [seconds(lambda: call("run", NUMBA_CACHE_DIR=str(Path(folder) / "cache")))]
+                times.append(seconds(partial(python, *commands[name])))
     bare = "whole process, against a bare interpreter that imports NumPy"
     return [
         Row("--help", spent["help"], spent["numpy"], 3.0, False, bare),
@@ -502,7 +498,6 @@ def processes(rounds: int) -> list[Row]:
             False,
             "against the same without",
         ),
-        Row("the first run ever", first, [1.0], 25.0, False, "seconds, compile included"),
     ]
 
 

@@ -86,15 +86,6 @@ def _missions(data: Data) -> str:
     return "\n\n".join([table, *judged])
 
 
-def _processes(data: Data) -> str:
-    """Whole processes: but for the first run, against a bare interpreter."""
-    *warm, first = data["processes"]
-    text = _ratios("processes", "interpreter")({"processes": warm})
-    return (
-        f"{text}\n\nThe first run ever: {median(first['ours']):.1f} s (goal: {first['goal']:g} s)."
-    )
-
-
 def _operations(data: Data) -> str:
     """Operations of an evaluation, and how near to the bound the vectors come."""
     counts = data["operations"]
@@ -267,7 +258,7 @@ TABLES: dict[str, tuple[str, Any]] = {
     "ensembles": ("ensembles", _ratios("ensembles", "SciPy")),
     "missions": ("missions", _missions),
     "operations": ("operations", _operations),
-    "processes": ("processes", _processes),
+    "processes": ("processes", _ratios("processes", "interpreter")),
     "peers": ("rows", _peers),
     "models": ("rows", _models),
     "summary": ("rows", _summary),

@@ -38,7 +38,7 @@ _SILENCE = 1.0
 #: The speed of a flight is the mean of the last _RECENT seconds, shown after _KNOWN seconds. Speeds of phases differ
 #: by a factor of a thousand, and planning a phase takes time.
 _RECENT, _KNOWN = 10.0, 1.0
-COMPILING = "Compiling the simulator (first run only, about 20 s)"
+COMPILING = "Compiling the simulator (first run only, about half a minute)"
 
 
 def out() -> Console:

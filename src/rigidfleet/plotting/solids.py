@@ -159,20 +159,18 @@ def convex_rim(points: Floats) -> Floats:
 
     To load SciPy's takes a third of the time of the figures of `run`.
     """
-    # Upper and lower corners are the same but for rounding.
-    points = np.unique(points.round(9), axis=0)
-    rim: list[Floats] = []
-    for chain in points, points[::-1]:
+    # Numbers x + iy, in order of x and y; upper and lower corners are the same but for rounding.
+    places = np.unique((points @ [1.0, 1.0j]).round(9)).tolist()
+    rim: list[complex] = []
+    for chain in places, places[::-1]:
         first = len(rim)
-        for point in chain:
-            while len(rim) > first + 1 and _turns_right(rim[-2], rim[-1], point):
+        for z in chain:
+            # No corner where the way turns right, or not at all
+            while (
+                len(rim) > first + 1
+                and ((rim[-1] - rim[-2]).conjugate() * (z - rim[-1])).imag <= 1e-9
+            ):
                 rim.pop()
-            rim.append(point)
+            rim.append(z)
         rim.pop()  # begins the other chain
-    return np.array(rim)
-
-
-def _turns_right(a: Floats, b: Floats, c: Floats) -> bool:
-    """Whether a way from a by b to c (2,) [m] turns right at b, or not at all."""
-    (x, y), (u, v) = b - a, c - b
-    return bool(x * v - y * u <= 1e-9)
+    return np.array(rim).view(np.float64).reshape(-1, 2)

@@ -99,8 +99,8 @@ def not_kept(error: OSError) -> None:
         warned.set()
         warnings.warn(
             f"the compiled flight kernel cannot be cached in {_environment_folder()}: {error.strerror or error}. Every"
-            " process compiles it again, which takes about 20 s. Set NUMBA_CACHE_DIR to a folder that only you can"
-            " write",
+            " process compiles it again, which takes about half a minute. Set NUMBA_CACHE_DIR to a folder that only you"
+            " can write",
             RuntimeWarning,
             stacklevel=3,
         )

@@ -337,10 +337,4 @@ def _write(parts: Sequence[bytes], part: str) -> bool:
 
 def is_compiled() -> bool:
     """Return whether there is machine code, shipped or in the cache, so that nothing has to be compiled."""
-    if _shipped_code(sources_digest()):
-        return True
-    try:
-        with open_safely(_file("flight")):
-            return True
-    except OSError:
-        return False
+    return bool(_shipped_code(sources_digest())) or _read("flight") is not None
