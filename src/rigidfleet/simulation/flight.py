@@ -278,14 +278,12 @@ class Flight:
         self._cut: set[int] = set()  # phases left before their end
         self._finished = False
         self._route = list(mission.phases)  # phases to fly; after a loss, those that it asks for
-        self._reacted = (
-            mission.abandons_at == math.inf
-        )  # whether nothing (more) follows from a loss or abort
+        #: Whether nothing (more) follows from a loss or abort.
+        self._reacted = mission.abandons_at == math.inf
         self._following = 0  # index of the route's next phase
         self._answer = Answer([])  # what follows from it
-        self._plans: list[
-            PhasePlan
-        ] = []  # of the phases begun, if the flight may have to leave them
+        #: Of the phases begun, if the flight may have to leave them.
+        self._plans: list[PhasePlan] = []
         self._started = self._reported = clock.perf_counter()
         self._count = np.zeros(3, dtype=np.int64)
         self._solves: dict[str, Counts] = {}
