@@ -156,7 +156,7 @@ def _seen_from_above(r: Floats) -> tuple[bytes, bytes]:
     """What the loop depends on: all but place and heading, to a millimetre or so."""
     x = r - r.mean(axis=0)
     across = x[:, :2] @ x[:, :2].T
-    size = max(float(np.abs(x).max()), 1e-9)
+    size = max(float(np.linalg.norm(x, axis=1).max()), 1e-9)
     rounded = (
         np.round(part / scale, 3) + 0.0 for part, scale in ((across, size**2), (x[:, 2], size))
     )
