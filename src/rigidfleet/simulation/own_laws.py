@@ -130,12 +130,17 @@ class OwnLaws:
         self.said.append(said)
         state.count[ANSWERED] = k + 1
 
+    def has_views(self, problem: Problem, state: SampledState) -> bool:
+        """Whether the views last made are those of the tick that comes."""
+        last = self.last
+        return last is not None and last[0] == state.count[TICKS] and last[1] is problem
+
     def views(
         self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
     ) -> list[View | None]:
         """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
         k, mail = int(state.count[TICKS]), state.mail
-        if self.last is not None and self.last[0] == k and self.last[1] is problem:
+        if self.last is not None and self.has_views(problem, state):
             return self.last[2]
         t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
         has_heard = mail.stamp >= 0
