@@ -159,13 +159,13 @@ def test_the_exact_law_is_that_of_all_edges(seed):
     np.testing.assert_allclose(by_neighbours, central, rtol=0, atol=1e-9 * np.abs(central).max())
 
 
-@pytest.mark.parametrize("shape", ["cube", "line", "plane"])
+@pytest.mark.parametrize("shape", ["cube", "complete", "line", "plane"])
 def test_the_default_law_is_that_of_all_edges(shape):
-    """Also with redundant edges, and on a line and in a plane, where the exact law has no force."""
+    """Also with ten redundant edges, and on a line and in a plane, where the exact law has no force."""
     slots, edges = CUBE, EDGES
     if shape != "cube":
-        slots = CUBE[:4] if shape == "plane" else np.arange(4.0)[:, None] * [3.0, 0, 0]
-        edges = [[i, j] for j in range(2, 5) for i in range(1, j)]
+        slots = {"line": np.arange(4.0)[:, None] * [3.0, 0, 0], "plane": CUBE[:4]}.get(shape, CUBE)
+        edges = [[i, j] for j in range(2, len(slots) + 1) for i in range(1, j)]
     off = np.random.default_rng(5).normal(0, 0.05, slots.shape)
     m = mission(
         {},
@@ -198,6 +198,17 @@ def test_messages_arrive_as_sent():
     under_way = sent - heard - lost
     assert under_way.min() >= 0
     assert under_way.max() <= (net.delay + net.jitter) // net.every + 1
+
+
+def test_nobody_hears_beyond_the_range():
+    """All that is sent along the diagonals of the faces (5.7 m) is lost, along the sides (4 m) nothing."""
+    problem, work, flight, state = laid_out(mission({"range": 4.9}), CUBE + [0, 0, 20])
+    fly(problem, work, flight, state, 20)
+    i, j = flight.network.links.T
+    sent, _, lost = state.mail.count
+    share = np.where(np.linalg.norm(CUBE[i] - CUBE[j], axis=1) > 4.9, 1.0, 0.0)
+    np.testing.assert_array_equal(lost, share * sent)
+    assert 0.0 < share.mean() < 1.0
 
 
 def test_losses_come_as_often_and_in_bursts_as_long_as_they_say():
@@ -312,6 +323,9 @@ def test_a_result_with_links_of_before_loads(tmp_path):
     result.save(file)
     assert rf.Result.load(file).mission.network == m.network
     with pytest.raises(MissionError, match=r"it is now called '\[network\]'"):
+        rf.Mission.from_dict(data)
+    data["network"] = data["disturbances"].pop("links")
+    with pytest.raises(MissionError, match=r"network.dropped = 0.3: .*\n *it is now called 'loss'"):
         rf.Mission.from_dict(data)
 
 
