@@ -300,14 +300,10 @@ def shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     J = jacobian(r, edges) * np.repeat(np.sqrt(m.mean() / m), 3)
     w, V = np.linalg.eigh(J.T @ J)
     w[w < _SINGULAR * w[-1]] = 0.0
-    sigma = filter_factors(
-        w,
-        law.solver,
-        damping=law.damping,
-        iterations=law.iterations,
-        threshold=law.threshold,
-        cutoff=law.cutoff,
-    )
+    options = {
+        name: getattr(law, name) for name in ("damping", "iterations", "threshold", "cutoff")
+    }
+    sigma = filter_factors(w, law.solver, **options)
     sigma[sigma < _NO_SHARE] = 0.0
     some = sigma > 0
     sigma[some] = np.exp(np.round(np.log(sigma[some]) / _ALIKE) * _ALIKE)
