@@ -64,7 +64,7 @@ def check_network(
     checks: dict[str, FormationNetwork] = {}
     for name, flight, unheard in linear_flights(mission, way, lags):
         check = _formation_network(mission, flight, unheard)
-        checks[name] = check if name not in checks else checks[name].lesser(check)
+        checks[name] = check.lesser(checks.get(name, check))
     return checks
 
 

@@ -151,9 +151,8 @@ class SampledPhase(Stepper):
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
-        lose = (
-            self.first_tick is not None
-        )  # edges that end within a phase are those of what is lost
+        # Edges that end within a phase are those of what is lost.
+        lose = self.first_tick is not None
         assign_edges(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
