@@ -17,7 +17,7 @@ from rigidfleet.kernel.records import FINISHED
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.vehicles import network_of, sampled_flight
+from rigidfleet.planning.vehicles import TickTables, YawTurn, network_of, sampled_flight
 from rigidfleet.plotting.messages import oldest_messages
 from rigidfleet.typing import Floats
 from rigidfleet.web.live.session import Session
@@ -31,6 +31,10 @@ EDGES = [
     [1, 2], [1, 4], [1, 5], [1, 6], [2, 3], [2, 4], [2, 6], [2, 7], [3, 4], [3, 7], [3, 8], [4, 5], [4, 8], [5, 6],
     [5, 8], [6, 7], [6, 8], [7, 8],
 ]  # fmt: skip
+
+
+#: Vehicles that keep the yaw that they start with.
+TURN = YawTurn(0.0, np.zeros(8), np.zeros(8))
 
 
 def mission(
@@ -121,6 +125,25 @@ def test_no_vehicle_reads_another_ones_state(network):
         )  # ends at once: the others have no force
         assert alone.f_C[i].tobytes() == expected.f_C[i].tobytes()
         assert alone.force[i].tobytes() == expected.force[i].tobytes()
+
+
+def test_vehicles_go_by_what_they_measured():
+    """Where measurements are a tick old, forces are to the bit the same wherever the vehicles truly are by now."""
+    late = {"noise": {"delay": 0.02, "rate": 50.0, "position": 0.01, "velocity": 0.02, "seed": 1}}
+    problem, work, flight, state = laid_out(mission({"delay": 0.04}, disturbances=late))
+    flight = flight._replace(
+        tables=TickTables(mission({}, disturbances=late), flight).tables_for(0, 100, problem, TURN)
+    )
+    fly(problem, work, flight, state, 40)
+    moved = deepcopy(state)
+    moved.S[:, :6] += np.random.default_rng(2).normal(0.0, 1.0, (8, 6))
+    for each in (state, moved):
+        fly(problem, work, flight, each, 1)
+    assert np.linalg.norm(state.f_C, axis=1).min() > 1e-4
+    assert moved.force.tobytes() == state.force.tobytes()
+    fly(problem, work, flight, state, 1)
+    fly(problem, work, flight, moved, 1)
+    assert moved.force.tobytes() != state.force.tobytes()
 
 
 def central_force(problem: Any, work: Any, state: Any, t: float) -> Floats:
