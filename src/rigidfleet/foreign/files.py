@@ -338,7 +338,7 @@ def _read_file(parts: list[Path], options: _Options) -> Trajectories:
     try:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
             log = poses.read_recording(parts, topics)
-            read = logs.trajectories_of(log, path.stem, interpolation, (), origin)
+            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
         elif head.startswith((logs.ULOG, logs.BIN)) or suffix in _LOGS:
             log = logs.read_log(path)
             read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)

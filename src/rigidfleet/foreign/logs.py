@@ -26,12 +26,15 @@ from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.curves import LoggedStates, Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.geodesy import Geodetic, enu_of
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints
 
 #: Nanoseconds since 1970 from which on a stamp is a date; by how much a stamp goes back if a clock begins anew.
 _DATES, _ANEW = 10**15, 10**9
 #: A step of a position that its velocities do not explain: the least [m], and in usual ones.
 _JUMP, _UNUSUAL = 0.1, 20.0
+#: Distance of two topics that are places of one vehicle [m], and times at which they are compared.
+_TWINS, _TIMES = 0.05, 200
 #: Bytes after the last message of a log of ArduPilot that are the rest of its pages.
 _PAGES = 528
 #: Greatest number of things that a note lists.
@@ -229,6 +232,8 @@ def trajectories_of(
         both = track.velocity, track.deviation
         each = (None if x is None else np.resize(x, size) for x in both)
         measured.append(LoggedStates(*each, track.resets))
+    if not topics and all(who == track.topic for who, track in tracks.items()):
+        _refuse_twins([*tracks], curves)
     frames = [*dict.fromkeys(track.frame for track in tracks.values())]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
@@ -248,6 +253,25 @@ def trajectories_of(
     lines = tuple(of_all(notes))
     read = Trajectories(tuple(tracks), tuple(curves), ASSUMED[interpolation], lines, (record,))
     return read._replace(measured=tuple(measured), own_clocks=not log.clock)
+
+
+def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
+    """Refuse two topics that are at one place most of the time.
+
+    Raises
+    ------
+    ContentError
+        There are such.
+    """
+    times = np.array([curve.time[[0, -1]] for curve in curves])
+    t = np.linspace(times[:, 0].max(), max(times[:, 1].min(), times[:, 0].max()), _TIMES)
+    place = np.stack([curve.at(t)[:, :3] for curve in curves])
+    for k in range(1, len(place)):
+        apart = np.median(np.linalg.norm(place[:k] - place[k], axis=2), axis=1)
+        i = int(apart.argmin())
+        if apart[i] < _TWINS:
+            words = f"{names[i]} and {names[k]} are {apart[i]:.2g} m apart most of the time"
+            raise fault(f"{words}: is that one vehicle?", "Name the topics of vehicles: --topic")
 
 
 def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
