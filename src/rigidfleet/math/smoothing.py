@@ -192,22 +192,22 @@ def smooth(
     whole, turns = count - 3, _TURNS if calm is None else 0
     calm = np.ones(whole) if calm is None else calm
     numbers, about = 3 * max(len(samples.time) - 3, 1), np.zeros((count, 3))
+    third = np.zeros((whole, 3))  # differences of ``about``
 
     def solve(weight: Floats) -> tuple[Floats, Floats, Floats]:
         """Control points from ``about`` on (C, 3), what they were solved of, and the factor."""
         full, of = band.copy(), right.copy()
-        third = weight[:, None] * np.diff(about, 3, axis=0)
         for i in range(4):
-            of[i : i + whole] -= _THIRD[i] * third
+            of[i : i + whole] -= _THIRD[i] * weight[:, None] * third
             for j in range(i, 4):
                 full[j - i, i : i + whole] += _THIRD[i] * _THIRD[j] * weight
-        factor = cholesky_banded(full, lower=True)
-        return cho_solve_banded((factor, True), of), of, factor
+        factor = cholesky_banded(full, lower=True, check_finite=False)
+        return cho_solve_banded((factor, True), of, check_finite=False), of, factor
 
     def evaluate(log_variance: float) -> tuple[float, float]:
         weight = calm * np.exp(-log_variance)
         points, of, factor = solve(weight)
-        quadratic = squares + float((weight @ np.diff(about, 3, axis=0) ** 2).sum())
+        quadratic = squares + float((weight @ third**2).sum())
         quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
         variance = quadratic / numbers if free else 1.0
@@ -219,6 +219,7 @@ def smooth(
     bounds = _SMALLEST + zero, _LARGEST + zero
     # Only what a first way leaves is fitted: of far positions, the quadratic would be all rounding.
     about = solve(calm * np.exp(-_FIRST - zero))[0]
+    third = np.diff(about, 3, axis=0)
     rows = rows._replace(value=rows.value - rows.times(about))
     squares, right = float((rows.value**2).sum()), rows.normal_equations(count)[1]
     best = minimize_scalar(
