@@ -1,6 +1,7 @@
 """Logs judged with doubt. The oracles are flights of which the truth is known, with noise that the test makes."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,38 @@ def test_a_near_limit_is_undecided(count: int) -> None:
     assert {word for gap, word in words if gap == 0.4} == {"passed"}
     assert "failed" not in {word for gap, word in words if gap == 0.39}
     assert {word for gap, word in words if gap == 0.37} == {"failed"}
+
+
+@pytest.mark.parametrize("quantity", ["separation", "speed"])
+def test_what_would_decide_decides(monkeypatch: pytest.MonkeyPatch, quantity: str) -> None:
+    """An undecided check names a noise, and a rate: logs of the same flight with them are decided."""
+    fine = np.linspace(0.0, END, 20_001)
+    fastest = np.linalg.norm(np.gradient(places(fine), fine, axis=0), axis=2).max()
+    limits = {"separation": 0.1, "limits": {"speed": fastest + 0.01}}
+    if quantity == "separation":
+        limits = {"separation": 0.3985}
+
+    def check(sigma: float, rate: float, seed: int) -> Any:
+        monkeypatch.setattr("test_doubt.SIGMA", sigma)
+        monkeypatch.setattr("test_doubt.RATE", rate)
+        log = noisy("white", np.random.default_rng(seed))
+        return judge_log(log, None, Doubts(sigma, 0.0), **limits)[1].by_name[quantity]
+
+    first = check(0.003, 100.0, 1)
+    assert first.undecided
+    words = re.search(r"noise of (\S+) mm would decide it, .* white, (\d+) times", first.message)
+    assert words is not None
+    for sigma, rate in ((float(words[1]) / 1e3, 100.0), (0.003, 100.0 * int(words[2]))):
+        assert [check(sigma, rate, seed).passed for seed in (1, 2)] == [True, True]
+
+
+def test_one_vehicle_has_no_separation() -> None:
+    """A separation that is asked of one vehicle alone cannot be judged, with noise as without."""
+    log = noisy("white", np.random.default_rng(1))
+    alone = log._replace(names=log.names[:1], curves=log.curves[:1])
+    _, verdict = judge_log(alone, None, Doubts(SIGMA, 0.0), separation=0.3)
+    assert "there is one vehicle alone" in verdict.by_name["separation"].message
+    assert verdict.word == "failed"
 
 
 @pytest.mark.parametrize(("kind", "tau"), [("white", 0.0), ("ar 0.05", 0.05)])

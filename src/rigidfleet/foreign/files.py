@@ -35,7 +35,7 @@ Gaps = Literal["refuse", "bridge"]
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
-_ZIP, _HDF = b"PK", b"\x89HDF"
+_ZIP, _HDF, _BAG = b"PK", b"\x89HDF", b"#ROSBAG"
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
 #: in a folder. Files ``.bin`` are logs only by their content.
 _RECORDINGS, _LOGS = {".mcap", ".db3"}, {".ulg", ".tlog"}
@@ -334,6 +334,10 @@ def _read_file(parts: list[Path], options: _Options) -> Trajectories:
     if head.startswith(_HDF):
         raise TrajectoryError(
             f"{path}: is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`."
+        )
+    if head.startswith(_BAG):
+        raise TrajectoryError(
+            f"{path}: is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {path.name} --dst FOLDER."
         )
     try:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
