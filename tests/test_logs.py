@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError, TrajectoryError
 from rigidfleet.foreign.files import read_trajectories
@@ -842,6 +843,32 @@ def test_the_command_says_what_it_took(log, capsys):
     path = str(log("transforms.db3"))
     assert main(["assess", path, "--origin", "47.4", "8.5", "0"]) == 2
     assert "--origin: no file says where on the Earth it is" in capsys.readouterr().err
+
+
+def test_the_commands_of_the_page_judge_a_kept_log(log, tmp_path, capsys):
+    """The commands of docs/logs.md on PX4's log, against a plan made of what `pyulog` reads in it: nothing is off."""
+    path, plan = log("sitl.ulg"), tmp_path / "plan.nc"
+    every = pytest.importorskip("pyulog").ULog(str(path)).data_list
+    (own,) = (x.data for x in every if (x.name, x.multi_id) == ("vehicle_local_position", 0))
+    known = (own["xy_valid"] != 0) & (own["z_valid"] != 0)
+    time = own["timestamp_sample"][known].astype(float) / 1e6
+    place = np.stack([own["y"], own["x"], -own["z"]], axis=1)[known].astype(float)
+    rf.trajectories(time - time[0], place[:, None], cubic=True).save(plan)
+    page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text()
+    commands = re.findall(r"(?m)^rigidfleet (assess [^#\n]+)", page)
+    assert len(commands) == 4
+    for line in commands:
+        line = line.replace("flight.ulg", str(path)).replace("LOG...", str(path))  # noqa: PLW2901
+        line = line.replace("MISSION", str(plan)).replace("flights/", f"{tmp_path}/")  # noqa: PLW2901
+        code, out = main(line.split()), " ".join(capsys.readouterr().out.split())
+        assert code == ("--separation" in line), out  # of one vehicle alone it cannot be judged
+        if str(plan) in line:
+            late = float(re.search(r"the log is (\S+) \+- \S+ s (late|early)", out)[1])
+            assert late < 0.005
+            assert "off its slot" not in out
+    assert {"trajectories.nc", "verdict.json", "report.html", "replay.html"} <= {
+        x.name for x in (tmp_path / "first").iterdir()
+    }
 
 
 @pytest.mark.parametrize(

@@ -192,6 +192,7 @@ def _planned_ways(plan: Result) -> Piecewise:
     """The plan: ways of slots, and of vehicles as they fly in the simulator where no slots are tracked."""
     slots, flown = plan.motion(), plan.motion(flown=True)
     state = np.where(np.isnan(slots.state), flown.state, slots.state)
+    state[:, 2:] = np.nan_to_num(state[:, 2:])  # of straight lines
     still = np.zeros_like(slots.yaw)
     return ways_of(slots._replace(state=state, yaw=still, yaw_rate=still), slice(None))
 
