@@ -322,6 +322,18 @@ def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
     assert verdict.word == "undecided"
 
 
+def test_what_a_simulator_knows_is_not_said_of_a_log() -> None:
+    """Messages, rotors and attitudes of the simulated plan are not those of the flight that a log is of."""
+    plan = rf.simulate("lossy-passage")
+    assert plan.messages is not None
+    log = flown(plan, np.random.default_rng(15))
+    result, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0))
+    assert any("messages were sent" in note for note in rf.assess(plan).notes)
+    assert not any("messages were sent" in note for note in verdict.notes)
+    assert result.messages is result.rotor_force is result.vehicle_attitude is None
+    assert np.isnan(result.thrust).all()
+
+
 def test_a_vehicle_off_its_slot_is_named(plan: rf.Result) -> None:
     """A vehicle 50 mm off its slot is named, with how far and where to; no other is."""
     shift = np.zeros((3, 3))
