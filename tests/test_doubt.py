@@ -22,7 +22,7 @@ from rigidfleet.math.smoothing import (
     knots_over,
     noise_of,
     smooth,
-    spline_states,
+    spline,
 )
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log
@@ -122,7 +122,7 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
         curve = noisy(kind, random).curves[0]
         log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
         likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
-        ways = spline_states(likely.knots, likely.draw(40, random), t, 1)[0]
+        ways = spline(likely.knots, likely.draw(40, random)).at(t)
         drawn = np.std(ways, axis=2)
         held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)
     assert np.mean(held) > 0.9

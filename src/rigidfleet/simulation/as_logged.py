@@ -28,7 +28,7 @@ from rigidfleet.math.smoothing import (
     knots_over,
     noise_of,
     smooth,
-    spline_states,
+    spline,
 )
 from rigidfleet.result import Extremum, Result
 from rigidfleet.setpoints import ways_of
@@ -235,9 +235,8 @@ def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Float
         inside = flown.left[:, i]
         drawn = [model[i].draw(share, random) for model, share in zip(models, shares, strict=True)]
         points = np.concatenate(drawn, axis=2) - likely.points[..., None]
-        off[:, :, inside, i] = np.moveaxis(
-            spline_states(likely.knots, points, time[inside], 3), -1, 0
-        )
+        states = spline(likely.knots, points).states(time[inside], 3)
+        off[:, :, inside, i] = np.moveaxis(states, -1, 0)
     rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
     for s, by in enumerate(late * random.standard_normal((count, len(late)))):
         off[s, :2] += by[:, None] * rates
@@ -281,8 +280,8 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
     length = np.linalg.norm(r[:, i] - r[:, j], axis=2)
     known |= {
         "edges": plan.edges, "position": r, "velocity": v, "acceleration": a, "slot_position": slots[0],
-        "slot_velocity": slots[1], "slot_acceleration": slots[2], "cm": share @ r, "cm_velocity": share @ v, "distance": length,
-        "constraint": length - known["distance_reference"],
+        "slot_velocity": slots[1], "slot_acceleration": slots[2], "cm": share @ r, "cm_velocity": share @ v,
+        "distance": length, "constraint": length - known["distance_reference"],
     }  # fmt: skip
     whole = end >= plan.time[-1] - 1e-6
     ending = plan.ending if whole else "the log ends"
