@@ -16,6 +16,7 @@ from rigidfleet.cli.app import main
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import LoggedStates, Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.smoothing import (
     PositionNoise,
     Positions,
@@ -252,9 +253,9 @@ def test_an_offset_of_the_clock_is_recovered(plan: rf.Result) -> None:
 def test_hovering_tells_no_clock() -> None:
     """Where nothing moves, the offset cannot be told."""
     random, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.05)
-    still = lambda _i, t: (np.ones((len(t), 3)), np.zeros((len(t), 3)))  # noqa: E731
+    still = Piecewise(np.array([0.0, 20.0]), np.ones((1, 3, 1)))
     logs = [(t, 1.0 + 1e-4 * random.standard_normal((len(t), 3)))]
-    found = align(logs, still, (0.0, 20.0), "recorded").to_dict()
+    found = align(logs, [still], "recorded").to_dict()
     assert found["offset_s"] is None
     assert found["turn_deg"] is None
     x = np.ones((len(t), 1, 3))

@@ -202,8 +202,7 @@ def _alignment(
     for each, log in zip(smoothed, logs, strict=True):
         t = np.arange(log.time[0], log.time[-1], _ALIGNED)
         places.append((t, each.way.at(t)))
-    states = lambda i, t: tuple(alone[i].states(t, 2))  # noqa: E731
-    return align(places, states, (float(planned.time[0]), float(planned.time[-1])), clock)
+    return align(places, alone, clock)
 
 
 def _offsets(alignment: Alignment, clock: Clock) -> Floats:
