@@ -17,6 +17,7 @@ import numpy as np
 
 from rigidfleet._common.files import why_not
 from rigidfleet._common.tables import ContentError, fault
+from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import logs, poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
@@ -238,7 +239,7 @@ def groups_of_files(path: Path) -> list[list[Path]]:
         whole = [[*range(first, first + len(group))] for first in (0, 1)]
         if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
             raise TrajectoryError(
-                f"{group[0].parent}: {_first_few([p.name for p in group])} are no sequence. Number the tables that a "
+                f"{group[0].parent}: {first_few([p.name for p in group])} are no sequence. Number the tables that a "
                 "vehicle flies one after the other from 0 or 1 on, and leave none out."
             )
     return groups
@@ -263,7 +264,7 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
                 f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
                 "move it out of the folder."
             )
-    names = _first_few([p.relative_to(path) for p in rest])
+    names = first_few([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
 
 
@@ -296,12 +297,6 @@ def _head_of(path: Path) -> bytes:
 def _is_hidden(path: Path) -> bool:
     """Whether a file or folder is no one's own, as what systems put beside others."""
     return path.name.startswith((".", "__MACOSX"))
-
-
-def _first_few(things: Sequence[object]) -> str:
-    """The first of some things, and how many more there are."""
-    more = f" and {len(things) - _LISTED:,} more" if len(things) > _LISTED else ""
-    return ", ".join(map(str, things[:_LISTED])) + more
 
 
 def _sort_key(path: Path) -> list[tuple[int, str]]:
@@ -453,7 +448,7 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
     if frozen:
-        words = f"positions repeat to the last digit between moves, {_first_few(frozen)}"
+        words = f"positions repeat to the last digit between moves, {first_few(frozen)}"
         notes.append(f"{words}: a hold, or a tracker that lost sight of it")
     return notes
 
@@ -470,7 +465,7 @@ def _note_on_spans(read: Trajectories) -> list[str]:
     if not part:
         return []
     if not read.away:
-        return [f"{_first_few(part)}: each stays at its first and last place outside of its time"]
+        return [f"{first_few(part)}: each stays at its first and last place outside of its time"]
     apart = len(starts) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
     never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
-    return [f"vehicles are judged only where they have data: {_first_few(part)}{never}"]
+    return [f"vehicles are judged only where they have data: {first_few(part)}{never}"]

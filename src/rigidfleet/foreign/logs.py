@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
+from rigidfleet._common.text import first_few
 from rigidfleet.foreign.curves import LoggedStates, Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.geodesy import Geodetic, enu_of
@@ -277,8 +278,7 @@ def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
 def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
     """Notes with the names of those whom they are on, unless it is the only one ("")."""
     for note, names in notes.items():
-        more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
-        yield f"{', '.join(names[:_LISTED])}{more}: {note}" if any(names) else note
+        yield f"{first_few(names, _LISTED)}: {note}" if any(names) else note
 
 
 class _Track(NamedTuple):
