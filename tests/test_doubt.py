@@ -129,6 +129,22 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
     assert np.mean(held) > 0.9
 
 
+def test_a_gap_is_in_doubt() -> None:
+    """Without samples for 2 s about the least separation, its interval is wide, and holds."""
+    random, held, wide = np.random.default_rng(16), [], []
+    for _ in range(4):
+        log = noisy("white", random)
+        for kept in (slice(None), np.abs(log.curves[0].time - 6.0) > 1.0):
+            places_of = [c.at(c.time)[kept, :3] for c in log.curves]
+            some = logged([c.time[kept] for c in log.curves], places_of)
+            _, verdict = judge_log(some, None, Doubts(SIGMA, 0.0))
+            low, high = verdict.by_name["separation"].interval or (np.inf, np.inf)
+            held.append(low <= 0.4 <= high)
+            wide.append(high - low)
+    assert np.mean(held) >= 0.9
+    assert np.mean(wide[1::2]) > 5.0 * np.mean(wide[::2])
+
+
 @many
 def test_a_near_limit_is_undecided(count: int) -> None:
     """A flight that keeps its limit is never failed, one that collides by more than the noise never passed."""
@@ -321,6 +337,8 @@ def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
     _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0, "own"))
     assert "separation is not judged: vehicles have no common clock" in verdict.summary
     assert verdict.word == "undecided"
+    _, same = judge_log(log._replace(own_clocks=True), plan, Doubts(SIGMA, 0.0))  # as files say
+    assert same.summary == verdict.summary
 
 
 def test_what_a_simulator_knows_is_not_said_of_a_log() -> None:
