@@ -219,7 +219,7 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
     offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
         raise TrajectoryError(
-            "the clock cannot be told: the plan hardly moves. Use --clock recorded."
+            "the clock cannot be told: the plan hardly moves. Give logs of one clock, with --clock recorded."
         )
     return offsets
 
