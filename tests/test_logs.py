@@ -618,6 +618,13 @@ def test_one_vehicle_is_not_two(tmp_path):
         read_trajectories(path)
     assert read_trajectories(path, topic="/b").names == ("/b",)
     assert read_trajectories(path, topic="/?").names == ("/a", "/b")
+    pad = [
+        (topic, t + by, t + by, [1.0, 0.0, 0.0])
+        for t, _ in at
+        for topic, by in (("/a", 0), ("/b", 10**10))
+    ]
+    read = read_trajectories(poses_bag(tmp_path / "pad", pad), spans="away")
+    assert read.names == ("/a", "/b")  # one after the other
 
 
 def test_a_recording_that_ends_with_the_power(log):

@@ -109,18 +109,11 @@ def knots_over(time: Floats, zero: float, step: float) -> Floats:
     return zero + step * np.arange(first - 1.0, max(last, first + 1.0) + 2.0)
 
 
-class _Whitened(NamedTuple):
-    """Samples whose noise is independent, of variance 1: value (K, 3) is matrix (K, C) times control points (C, 3).
+def _whiten(samples: Positions, noise: PositionNoise, knots: Floats) -> tuple[Any, Floats, float]:
+    """A matrix (K, C), sparse, and values (K, 3): the matrix times control points (C, 3), with independent noise.
 
-    ``deviance`` is -2 log of the determinant of what whitens all axes.
+    The noise has variance 1; last comes -2 log of the determinant of what whitens all axes.
     """
-
-    matrix: Any
-    value: Floats
-    deviance: float
-
-
-def _whiten(samples: Positions, noise: PositionNoise, knots: Floats) -> _Whitened:
     from scipy.sparse import csr_array, diags_array
 
     h, spans, count = knots[1] - knots[0], len(knots) - 1, len(samples.time)
@@ -139,7 +132,7 @@ def _whiten(samples: Positions, noise: PositionNoise, knots: Floats) -> _Whitene
         whitening = diags_array([left, -share * left[1:]], offsets=[0, -1])
         matrix, value = (whitening @ matrix).tocsr(), whitening @ value
         deviance -= 6.0 * float(np.log(left).sum())
-    return _Whitened(matrix, value, deviance)
+    return matrix, value, deviance
 
 
 def smooth(
@@ -157,10 +150,9 @@ def smooth(
 
     free = np.isnan(noise.sigma)
     unit = PositionNoise(1.0, noise.tau) if free else noise
-    rows, count = _whiten(samples, unit, knots), len(knots) + _POINTS - 2
-    matrix, normal = rows.matrix, rows.matrix.T @ rows.matrix
+    (matrix, value, whitening), count = _whiten(samples, unit, knots), len(knots) + _POINTS - 2
+    normal, right = matrix.T @ matrix, matrix.T @ value
     band = np.stack([np.pad(normal.diagonal(-k), (0, k)) for k in range(_WINDOW)])
-    right = matrix.T @ rows.value
     whole, turns = count - 3, _TURNS if calm is None else 0
     calm = np.ones(whole) if calm is None else calm
     numbers, about = 3 * max(len(samples.time) - 3, 1), np.zeros((count, 3))
@@ -183,7 +175,7 @@ def smooth(
         quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
         variance = quadratic / numbers if free else 1.0
-        return rows.deviance + numbers * np.log(
+        return whitening + numbers * np.log(
             variance
         ) + quadratic / variance + 3.0 * of_points, variance
 
@@ -192,7 +184,7 @@ def smooth(
     # Only what a first way leaves is fitted: of far positions, the quadratic would be all rounding.
     about = solve(calm * np.exp(-_FIRST - zero))[0]
     third = np.diff(about, 3, axis=0)
-    value = rows.value - matrix @ about
+    value = value - matrix @ about
     squares, right = float((value**2).sum()), matrix.T @ value
     best = minimize_scalar(
         lambda x: evaluate(x)[0], bounds=bounds, method="bounded", options={"xatol": _CLOSE}
