@@ -330,11 +330,13 @@ class SampledPhase(Stepper):
         self.flown = problem
         times = phase.times(t_end)
         phase.begun, arrays = True, self.vehicles.avoidance
-        network = self.vehicles.flight.network
-        self.flight = self.flight._replace(network=network)
+        network, laws = self.vehicles.flight.network, self.vehicles.laws
+        if network is not self.flight.network:
+            self.flight = self.flight._replace(network=network)
         call = fleet.segment(n, m, t_end, times, _STEPS, links=len(network.links))
         sampled.count[fleet.SAMPLES] = 0
-        status, laws = records.PAUSED, self.vehicles.laws
+        looked = laws is not None and laws.has_views(problem, sampled)
+        status = records.ASKS if looked else records.PAUSED
         try:
             while status in (records.PAUSED, records.ASKS):
                 if status == records.PAUSED:
