@@ -163,13 +163,13 @@ def convex_rim(points: Floats) -> Floats:
     places = np.unique((points @ [1.0, 1.0j]).round(9)).tolist()
     rim: list[complex] = []
     for chain in places, places[::-1]:
-        side: list[complex] = []
+        part: list[complex] = []
         for z in chain:
             # No corner where the way turns right, or not at all
             while (
-                len(side) > 1 and ((side[-1] - side[-2]).conjugate() * (z - side[-1])).imag < 1e-9
+                len(part) > 1 and ((part[-1] - part[-2]).conjugate() * (z - part[-1])).imag < 1e-9
             ):
-                side.pop()
-            side.append(z)
-        rim += side[:-1]  # its last corner begins the other chain
+                part.pop()
+            part.append(z)
+        rim += part[:-1]  # its last corner begins the other chain
     return np.array(rim).view(np.float64).reshape(-1, 2)

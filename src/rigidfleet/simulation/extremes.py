@@ -395,8 +395,7 @@ class Extremes(CurveWatch):
         """
         size = states or len(y), edges
         if size != self.size:  # else the memory of the phase before serves this one
-            room = records.VEHICLES_TRAIL if states else records.POINTS_TRAIL
-            self.size = size
+            self.size, room = size, records.VEHICLES_TRAIL if states else records.POINTS_TRAIL
             self.trail = records.trail(room, size[0], self.n, edges, self.directed)
             self._begin_monitor(size[0], self.trail.gauge.shape[1])
         return records.integrator(y, t, rtol=rtol, atol=atol, trail=self.trail)
