@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -238,6 +238,12 @@ class Fact(NamedTuple):
         worst = None if self.value is None else value(self.value, self.unit)
         when = None if self.when is None else f"{self.when:.2f}"
         return Row((self.name, worst, self.doubt, self.bound, when, self.who), self.level)
+
+
+def table_of(rows: Sequence[Mapping[str, Any]], words: Collection[str] = ()) -> FactTable:
+    """Table of things by the names of their quantities, of which each has its own."""
+    heads = [*dict.fromkeys(name for row in rows for name in row)]
+    return FactTable(heads, [Row([row.get(name) for name in heads]) for row in rows], words)
 
 
 def worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
