@@ -831,7 +831,9 @@ def test_sweeps_push_all_and_then_those_that_push_until_little_changes(ask):
         reduced=1.0 / diagonal[:count], most=most, inverse=inverse, pushing=np.zeros(count, dtype=np.int64),
         pull=np.zeros(m), hold=np.ones(n),
     )  # fmt: skip
-    sweep = as_python(barriers, "relative", "shove", "softness", "relax", "relax_edges", "sweep")
+    sweep = as_python(
+        barriers, "relative", "shove", "edge_softness", "relax", "relax_edges", "sweep"
+    )
     x, right = np.r_[np.zeros(count), rng.normal(size=m)], np.r_[missing, np.zeros(m)]
     a.pull[:], a.shift[:] = x[count:], (np.repeat(inverse, 3) * (x @ J)).reshape(n, 3)
     A += np.diag([0.0] * count + [mu / mean] * m)
