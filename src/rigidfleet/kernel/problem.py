@@ -5,6 +5,7 @@ compiled with the extents that types of arrays declare here, and once more with 
 """
 
 import math
+from functools import lru_cache
 from itertools import accumulate
 from typing import Annotated, NamedTuple
 
@@ -259,18 +260,9 @@ def workspace(
     """
     size = 0 if large else min(m, 3 * n) if solver == ITERATED else m
     vectors = 0 if large or solver in (ITERATED, EXACT) else m
-    k = 3 * n if with_h else 0
-    agents, edges, space = (n, 3), (m,), (3, 3)
-    w = Workspace(
-        **_side_by_side(
-            r=agents, v=agents, r_seen=agents, v_seen=agents, u=(m, 3), L=edges, d=edges,
-            d_dot=edges, d_ddot=edges, c=edges, b=edges, A=(size, size), V=(vectors, vectors),
-            w=edges, multiplier=edges, f_E=agents, f_u=agents, f_C=agents, f_D=agents, a=agents,
-            p=agents, p_dot=agents, p_ddot=agents, r_ref=agents, v_ref=agents, a_ref=agents,
-            cm=(5, 3), I=space, I_inv=space, T=space, body=(8, 3), gain=(4,), E=space, T_ref=space,
-            wrench=(6,), H=(k, k), H_V=(k, k), H_w=(2, k),
-        )
-    )  # fmt: skip
+    places, length = _side_by_side(n, m, size, vectors, 3 * n if with_h else 0)
+    memory = zeros(length)
+    w = Workspace(*[memory[part].reshape(shape) for part, shape in places])
     w.T[:] = w.T_ref[:] = np.eye(3)
     return w
 
@@ -280,15 +272,26 @@ def padded(count: int) -> int:
     return -(-count // 8) * 8
 
 
-def _side_by_side(**shapes: tuple[int, ...]) -> dict[str, Floats]:
-    """Arrays of zeros, each aligned to a cache line."""
-    sizes = [math.prod(shape) for shape in shapes.values()]
-    ends = list(accumulate(map(padded, sizes)))
-    memory = zeros(ends[-1])
-    return {
-        name: memory[end - padded(size) :][:size].reshape(shape)
-        for (name, shape), size, end in zip(shapes.items(), sizes, ends, strict=True)
-    }
+@lru_cache(64)
+def _side_by_side(
+    n: int, m: int, size: int, vectors: int, k: int
+) -> tuple[list[tuple[slice, tuple[int, ...]]], int]:
+    """Place and shape of each array of a `Workspace` in one memory, aligned to a cache line; its length."""
+    agents, edges, space = (n, 3), (m,), (3, 3)
+    shapes: dict[str, tuple[int, ...]] = {
+        "r": agents, "v": agents, "r_seen": agents, "v_seen": agents, "u": (m, 3), "L": edges, "d": edges,
+        "d_dot": edges, "d_ddot": edges, "c": edges, "b": edges, "A": (size, size), "V": (vectors, vectors),
+        "w": edges, "multiplier": edges, "f_E": agents, "f_u": agents, "f_C": agents, "f_D": agents, "a": agents,
+        "p": agents, "p_dot": agents, "p_ddot": agents, "r_ref": agents, "v_ref": agents, "a_ref": agents,
+        "cm": (5, 3), "I": space, "I_inv": space, "T": space, "body": (8, 3), "gain": (4,), "E": space,
+        "T_ref": space, "wrench": (6,), "H": (k, k), "H_V": (k, k), "H_w": (2, k),
+    }  # fmt: skip
+    sizes = [math.prod(shapes[name]) for name in Workspace._fields]
+    *starts, length = accumulate(map(padded, sizes), initial=0)
+    parts = [slice(start, start + size) for start, size in zip(starts, sizes, strict=True)]
+    return [
+        (part, shapes[name]) for name, part in zip(Workspace._fields, parts, strict=True)
+    ], length
 
 
 def no_disturbance(masses: Floats) -> Disturbance:

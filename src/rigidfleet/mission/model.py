@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from functools import cached_property, wraps
+from functools import cached_property, lru_cache, wraps
 from hashlib import sha256
 from typing import Any, Literal, NamedTuple, Self, TypeVar
 
@@ -454,14 +454,12 @@ class Mission(Contents, Shown):
         if name is None or slots is None:
             return _DAMPING[1]
         edges = self.formation_edges(name)
-        if lost is None and len(edges) > 0 and min(len(edges), 3 * self.n_agents) <= _DENSE:
-            return _damping(slots, edges, self.fleet.mass)
         left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
         edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
         if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
             return _DAMPING[1]
-        masses = self.fleet.mass[left]
-        return _damping(slots[left], edges, masses)
+        of_left = slots[left], edges, self.fleet.mass[left]
+        return _damping(*(x.tobytes() for x in of_left))
 
     @property
     def latest_end(self) -> float:
@@ -581,6 +579,8 @@ class Mission(Contents, Shown):
         pairs, times = self.links_lost
         n = self.n_agents
         lost = pairs[times < t]
+        if not len(lost):
+            return np.ones(len(edges), dtype=np.bool_)
         return ~np.isin(edges[:, 0] * n + edges[:, 1], lost[:, 0] * n + lost[:, 1])
 
     @cached_property
@@ -629,9 +629,15 @@ class Mission(Contents, Shown):
         return "continue" if self.disturbances is None else self.disturbances.on_loss
 
 
-def _damping(slots: Floats, edges: Ints, masses: Floats) -> float:
-    """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg]."""
+@lru_cache(64)
+def _damping(slots: bytes, edges: bytes, masses: bytes) -> float:
+    """Damping "auto" of a formation held: slots (N, 3) [m], edges (m, 2) and masses (N,) [kg].
+
+    All runs of a sweep ask for the same: it would be a tenth of a short flight.
+    """
+    r, pairs = np.frombuffer(slots).reshape(1, -1, 3), np.frombuffer(edges, np.int64).reshape(-1, 2)
+    J = constraint_jacobian.jacobian(r, pairs)
     least, most = _DAMPING
-    J = constraint_jacobian.jacobian(slots[None], edges)
-    w = float(constraint_jacobian.smallest_of(J, masses)[0]) ** 2  # of mbar J M^-1 J^T
+    (singular,) = constraint_jacobian.smallest_of(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
+    w = float(singular) ** 2
     return min(max(w / 4, least), most)

@@ -361,6 +361,9 @@ class Extremes(CurveWatch):
 
     def __init__(self, mission: Mission) -> None:
         super().__init__(mission)
+        #: States in the trail, and edges, for which there is a monitor.
+        self.size: tuple[int, int] | None = None
+        self.trail = records.NO_TRAIL
         self._thread: ThreadPoolExecutor | None = None  # of large formations
         self._taking: Future[None] | None = None
         self.of_vehicles: dict[str, Extremum] = {}
@@ -390,9 +393,11 @@ class Extremes(CurveWatch):
 
         ``states``: how many the trail records, by default all.
         """
-        trail = records.trail(states or len(y), self.n, edges, self.directed)
-        self._begin_monitor(states or len(y), trail.gauge.shape[1])
-        return records.integrator(y, t, rtol=rtol, atol=atol, trail=trail)
+        size = states or len(y), edges
+        if size != self.size:  # else the memory of the phase before serves this one
+            self.size, self.trail = size, records.trail(size[0], self.n, edges, self.directed)
+            self._begin_monitor(size[0], self.trail.gauge.shape[1])
+        return records.integrator(y, t, rtol=rtol, atol=atol, trail=self.trail)
 
     def lose(self, lost: Bools) -> None:
         """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
@@ -408,6 +413,7 @@ class Extremes(CurveWatch):
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
         self._list_all()
+        self.size = None  # other vehicles are monitored from now on
 
     def take(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool

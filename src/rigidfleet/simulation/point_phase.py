@@ -163,7 +163,7 @@ class PointPhase(Stepper):
         phase, plan = self.phase, self.phase.plan
         n, m = len(plan.masses), len(plan.edges)
         setup = None if phase.solver is None else phase.solver.setup
-        source = Unevaluated(problem, plan.problem, samples, setup)
+        source = Unevaluated(native.pack(problem), plan.problem, samples, setup)
         if phase.external is not None:  # a user's function is asked while it is at hand
             source = source.evaluate(times, phase.workspace)
         frame = np.full((len(times), 4), np.nan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy as np
 from rigidfleet._common.arrays import same
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measurement_of
+from rigidfleet.kernel.problem import workspace
 from rigidfleet.kernel.records import Record, recorder
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -84,10 +85,15 @@ Array = TypeVar("Array", Floats, Ints)
 class Unevaluated(NamedTuple):
     """States of the integrator at samples, of which forces and references have not been asked for yet."""
 
-    problem: Problem  # as flown: it may hold the force of a user's controller
+    packed: native.Packed  # the problem as flown: it may hold the force of a user's controller
     planned: Problem  # of the phase, which has the references
     y: Floats  # (K, n)
     setup: Setup | None  # of a large formation
+
+    @property
+    def problem(self) -> Problem:
+        """The problem as flown."""
+        return self.packed.of
 
     @property
     def motion(self) -> tuple[Floats, Floats]:
@@ -109,7 +115,7 @@ class Unevaluated(NamedTuple):
 
     def evaluate_into(self, out: native.Packed, first: int, times: Floats, work: Workspace) -> None:
         """Write them into a packed record from row ``first`` on."""
-        native.record_into(out, first, native.pack_anew(self.problem), work, times, self.y)
+        native.record_into(out, first, self.packed, work, times, self.y)
         if self.problem is not self.planned:
             of_phase = native.record(self.planned, work, times, self.y)
             for name in _REFERENCES:
@@ -146,8 +152,13 @@ class Piece:
         self.record_into(native.pack_anew(out), 0)
         return out
 
-    def record_into(self, out: native.Packed, first: int) -> None:
-        """Write forces and references, of the edges of this phase, into a packed record from row ``first`` on."""
+    def record_into(
+        self, out: native.Packed, first: int, make: Callable[..., Workspace] = workspace
+    ) -> None:
+        """Write forces and references, of the edges of this phase, into a packed record from row ``first`` on.
+
+        ``make`` makes a workspace, or returns one that the piece before has used.
+        """
         source = self.source
         if not isinstance(source, Unevaluated):
             for rows, values in zip(out.of, source, strict=True):
@@ -158,11 +169,11 @@ class Piece:
             planned = solved_by(solver, source.planned)
             own = source.problem is source.planned
             problem = planned if own else solved_by(solver, source.problem)
-            renewed = source._replace(problem=problem, planned=planned)
+            renewed = source._replace(packed=native.pack_anew(problem), planned=planned)
             renewed.evaluate_into(out, first, self.time, solver.workspace)
             solver.check()
         else:
-            source.evaluate_into(out, first, self.time, workspace_of(source.planned))
+            source.evaluate_into(out, first, self.time, workspace_of(source.planned, make=make))
 
 
 def assemble(
@@ -471,16 +482,16 @@ def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) ->
     """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
     count, end = sum(len(p.time) for p in pieces), 0
     out = recorder(count, n, len(edges), disturbed=disturbed)
-    whole = native.pack_anew(out)
+    whole, make = native.pack_anew(out), cache(workspace)
     for piece in pieces:
         begin, end = end, end + len(piece.time)
         places = _columns(piece.edges, edges)
         if isinstance(places, slice):
-            piece.record_into(whole, begin)
+            piece.record_into(whole, begin, make)
             continue
         size = count, len(piece.edges)
         own = out._replace(**{name: np.empty(size) for name in _EDGEWISE})
-        piece.record_into(native.pack_anew(own), begin)
+        piece.record_into(native.pack_anew(own), begin, make)
         for name in _EDGEWISE:
             rows = getattr(out, name)[begin:end]
             rows.fill(np.nan)

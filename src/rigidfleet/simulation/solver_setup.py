@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,10 +53,12 @@ def solved_by(solver: LargeSolver, problem: Problem) -> Problem:
     return problem._replace(graph=graph)
 
 
-def workspace_of(problem: Problem, *, large: bool = False) -> Workspace:
+def workspace_of(
+    problem: Problem, *, large: bool = False, make: Callable[..., Workspace] = workspace
+) -> Workspace:
     """A workspace for a problem; that of a ``large`` formation has no room for a dense solve of its multipliers."""
     size, with_h = problem.graph.edges.shape[0], problem.control.allocation != RIGID
-    return workspace(
+    return make(
         len(problem.vehicles.m), size, with_h=with_h, solver=problem.law.solver, large=large
     )
 
