@@ -270,7 +270,7 @@ class Sheet:
         """What is printed: the head, and the parts with blank lines around tables."""
         from rich.text import Text
 
-        head = Text.assemble((self.name, "bold"), f": {self.title}")
+        head = Text.assemble((self.name, "bold"), f": {self.title}" * bool(self.title))
         begin: list[Any] = [head] if self.name else []
         blocks = [*begin]
         for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):

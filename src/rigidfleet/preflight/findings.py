@@ -223,24 +223,14 @@ class FormationNetwork:
         return min(self, other, key=lambda f: (f.borne, f.delay, f.loss or 0.0))
 
     @property
-    def words(self) -> str:
-        """In words."""
-        ms = 1e3 * self.tick
-        parts = [
-            f"{self.broadcasts:.0f} broadcasts a second",
-            f"bears messages {self.delay} ticks late ({self.delay * ms:.0f} ms), its own are {self.own_delay}"
-            f" ({self.own_delay * ms:.0f} ms)",
-        ]
-        if self.loss is not None:
-            most = f"up to {100 * self.loss:.0f}" if self.loss < 0.95 else "with 95"
-            parts.append(
-                f"stable in mean square {most} % of losses, its own are {100 * self.own_loss:.0f} %"
-            )
-        if self.growing is not None:
-            parts.append(
-                f"errors grow in {100 * self.growing:.0f} % of sampled flights over its own network"
-            )
-        return "; ".join(parts)
+    def row(self) -> dict[str, Any]:
+        """What it bears and what it has, by the names of columns; losses are stable in mean square."""
+        ms, bears = 1e3 * self.tick, None if self.loss is None else 100 * self.loss
+        return {
+            "broadcasts [/s]": self.broadcasts, "bears delay [ms]": ms * self.delay, "has [ms]": ms * self.own_delay,
+            "bears loss [%]": bears, "has [%]": None if bears is None else 100 * self.own_loss,
+            "flights that grow [%]": None if self.growing is None else 100 * self.growing,
+        }  # fmt: skip
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -423,6 +413,7 @@ class Preflight(Shown):
         ]  # fmt: skip
         return [
             *tables,
+            table_of([{"network": name} | f.row for name, f in self.network.items()]),
             FactTable(words, [*map(Row, self._rows())], words, bare=True),
             table_of(ways if len(ways) > 1 else []),
             worst_values("planned", self._worst()),
@@ -473,7 +464,6 @@ class Preflight(Shown):
         """What is said in words, each with its heading."""
         in_words = _scene_words if self.is_show else _formation_words
         yield from ((f.name, words) for f in self.formations if (words := in_words(f)))
-        yield from (("network", f"'{name}': {f.words}") for name, f in self.network.items())
         lacking = [p.phase for p in self.planned_phases if p.certificate is None]
         if lacking and self.certificates:
             yield "not proved", f"{names_in_words(lacking)} flown without tracked slots"
