@@ -267,6 +267,11 @@ class Sweep:
         tables = (*_SEEDED[:3], ("avoidance", "sensing_noise"))
         return any(look_up(self.varied(0), keys) for keys in tables)
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """The mission as plain data, as written."""
+        return self.mission.to_dict()
+
     @cached_property
     def whole(self) -> dict[str, Any]:
         """The mission as plain data with all defaults."""
