@@ -50,7 +50,7 @@ network: .venv/.core  ## Fly formations over networks that lose and delay (half 
 day: .venv/.oracles .venv/.interchange .venv/.dev  ## Rehearse and abort shows of a thousand, against oracles (an hour)
 	@$(BIN)/python benchmarks/day.py --write docs/day.md
 
-evening: .venv/.core  ## Judge logs of which the truth is known (an hour)
+evening: .venv/.core  ## Judge logs of which the truth is known (half an hour)
 	@$(BIN)/python benchmarks/evening.py --write docs/logs.md
 
 exports: .venv/.interchange  ## Measure every export of three flights

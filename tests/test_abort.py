@@ -110,6 +110,44 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
     return apart(mission, begins) - abort.least.separation
 
 
+#: A shipped mission, to where, and when: whose steps back once broke a limit of acceleration, who are pushed or lag.
+HARD = [
+    ("bridge-inspection", "own", 21.43), ("change-of-picture", "own", 14.28), ("market-square", "any", 30.77),
+    ("windy-passage", "any", 20.22), ("passage-quadrotors", "own", 42.02),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "to", "T"), HARD)
+def test_shipped_missions_pass_after_an_abort_and_keep_its_promise(
+    name: str, to: str, T: float
+) -> None:
+    """The verdict passes, and compares the least distance, that of samples, with the one that the abort promises."""
+    data = load_mission(name).to_dict()
+    mission = Mission.from_dict(data | {"abort": {"at": T, "to": to}})
+    promised = aborts_of(complete_times(mission)).at(T).least.separation
+    result = rf.simulate(mission)
+    verdict = rf.assess(result)
+    assert verdict.passed, verdict.summary
+    check = verdict.by_name["way_home"]
+    assert check.limit == pytest.approx(promised, abs=1e-12)
+    i, j = np.array(list(itertools.combinations(range(mission.n_agents), 2))).T
+    r, radius = result.position[result.time >= T + 0.5], mission.fleet.radius
+    least = (np.linalg.norm(r[:, i] - r[:, j], axis=2) - radius[i] - radius[j]).min()
+    assert check.worst == pytest.approx(least, abs=1e-3)
+    assert check.worst is not None
+    assert promised - 1e-12 <= check.worst <= least + 1e-9
+
+
+def test_a_broken_promise_fails_the_verdict() -> None:
+    """Vehicles whose messages are lost do not keep the promised distance, which is one line of the verdict."""
+    data = load_mission("lossy-passage").to_dict() | {"abort": {"at": 35.71, "to": "own"}}
+    verdict = rf.assess(rf.simulate(Mission.from_dict(data)))
+    check = verdict.by_name["way_home"]
+    assert not check.passed
+    assert f"- {check.message}" in verdict.summary
+    assert "promised 0.812 m" in check.message
+
+
 def progress(begins: float, time: float, t: np.ndarray) -> np.ndarray:
     """Time along the plan at times t [s], by quadrature of a rate that falls from 1 to 0 as a quintic blend."""
     fine = np.linspace(begins, begins + time, 20_001)

@@ -1,6 +1,7 @@
 """Logs judged with doubt. The oracles are flights of which the truth is known, with noise that the test makes."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +13,19 @@ from scipy.signal import butter, lfilter
 import rigidfleet as rf
 from rigidfleet.assessment.alignment import align
 from rigidfleet.cli.app import main
-from rigidfleet.foreign.curves import Trajectories
+from rigidfleet.errors import TrajectoryError
+from rigidfleet.foreign.curves import LoggedStates, Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.math.smoothing import (
     PositionNoise,
     Positions,
     knots_over,
     noise_of,
     smooth,
-    spline_states,
+    spline,
 )
+from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.as_logged import Doubts, judge_log
 
 SIGMA, RATE, END = 0.003, 100.0, 12.0
@@ -119,10 +123,26 @@ def test_intervals_of_positions_hold(kind: str, count: int) -> None:
         curve = noisy(kind, random).curves[0]
         log = Positions(curve.time, curve.at(curve.time)[:, :3], np.ones(len(curve.time)))
         likely = smooth(log, PositionNoise(SIGMA, tau), knots_over(log.time, 0.0, 0.025))
-        ways = spline_states(likely.knots, likely.draw(40, random), t, 1)[0]
+        ways = spline(likely.knots, likely.draw(40, random)).at(t)
         drawn = np.std(ways, axis=2)
         held.append(np.abs(likely.way.at(t) - places(t)[:, 0]) < 1.96 * drawn)
     assert np.mean(held) > 0.9
+
+
+def test_a_gap_is_in_doubt() -> None:
+    """Without samples for 2 s about the least separation, its interval is wide, and holds."""
+    random, held, wide = np.random.default_rng(16), [], []
+    for _ in range(4):
+        log = noisy("white", random)
+        for kept in (slice(None), np.abs(log.curves[0].time - 6.0) > 1.0):
+            places_of = [c.at(c.time)[kept, :3] for c in log.curves]
+            some = logged([c.time[kept] for c in log.curves], places_of)
+            _, verdict = judge_log(some, None, Doubts(SIGMA, 0.0))
+            low, high = verdict.by_name["separation"].interval or (np.inf, np.inf)
+            held.append(low <= 0.4 <= high)
+            wide.append(high - low)
+    assert np.mean(held) >= 0.9
+    assert np.mean(wide[1::2]) > 5.0 * np.mean(wide[::2])
 
 
 @many
@@ -138,6 +158,38 @@ def test_a_near_limit_is_undecided(count: int) -> None:
     assert {word for gap, word in words if gap == 0.4} == {"passed"}
     assert "failed" not in {word for gap, word in words if gap == 0.39}
     assert {word for gap, word in words if gap == 0.37} == {"failed"}
+
+
+@pytest.mark.parametrize("quantity", ["separation", "speed"])
+def test_what_would_decide_decides(monkeypatch: pytest.MonkeyPatch, quantity: str) -> None:
+    """An undecided check names a noise, and a rate: logs of the same flight with them are decided."""
+    fine = np.linspace(0.0, END, 20_001)
+    fastest = np.linalg.norm(np.gradient(places(fine), fine, axis=0), axis=2).max()
+    limits = {"separation": 0.1, "limits": {"speed": fastest + 0.01}}
+    if quantity == "separation":
+        limits = {"separation": 0.3985}
+
+    def check(sigma: float, rate: float, seed: int) -> Any:
+        monkeypatch.setattr("test_doubt.SIGMA", sigma)
+        monkeypatch.setattr("test_doubt.RATE", rate)
+        log = noisy("white", np.random.default_rng(seed))
+        return judge_log(log, None, Doubts(sigma, 0.0), **limits)[1].by_name[quantity]
+
+    first = check(0.003, 100.0, 1)
+    assert first.undecided
+    words = re.search(r"noise of (\S+) mm would decide it, .* white, (\d+) times", first.message)
+    assert words is not None
+    for sigma, rate in ((float(words[1]) / 1e3, 100.0), (0.003, 100.0 * int(words[2]))):
+        assert [check(sigma, rate, seed).passed for seed in (1, 2)] == [True, True]
+
+
+def test_one_vehicle_has_no_separation() -> None:
+    """A separation that is asked of one vehicle alone cannot be judged, with noise as without."""
+    log = noisy("white", np.random.default_rng(1))
+    alone = log._replace(names=log.names[:1], curves=log.curves[:1])
+    _, verdict = judge_log(alone, None, Doubts(SIGMA, 0.0), separation=0.3)
+    assert "there is one vehicle alone" in verdict.by_name["separation"].message
+    assert verdict.word == "failed"
 
 
 @pytest.mark.parametrize(("kind", "tau"), [("white", 0.0), ("ar 0.05", 0.05)])
@@ -211,16 +263,65 @@ def test_an_offset_of_the_clock_is_recovered(plan: rf.Result) -> None:
         assert abs(value - true) < min(least, 3.0 * error)
     assert verdict.failures  # a turned flight is judged as flown
     assert any("turned by 7.0" in note for note in verdict.notes)
+    assert any("Positions alone do not tell a clock from a lag" in note for note in verdict.notes)
 
 
 def test_hovering_tells_no_clock() -> None:
     """Where nothing moves, the offset cannot be told."""
     random, t = np.random.default_rng(9), np.arange(0.0, 20.0, 0.05)
-    still = lambda _i, t: (np.ones((len(t), 3)), np.zeros((len(t), 3)))  # noqa: E731
+    still = Piecewise(np.array([0.0, 20.0]), np.ones((1, 3, 1)))
     logs = [(t, 1.0 + 1e-4 * random.standard_normal((len(t), 3)))]
-    found = align(logs, still, (0.0, 20.0), "recorded").to_dict()
+    found = align(logs, [still], "recorded").to_dict()
     assert found["offset_s"] is None
     assert found["turn_deg"] is None
+    x = np.ones((len(t), 1, 3))
+    log = logged([t], [x[:, 0] + 1e-3 * random.standard_normal((len(t), 3))])
+    _, verdict = judge_log(log, rf.trajectories(t, x), Doubts(1e-3, 0.0))
+    assert any("the clock cannot be told, as the plan hardly moves" in x for x in verdict.notes)
+    with pytest.raises(TrajectoryError, match="the clock cannot be told: the plan hardly moves"):
+        judge_log(log, rf.trajectories(t, x), Doubts(1e-3, 0.0, "offset"))
+
+
+def test_a_set_up_is_recovered(plan: rf.Result) -> None:
+    """A scale of 1.02 and a shift are estimated within their errors, judged as flown and told as the cause."""
+    shift = np.array([0.3, -0.2, 0.1])
+    log = flown(plan, np.random.default_rng(13), shift=shift)
+    log = logged([c.time for c in log.curves], [1.02 * c.at(c.time)[:, :3] for c in log.curves])
+    _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0))
+    facts = verdict.doubt["alignment"] if verdict.doubt else {}
+    pairs = zip([facts["scale"], *facts["shift_m"]], [1.02, *(1.02 * shift)], strict=True)
+    for (value, error), true in pairs:
+        assert abs(value - true) < min(0.01, 3.0 * error)
+    assert facts["rms_explained_m"] < 0.1 < facts["rms_as_logged_m"]
+    (note,) = (note for note in verdict.notes if "scaled by 1.02" in note)
+    assert "shifted by (0.306, -0.204, 0.1" in note
+    assert "judged as flown" in note
+
+
+def test_a_log_says_its_own_noise() -> None:
+    """Noise of each sample by the log's own estimator counts: intervals hold, and are wider where it says more."""
+    random, held = np.random.default_rng(14), []
+    t = np.arange(0.0, END, 1.0 / RATE)
+    size = np.where(t < 6.0, SIGMA, 4.0 * SIGMA)[:, None]
+    for _ in range(4):
+        x = places(t) + size[:, None] * random.standard_normal((len(t), 2, 3))
+        log = logged([t, t], [*x.swapaxes(0, 1)])
+        own = LoggedStates(None, np.broadcast_to(size, (len(t), 3)), np.zeros(0, dtype=np.int64))
+        log = log._replace(measured=(own, own))
+        plan = rf.trajectories(t, places(t), cubic=True)
+        result, verdict = judge_log(log, plan, Doubts("log"))
+        assert verdict.doubt is not None
+        assert verdict.doubt["noise_m"] == pytest.approx(SIGMA)
+        bands = result.statistics["bands"]
+        early = np.array(bands["time"]) < 5.5
+        wide = np.array(bands["place"]).mean(axis=1)
+        assert wide[~early][5:].mean() > 2.0 * wide[early].mean()
+        off = np.linalg.norm(result.position - places(result.time), axis=2)
+        rows = np.searchsorted(result.time, np.array(bands["time"]) - 1e-9)
+        held.append(off[rows] <= np.array(bands["place"]))
+    assert np.mean(held) > 0.9
+    with pytest.raises(TrajectoryError, match=r"does not say its noise\. State it: --noise"):
+        judge_log(noisy("white", random), None, Doubts("log"))
 
 
 def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
@@ -234,8 +335,22 @@ def test_a_late_vehicle_is_not_aligned_away(plan: rf.Result) -> None:
     assert verdict.by_name["separation"].worst == pytest.approx(apart.min(), abs=0.01)
     assert verdict.word == "failed"
     _, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0, "own"))
-    assert "separation is not judged" in verdict.summary
+    assert "separation is not judged: vehicles have no common clock" in verdict.summary
     assert verdict.word == "undecided"
+    _, same = judge_log(log._replace(own_clocks=True), plan, Doubts(SIGMA, 0.0))  # as files say
+    assert same.summary == verdict.summary
+
+
+def test_what_a_simulator_knows_is_not_said_of_a_log() -> None:
+    """Messages, rotors and attitudes of the simulated plan are not those of the flight that a log is of."""
+    plan = rf.simulate("lossy-passage")
+    assert plan.messages is not None
+    log = flown(plan, np.random.default_rng(15))
+    result, verdict = judge_log(log, plan, Doubts(SIGMA, 0.0))
+    assert any("messages were sent" in note for note in rf.assess(plan).notes)
+    assert not any("messages were sent" in note for note in verdict.notes)
+    assert result.messages is result.rotor_force is result.vehicle_attitude is None
+    assert np.isnan(result.thrust).all()
 
 
 def test_a_vehicle_off_its_slot_is_named(plan: rf.Result) -> None:
@@ -292,13 +407,56 @@ def test_without_doubt_nothing_changes(capsys: pytest.CaptureFixture[str]) -> No
     assert not any({"interval", "undecided"} & set(check) for check in data["checks"])
 
 
+def guarded(evening: Any, seed: int | None) -> rf.Mission:
+    """A flight of `make evening` among fences, people, a ball and the ground."""
+    data = evening.mission(seed).to_dict()
+    square = lambda a, b: [[a, a], [b, a], [b, b], [a, b]]  # noqa: E731
+    data["limits"] |= {"speed": 3.0, "geofence": {"min": [-5, -5, 1], "max": [12, 12, 12]}}
+    data["fences"] = [
+        {"name": "hard", "kind": "inclusion", "polygon": square(-3, 9)},
+        {"name": "soft", "kind": "exclusion", "polygon": square(6, 8), "soft": True},
+    ]
+    data["people"] = [{"name": "crowd", "polygon": square(20, 30)}]
+    ball = {"kind": "sphere", "centre": [2.5, 3.0, 5.0], "radius": 0.5}
+    data["obstacles"] = [{"kind": "ground", "height": 0.0}, ball]
+    return rf.Mission.from_dict(data)
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(20, marks=pytest.mark.long)])
+def test_all_that_is_judged_has_an_interval(benchmark_named: Any, count: int) -> None:
+    """What our own monitor sees of a flight lies in the intervals of its log: shapes, waypoints, fences, obstacles."""
+    evening, held = benchmark_named("evening"), []
+    plan, names = rf.simulate(guarded(evening, None)), set()
+    for seed in range(count):
+        true = rf.simulate(guarded(evening, seed))
+        t = np.arange(0.0, float(true.time[-1]) + 1e-9, 0.02)
+        x = ways_of(true.motion(flown=True), slice(None)).at(t)[:, :, :3]
+        x = x + evening.noise(np.random.default_rng(seed), x.shape, "white")
+        _, verdict = judge_log(logged([t] * 3, [*x.swapaxes(0, 1)]), plan, Doubts(SIGMA))
+        own = {(check.check, check.phase): check for check in verdict.checks}
+        for check in rf.assess(true).checks:
+            judged = own.get((check.check, check.phase))
+            if judged is not None and judged.interval and check.worst is not None:
+                names.add(check.check)
+                low, high = judged.interval
+                held.append(low - 1e-9 <= check.worst <= high + 1e-9)
+                assert judged.passed or judged.undecided or not check.passed
+    assert np.mean(held) >= 0.9
+    assert names >= {"separation", "clearance", "fence", "soft_fence", "people", "geofence", "speed", "shape",
+                     "distances", "waypoint_position"}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["white", "white, from data", "of an estimator, from data"])
 @pytest.mark.parametrize("count", [3, pytest.param(20, marks=pytest.mark.long)])
-def test_the_flights_of_the_page_are_judged(benchmark_named: Any, count: int) -> None:
+def test_the_flights_of_the_page_are_judged(benchmark_named: Any, kind: str, count: int) -> None:
     """Of flights of `make evening`, intervals hold in nine of ten; no clean one fails, none that collides passes."""
     evening = benchmark_named("evening")
-    rows = [evening.judge("white", seed) for seed in range(1, 1 + count)]
-    shares = {key: np.mean([row[key] for row in rows]) for key in evening.HELD}
-    assert min(shares.values()) >= 0.9, shares
+    rows = [evening.judge(kind, seed) for seed in range(1, 1 + count)]
+    told = [row for row in rows if row["noise told"]]
+    assert len(told) == (0 if "estimator" in kind else count)  # its noise looks like motion
+    shares = {key: np.mean([row[key] for row in told]) for key in evening.HELD if told}
+    assert min(shares.values(), default=1.0) >= 0.9, shares
+    assert bool(told) or not any(row["decided"] for row in rows)
     assert {row["clean flights failed"] for row in rows if row["clean flights failed"] >= 0} == {0}
     assert {row["collisions passed"] for row in rows if row["collisions passed"] >= 0} == {0}
-    assert evening.rows_of("white", rows).endswith("| 0 | 0 | yes |")
+    assert evening.rows_of(kind, rows).endswith("| 0 | 0 | yes |")

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,9 +15,9 @@ import rigidfleet as rf
 from rigidfleet._common.facts import FactTable
 from rigidfleet.cli.app import main
 from rigidfleet.sweep import Sweep, faults, figures, fly, load
-from rigidfleet.sweep.faults import Drill, Show
+from rigidfleet.sweep.faults import Drill, GeometricFault, Show
 from rigidfleet.sweep.run import fly_runs
-from rigidfleet.sweep.summary import summarise
+from rigidfleet.sweep.summary import borne, summarise
 
 log = log_file  # the fixture
 #: Least distance of the shows here, and radius of their vehicles [m].
@@ -183,7 +184,9 @@ def compare(folder, seeds, count):
         drilled, rng = Show(show.mission, Drill(files=(show.file,))), np.random.default_rng(seed)
         for fault, size, who, angles, sign in some_faults(show, rng, count):
             truth = brute_force(show, fault, size, who, angles, sign)
-            _, reason, words = drilled.outcome(fault, size, who, Known(angles, sign))
+            _, reason, words = drilled.outcome(
+                GeometricFault(fault, size, who, Known(angles, sign))
+            )
             assert set(filter(None, reason.split(", "))) == truth, (seed, fault, size, who, words)
             broken += bool(truth)
             if fault in ("rotated", "shifted", "mirrored") and len(who) == show.n:
@@ -209,15 +212,15 @@ def test_a_show_that_is_turned_as_a_whole_is_judged_by_its_fence_alone(tmp_path)
     show, every = day(tmp_path, 3), np.arange(16)
     drilled = Show(show.mission, Drill(files=(show.file,)))
     stream = Known(np.zeros(16), 1.0)
-    before = drilled.outcome("rotated", 1e-9, every, stream)[0]["separation"]
-    worst, reason, words = drilled.outcome("rotated", 90.0, every, stream)
+    before = drilled.outcome(GeometricFault("rotated", 1e-9, every, stream))[0]["separation"]
+    worst, reason, words = drilled.outcome(GeometricFault("rotated", 90.0, every, stream))
     assert reason == "geofence"
     assert "leaves the geofence" in words
     assert worst["separation"] == pytest.approx(before, abs=1e-9)
     data = show.mission.to_dict()
     del data["limits"]["geofence"]
     free = Show(rf.Mission.from_dict(data), Drill(files=(show.file,)))
-    assert free.outcome("rotated", 90.0, every, stream) == ({}, "", "")
+    assert free.outcome(GeometricFault("rotated", 90.0, every, stream)) == ({}, "", "")
 
 
 def test_in_turn_every_vehicle_has_a_fault():
@@ -276,6 +279,29 @@ def test_a_drill_is_a_sweep_over_its_faults(drilled):
         fly(sweep, folder / "out", workers=1).wall.tolist() == table.wall.tolist()
     )  # none flown again
     assert float(load(folder / "out")["drill.magnitude"][17]) == 60.0
+
+
+def test_the_worst_run_of_each_fault_is_drawn(drilled):
+    """Dots are where two vehicles come as near as the words of the run say, or one crosses a fence, at that time."""
+    _, _, table = drilled
+    figure = figures.worst_runs(table)
+    assert figure is not None
+    worst = {}
+    for case in (case for case in borne(table) if case.worst):
+        known = worst.setdefault(case.fault, case)
+        worst[case.fault] = min(known, case, key=lambda x: x.separation or 0.0)
+    axes = [ax for ax in figure.axes if ax.lines]
+    assert [ax.get_title(loc="left").split()[0] for ax in axes] == list(worst)
+    for ax, case in zip(axes, worst.values(), strict=True):
+        detail = case.worst.detail
+        names, _, when = ax.get_xlabel().rpartition(", ")
+        assert names in detail
+        times = [float(x) for x in re.findall(r"at ([\d.]+) s", detail)]
+        assert float(when[:-2]) == pytest.approx(times[-1], abs=0.05 + 1e-9)
+        ends = [np.column_stack(x.get_data())[-1] for x in ax.lines if x.get_marker() == "o"]
+        assert len(ends) == len(re.findall(r"\d+", names))
+        if len(ends) == 2:  # as seen from above, no farther apart than in space
+            assert np.linalg.norm(ends[0] - ends[1]) <= case.separation + 2 * RADIUS + 1e-6
 
 
 def test_the_summary_has_the_share_of_each_fault(drilled):
@@ -366,7 +392,9 @@ def test_a_late_light_is_caught_as_it_is_flown():
     """A light of the shipped change of picture that is late by 2 s comes as near as samples of the file show."""
     result = rf.simulate("change-of-picture")
     show = faults.show_of(rf.load_mission("change-of-picture").text, Drill(late=(2.0,)))
-    worst, reason, words = show.outcome("late", 2.0, np.array([4]), np.random.default_rng(0))
+    worst, reason, words = show.outcome(
+        GeometricFault("late", 2.0, np.array([4]), np.random.default_rng(0))
+    )
     t = np.arange(0.0, 33.0, 0.001)
     x = result.time
     places = [CubicSpline(*samples(x, result.slot_position[:, i])) for i in range(12)]
@@ -403,9 +431,9 @@ def test_stale_files_are_flown(tmp_path):
     stale.write_text("\n".join([text[0], *(",".join(f) for f in moved)]) + "\n")
     drilled = Show(show.mission, Drill(files=(show.file,), stale=(show.file, str(stale))))
     stream, first = np.random.default_rng(0), np.array([0])
-    assert drilled.outcome("stale", 1.0, first, stream)[1] == ""
-    assert "separation" in drilled.outcome("stale", 2.0, first, stream)[1]
-    assert drilled.outcome("stale", 2.0, np.array([5]), stream)[1] == ""
+    assert drilled.outcome(GeometricFault("stale", 1.0, first, stream))[1] == ""
+    assert "separation" in drilled.outcome(GeometricFault("stale", 2.0, first, stream))[1]
+    assert drilled.outcome(GeometricFault("stale", 2.0, np.array([5]), stream))[1] == ""
 
 
 @pytest.mark.parametrize("kind", ["folder", "skyc"])

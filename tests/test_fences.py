@@ -466,3 +466,18 @@ def test_a_fence_of_a_file_is_that_of_its_metres(tmp_path):
     assert again.fences == mission.fences
     with pytest.raises(MissionError, match="is read only with a mission file"):
         rf.Mission.from_dict(data)
+
+
+def test_a_fence_on_the_way_of_those_left_is_told_before_the_flight() -> None:
+    """Lights above a closed area stay out of it; those that land after a loss do not, as check and flight say."""
+    data = rf.load_mission("market-square").to_dict()
+    corners = [[-9.0, 6.0], [9.0, 6.0], [9.0, 14.0], [-9.0, 14.0]]
+    closed = {"name": "stage", "kind": "exclusion", "polygon": corners, "ceiling": 6.0}
+    data["fences"] = [*data["fences"], closed]
+    assert rf.check(rf.Mission.from_dict(data)).passed
+    lost = {"lost": [{"agent": 3, "time": 13.5}], "on_loss": "land"}
+    mission = rf.Mission.from_dict(data | {"disturbances": data["disturbances"] | lost})
+    broken = [x for x in rf.check(mission).remarks if x.topic == "fence" and x.level == "fails"]
+    assert "'stage'" in broken[0].text
+    assert "land (loss)" in broken[0].text
+    assert not rf.assess(rf.simulate(mission)).by_name["fence"].passed

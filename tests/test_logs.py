@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.errors import ResultError, TrajectoryError
 from rigidfleet.foreign.files import read_trajectories
@@ -537,6 +538,108 @@ def test_rosbag2_is_read(log, tmp_path):
         read_trajectories(path)
 
 
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_robot_that_others_recorded(tmp_path, storage):
+    """Odometry of a TurtleBot3, recorded by others in ROS 1 and moved to rosbag2, is what rosbags reads in ROS 1."""
+    converter = pytest.importorskip("rosbags.convert.converter")
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    path, folder = tmp_path / "waffle.bag", tmp_path / "bag"
+    path.write_bytes(lzma.decompress((LOGS / "waffle.bag.xz").read_bytes()))
+    old, new = (get_typestore(x) for x in (Stores.ROS1_NOETIC, Stores.ROS2_HUMBLE))
+    converter.convert([path], folder, storage, 9, None, "file", old, new, [], [], [], [])
+    with AnyReader([path], default_typestore=old) as reader:
+        to = [c for c in reader.connections if c.topic == "/odom"]
+        own = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(to)]
+    read = read_trajectories(folder)
+    time, place = at_samples(read)
+    point, q = [m.pose.pose.position for m in own], [m.pose.pose.orientation for m in own]
+    assert len(time) == 137
+    np.testing.assert_array_equal(place, [[p.x, p.y, p.z] for p in point])
+    np.testing.assert_allclose(time + read.since, [seconds(m) for m in own], atol=1e-6)
+    turn = Rotation.from_quat([[x.x, x.y, x.z, x.w] for x in q])
+    np.testing.assert_allclose(read.curves[0].at(time)[:, 3], turn.as_euler("xyz")[:, 2])
+    v = [m.twist.twist.linear for m in own]
+    np.testing.assert_allclose(
+        measured(read).velocity, turn.apply([[x.x, x.y, x.z] for x in v]), atol=1e-15
+    )
+
+
+def poses_bag(folder: Path, rows: list[tuple[str, int, int, list[float]]]) -> Path:
+    """A recording that `rosbags` writes, of poses: topic, when it was recorded and stamped [ns], place [m]."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    pytest.importorskip("mcap")
+    from rosbags.rosbag2.enums import StoragePlugin
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    of = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    kind, to = of["PoseStamped"].__msgtype__, {}
+    with rosbag2.Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, received, stamp, place in rows:
+            if topic not in to:
+                to[topic] = writer.add_connection(topic, kind, typestore=store)
+            header = of["Header"](of["Time"](stamp // 10**9, stamp % 10**9), "map")
+            pose = of["Pose"](of["Point"](*place), of["Quaternion"](0.0, 0.0, 0.0, 1.0))
+            data = store.serialize_cdr(of["PoseStamped"](header, pose), kind)
+            writer.write(to[topic], received, data)
+    (path,) = folder.glob("*.mcap")
+    return path
+
+
+def test_messages_without_a_stamp_are_no_places(tmp_path):
+    """Before its first place a node may send empty messages; a topic without stamps has another clock than others."""
+    begin, now = 1_500_000_000 * 10**9, 1_700_000_000 * 10**9
+    at = [20_000_000 * k for k in range(50)]
+    place = [[0.01 * k, 0.0, 1.0] for k in range(50)]
+    late = [("/a", now + t, begin + t if k >= 5 else 0, place[k]) for k, t in enumerate(at)]
+    none = [("/b", now + t, 0, [9.0, 0.0, 1.0]) for t in at]
+    read = read_trajectories(poses_bag(tmp_path / "both", late + none))
+    assert read.names == ("/a",)
+    np.testing.assert_allclose(at_samples(read)[1], place[5:], atol=1e-12)
+    assert read.since == begin / 1e9 + 0.1
+    assert said(read, "5 samples without a valid position are left out")
+    assert said(read, "/b is not read: it has no stamps, as others have")
+    read = read_trajectories(poses_bag(tmp_path / "alone", none))  # when it was recorded counts
+    assert read.since == now / 1e9
+
+
+def test_one_vehicle_is_not_two(tmp_path):
+    """An estimate and the truth of one vehicle are no two that collide: topics at one place are to be named."""
+    at = [(1_700_000_000 * 10**9 + 20_000_000 * k, 0.01 * k) for k in range(50)]
+    rows = [
+        (topic, t, t, [x + by, 0.0, 1.0])
+        for t, x in at
+        for topic, by in (("/a", 0.0), ("/b", 0.01))
+    ]
+    path = poses_bag(tmp_path / "bag", rows)
+    with pytest.raises(TrajectoryError, match=r"/a and /b are 0.01 m apart most .* --topic"):
+        read_trajectories(path)
+    assert read_trajectories(path, topic="/b").names == ("/b",)
+    assert read_trajectories(path, topic="/?").names == ("/a", "/b")
+    pad = [
+        (topic, t + by, t + by, [1.0, 0.0, 0.0])
+        for t, _ in at
+        for topic, by in (("/a", 0), ("/b", 10**10))
+    ]
+    read = read_trajectories(poses_bag(tmp_path / "pad", pad), spans="away")
+    assert read.names == ("/a", "/b")  # one after the other
+
+
+def test_a_recording_that_ends_with_the_power(log):
+    """An MCAP without its end is read up to there, as its own library reads it, with a note."""
+    path = log("odometry.mcap")
+    whole = at_samples(read_trajectories(path))[1]
+    path.write_bytes(path.read_bytes()[:-100])
+    read = read_trajectories(path)
+    np.testing.assert_array_equal(at_samples(read)[1], whole)
+    assert said(read, "the log is damaged in part")
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(TrajectoryError, match="the recording is damaged"):
+        read_trajectories(path)
+
+
 #: How `px4_msgs` defines the first fields of two messages, and the last ones that matter here.
 PX4 = {
     "VehicleLocalPosition": """
@@ -747,6 +850,32 @@ def test_the_command_says_what_it_took(log, capsys):
     path = str(log("transforms.db3"))
     assert main(["assess", path, "--origin", "47.4", "8.5", "0"]) == 2
     assert "--origin: no file says where on the Earth it is" in capsys.readouterr().err
+
+
+def test_the_commands_of_the_page_judge_a_kept_log(log, tmp_path, capsys):
+    """The commands of docs/logs.md on PX4's log, against a plan made of what `pyulog` reads in it: nothing is off."""
+    path, plan = log("sitl.ulg"), tmp_path / "plan.nc"
+    every = pytest.importorskip("pyulog").ULog(str(path)).data_list
+    (own,) = (x.data for x in every if (x.name, x.multi_id) == ("vehicle_local_position", 0))
+    known = (own["xy_valid"] != 0) & (own["z_valid"] != 0)
+    time = own["timestamp_sample"][known].astype(float) / 1e6
+    place = np.stack([own["y"], own["x"], -own["z"]], axis=1)[known].astype(float)
+    rf.trajectories(time - time[0], place[:, None], cubic=True).save(plan)
+    page = (Path(__file__).parents[1] / "docs" / "logs.md").read_text()
+    commands = re.findall(r"(?m)^rigidfleet (assess [^#\n]+)", page)
+    assert len(commands) == 4
+    for line in commands:
+        line = line.replace("flight.ulg", str(path)).replace("LOG...", str(path))  # noqa: PLW2901
+        line = line.replace("MISSION", str(plan)).replace("flights/", f"{tmp_path}/")  # noqa: PLW2901
+        code, out = main(line.split()), " ".join(capsys.readouterr().out.split())
+        assert code == ("--separation" in line), out  # of one vehicle alone it cannot be judged
+        if str(plan) in line:
+            late = re.findall(r"the log is (\S+) \+- \S+ s (?:late|early)", out)
+            assert float(late[0]) < 0.005
+            assert "off its slot" not in out
+    assert {"trajectories.nc", "verdict.json", "report.html", "replay.html"} <= {
+        x.name for x in (tmp_path / "first").iterdir()
+    }
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 
 def agent_names(indices: Iterable[int]) -> str:
@@ -11,6 +11,12 @@ def agent_names(indices: Iterable[int]) -> str:
     if len(numbers) == 1:
         return f"agent {numbers[0]}"
     return f"agents {', '.join(numbers[:-1])} and {numbers[-1]}"
+
+
+def first_few(things: Sequence[object], most: int = 5) -> str:
+    """The first of some things, and how many more there are: "a, b and 1,000 more"."""
+    more = f" and {len(things) - most:,} more" if len(things) > most else ""
+    return ", ".join(map(str, things[:most])) + more
 
 
 def all_hold(count: int) -> str:

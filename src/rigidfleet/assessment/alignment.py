@@ -7,15 +7,16 @@ Ann. Statist. 17, 1989), as what a controller leaves is not independent from sam
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Bools, Floats
 
-#: Positions and velocities (K, 3) of vehicle i at times (K,) of the plan.
-PlanStates = Callable[[int, Floats], tuple[Floats, Floats]]
+#: Planned ways of vehicles, of x, y, z [m].
+Plan = Sequence[Piecewise]
 #: Times (K,) [s] and smoothed positions (K, 3) [m] of each vehicle.
 Logs = Sequence[tuple[Floats, Floats]]
 #: Parts of a flight that count as independent, and by how much Student's distribution of so few is wider (97.5 %).
@@ -65,44 +66,40 @@ class Alignment(NamedTuple):
         }  # fmt: skip
 
 
-def align(logs: Logs, plan: PlanStates, span: tuple[float, float], clock: str) -> Alignment:
-    """The clock and the set-up of logs against a plan from when to when [s].
+def align(logs: Logs, plan: Plan, clock: str) -> Alignment:
+    """The clock and the set-up of logs against a plan.
 
     ``clock``: "recorded", near that of the plan; "offset", anywhere; or "own", each log anywhere for itself
     """
     logs = [(t[:: -(-len(t) // _MANY)], x[:: -(-len(t) // _MANY)]) for t, x in logs]
-    start = np.zeros(6)
-    apart = np.zeros(len(logs))
+    start, apart = np.zeros(6), np.zeros(len(logs))
     if clock == "own":
-        for i, log in enumerate(logs):
-            apart[i] = _nearest_offset([log], lambda _, t, i=i: plan(i, t), span)
+        apart[:] = [_nearest_offset([log], [way]) for log, way in zip(logs, plan, strict=True)]
         logs = [(t - by, x) for (t, x), by in zip(logs, apart, strict=True)]
-    start[0] = _nearest_offset(logs, plan, span) if clock == "offset" else 0.0
+    start[0] = _nearest_offset(logs, plan) if clock == "offset" else 0.0
     every = np.ones(6, dtype=np.bool_)
-    whole, errors, left = _fit(logs, plan, span, start, every)
+    whole, errors, left = _fit(logs, plan, start, every)
     own = np.empty((2, len(logs)))
-    for i, log in enumerate(logs):
-        alone, error, _ = _fit([log], lambda _, t, i=i: plan(i, t), span, whole, every)
+    for i, (log, way) in enumerate(zip(logs, plan, strict=True)):
+        alone, error, _ = _fit([log], [way], whole, every)
         own[:, i] = np.where(np.isfinite(error[0]), [alone[0], error[0]], np.nan)
     own[0] += apart
     errors[0] = errors[0] if np.ptp(apart) == 0.0 else np.nan  # all have none in common
     whole[0] += apart[0]
     fit = np.where(np.isfinite(errors), [whole, errors], np.nan)
-    return Alignment(fit, own, _fit(logs, plan, span, start, ~every)[2], left)
+    return Alignment(fit, own, _fit(logs, plan, start, ~every)[2], left)
 
 
-def _residuals(
-    logs: Logs, plan: PlanStates, span: tuple[float, float], q: Floats
-) -> tuple[Floats, Floats, Floats]:
+def _residuals(logs: Logs, plan: Plan, q: Floats) -> tuple[Floats, Floats, Floats]:
     """Off (M, 3), its derivatives (M, 3, 6) by the parameters q, and times (M,) of the plan."""
     rows = []
     c, s = np.cos(q[1]), np.sin(q[1])
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) * np.exp(q[2])
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    for i, (t, x) in enumerate(logs):
-        inside = (t - q[0] >= span[0]) & (t - q[0] <= span[1])
+    for (t, x), way in zip(logs, plan, strict=True):
+        inside = (t - q[0] >= way.time[0]) & (t - q[0] <= way.time[-1])
         time = t[inside] - q[0]
-        p, v = (y @ turn.T for y in plan(i, time))
+        p, v = way.states(time, 2) @ turn.T
         shifts = np.broadcast_to(np.eye(3), (len(p), 3, 3))
         slope = np.concatenate([np.stack([-v, p @ quarter.T, p], axis=2), shifts], axis=2)
         rows.append((x[inside] - p - q[3:], slope, time))
@@ -110,13 +107,11 @@ def _residuals(
     return np.concatenate(off), np.concatenate(slopes), np.concatenate(times)
 
 
-def _fit(
-    logs: Logs, plan: PlanStates, span: tuple[float, float], start: Floats, free: Bools
-) -> tuple[Floats, Floats, float]:
+def _fit(logs: Logs, plan: Plan, start: Floats, free: Bools) -> tuple[Floats, Floats, float]:
     """The ``free`` parameters (6,) that a flight tells, from a start; their errors; the distance that is left."""
     q, free, errors = start.copy(), free.copy(), np.full(6, np.nan)
     for _ in range(_TURNS):
-        off, slope, time = _residuals(logs, plan, span, q)
+        off, slope, time = _residuals(logs, plan, q)
         if not (len(off) and free.any()):
             break
         for j in np.flatnonzero(free[:3]):  # what the others do not explain of it
@@ -156,14 +151,15 @@ def _errors(A: Floats, left: Floats, time: Floats) -> Floats:
     return _WIDER * np.sqrt(spread * (_PARTS - 1) / _PARTS)
 
 
-def _nearest_offset(logs: Logs, plan: PlanStates, span: tuple[float, float]) -> float:
+def _nearest_offset(logs: Logs, plan: Plan) -> float:
     """The offset on a grid at which shapes of ways agree best, whatever the set-up."""
     few = [(t[:: -(-len(t) // _FEW)], x[:: -(-len(t) // _FEW)]) for t, x in logs]
     begin, end = min(t[0] for t, _ in few), max(t[-1] for t, _ in few)
+    span = plan[0].time[[0, -1]]
     least = 0.5 * min(end - begin, span[1] - span[0])
     best = np.inf, 0.0
     for offset in np.arange(begin - span[1] + least, end - span[0] - least + _STEP, _STEP).tolist():
-        off, slope, _ = _residuals(few, plan, span, np.array([offset, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        off, slope, _ = _residuals(few, plan, np.array([offset, *np.zeros(5)]))
         A, b = slope[..., 1:].reshape(-1, 5), off.ravel()
         if len(off) > 5:
             left = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]

@@ -53,6 +53,7 @@ def all_checks(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[C
     for q in QUANTITIES.values():
         yield from _CHECKS.get(q.name, _quantity_check)(measured, q)
     yield from _corner_check(measured)
+    yield from _way_home_check(measured)
 
 
 def _failures_or_nearest(candidates: Iterable[CheckResult]) -> Iterator[CheckResult]:
@@ -324,6 +325,17 @@ def _planned_separation_check(measured: Measurements, q: Quantity) -> Iterator[C
             )
             checks.append(limit_check(q, replace(e, value=planned - e.value), allowed, words))
     yield from _failures_or_nearest(checks)
+
+
+def _way_home_check(measured: Measurements) -> Iterator[CheckResult]:
+    """Compare the separation on the way home, after an abort, with the one that was proved before the flight."""
+    since, promised = measured.result.statistics.get("promised", (math.inf, 0.0))
+    pairs = zip(measured.result.phases, measured.worst_by_phase, strict=True)
+    every = [x["separation"] for p, x in pairs if p.t_start >= since and "separation" in x]
+    if every:
+        e = min(every, key=lambda x: x.value)
+        words = f"on the way home {_nearness_in_words(e)} (promised {value(promised, 'm')})"
+        yield limit_check(replace(QUANTITIES["separation"], name="way_home"), e, promised, words)
 
 
 def _nearness_in_words(e: Extreme) -> str:

@@ -40,8 +40,10 @@ _AT_END = (*_SHAPES, "waypoint_position", "waypoint_velocity", "touch_down", "co
 _CERTAIN = ("complete", "samples", "abandoned")
 #: Derivative of the position that a check is of, where no quantity says it.
 _ORDERS = {"waypoint_velocity": 1, "touch_down": 1, "corner": 1}
-#: Share of an interval within which a value is at its limit: no rate would decide it.
-_TOO_NEAR = 0.1
+#: Half of the power of noise by which an interval of a derivative shrinks (of positions 5/6, speeds 1/2, accelerations
+#: 1/6: splines of a third derivative that wanders), and of white noise's rate; the greatest rate that is named; a share
+#: to be safe.
+_POWERS, _TIMES, _SHORTER = (5 / 12, 3 / 12, 1 / 12), 250.0, 0.9
 #: What a vehicle is off its slot on average, at least, to be named [m]; errors from which on something is sure.
 _OFF, _SURE = 0.01, 4.0
 #: What a choice of clocks does, in words.
@@ -74,8 +76,10 @@ class DrawnWays:
 
     def of_check(self, check: CheckResult) -> float:
         """By how much what is judged may differ from what is true, in the unit of the check."""
-        name = re.sub("_(flight|start|end)$", "", check.check)
-        q, order, shifts = quantity(name), _ORDERS.get(name, quantity(name).order), self.states
+        name, order, shifts = _name_of(check), _order_of(check), self.states
+        q = quantity(name)
+        if check.worst is None and name not in _SHAPES:  # it cannot be judged, whatever the noise
+            return 0.0
         if name in _AT_END:
             k = int(np.abs(self.result.time - (check.when or 0.0)).argmin())
             if name not in _SHAPES:
@@ -125,6 +129,16 @@ def _lengths(x: Floats) -> Floats:
 
 def _greatest_length(x: Floats) -> float:
     return float(_lengths(x).max(initial=0.0))
+
+
+def _name_of(check: CheckResult) -> str:
+    return re.sub("_(flight|start|end)$", "", check.check)
+
+
+def _order_of(check: CheckResult) -> int:
+    """Which derivative of positions a check is of."""
+    name = _name_of(check)
+    return _ORDERS.get(name, quantity(name).order)
 
 
 def _is_of_pairs(name: str) -> bool:
@@ -184,10 +198,11 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
         return replace(check, passed=True)
     if not keeps_limit(sense, better, limit):
         return replace(check, passed=False)
-    share = abs(worst - limit) / by
-    times = math.ceil(share**-2.4) if share > _TOO_NEAR else 0
-    rate = f", or, if it is white, {times} times the rate" * (times > 0)
-    remedy = f"noise of {value(1e3 * sigma * share)} mm would decide it{rate}"
+    # The interval is then to be shorter than the way to the limit, which another log finds a little nearer.
+    less = (_SHORTER * abs(worst - limit) / by) ** (1.0 / _POWERS[_order_of(check)])
+    remedy = f"noise of {value(1e3 * sigma * math.sqrt(less))} mm would decide it"
+    if less * _TIMES > 1.0:
+        remedy += f", or, if it is white, {math.ceil(1.0 / less)} times the rate"
     words = re.sub(" is (missed|met),", " may be missed,", words)
     words = words.replace(" is not reached", " may not be reached")
     return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")

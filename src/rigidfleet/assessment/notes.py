@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.assessment.avoidance import avoidance_notes, clock_notes
 from rigidfleet.assessment.checks import abandonment_check
 from rigidfleet.assessment.fits import angle_between
@@ -63,9 +63,9 @@ def _network_notes(measured: Measurements) -> Iterator[str]:
     age = result.message_age
     silent = np.zeros((1, len(result.edges))) if age is None else (age > net.silence).any(axis=2)
     if silent.any():
-        names = _first_few([result.edge_labels[k] for k in np.flatnonzero(silent.any(axis=0))])
+        edges = [result.edge_labels[k] for k in np.flatnonzero(silent.any(axis=0))]
         since = measured.first_time(silent.max(axis=1))
-        yield f"edges that let go for want of messages, first at {since:.2f} s: {names}"
+        yield f"edges that let go for want of messages, first at {since:.2f} s: {first_few(edges, _NAMED)}"
 
 
 def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
@@ -95,12 +95,7 @@ def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
     yield from result.statistics.get("notes", [])
     names = result.statistics.get("names", [])
     if [name.removeprefix("agent ") for name in names] != [f"{k + 1}" for k in range(len(names))]:
-        yield f"agents from 1 on are {_first_few(names)}"
-
-
-def _first_few(names: list[str]) -> str:
-    more = f" and {len(names) - _NAMED:,} more" if len(names) > _NAMED else ""
-    return ", ".join(names[:_NAMED]) + more
+        yield f"agents from 1 on are {first_few(names, _NAMED)}"
 
 
 def _abandonment_notes(measured: Measurements) -> Iterator[str]:

@@ -42,6 +42,7 @@ _PRAISE = {
     "clearance_end": "agents land {worst} above an obstacle",
     "lost": "lost vehicles stay {worst} away from the others",
     "abandoned": "phases abandoned after {who}: {worst}",
+    "way_home": "{worst} apart on the way home, of {limit} promised",
     "thrust_peak": "thrust peaks at {worst} ({who})",
     "thrust": "thrust peaks at {worst}",
     "rotor_force": "rotors peak at {worst} of {limit}",

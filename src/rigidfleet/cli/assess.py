@@ -118,15 +118,13 @@ def assess(
     options: dict[str, Any] = {
         "mission": mission, "separation": separation, "separation_altitude": separation_altitude, "limits": limits,
         "radius": radius, "ground": ground, "interpolation": interpolation, "spans": spans, "gaps": gaps,
-        "units": units, "axes": axes, "topic": topic, "origin": origin,
+        "units": units, "axes": axes, "topic": topic, "origin": origin, "noise": noise, "clock": clock,
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
     plan = len(files) > 1 and _is_plan(files[0])
     if len(files) == 1 and files[0].suffix == ".nc":
         from rigidfleet.result import Result
 
-        if noise or clock:
-            chosen += ["noise" if noise else "clock"]
         if chosen:
             words = f"--{chosen[0].replace('_', '-')}: no effect on a result, which has its own mission; remove it"
             raise RigidfleetError(words)
@@ -152,8 +150,9 @@ def assess(
         if origin is None and place is not None and Path(place).suffix != ".nc":
             place = as_mission(str(place)).geodetic_origin
             options["origin"] = place and (place.latitude_deg, place.longitude_deg, place.altitude)
-        own = {key: options[key] for key in _READ if options[key] is not None}
-        read = read_trajectories(files[plan:], **own)
+        read = read_trajectories(
+            files[plan:], **{key: x for key, x in options.items() if key in _READ and x is not None}
+        )
         if origin is not None and not any("origin" in part for part in read.read):
             raise RigidfleetError("--origin: no file says where on the Earth it is; remove it")
         judged: dict[str, Any] = {} if plan else {

@@ -17,6 +17,7 @@ import numpy as np
 
 from rigidfleet._common.files import why_not
 from rigidfleet._common.tables import ContentError, fault
+from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign import logs, poses, shows, texts
 from rigidfleet.foreign.columns import Units, units_of
@@ -35,7 +36,7 @@ Gaps = Literal["refuse", "bridge"]
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
-_ZIP, _HDF = b"PK", b"\x89HDF"
+_ZIP, _HDF, _BAG = b"PK", b"\x89HDF", b"#ROSBAG"
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
 #: in a folder. Files ``.bin`` are logs only by their content.
 _RECORDINGS, _LOGS = {".mcap", ".db3"}, {".ulg", ".tlog"}
@@ -238,7 +239,7 @@ def groups_of_files(path: Path) -> list[list[Path]]:
         whole = [[*range(first, first + len(group))] for first in (0, 1)]
         if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
             raise TrajectoryError(
-                f"{group[0].parent}: {_first_few([p.name for p in group])} are no sequence. Number the tables that a "
+                f"{group[0].parent}: {first_few([p.name for p in group])} are no sequence. Number the tables that a "
                 "vehicle flies one after the other from 0 or 1 on, and leave none out."
             )
     return groups
@@ -263,7 +264,7 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
                 f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
                 "move it out of the folder."
             )
-    names = _first_few([p.relative_to(path) for p in rest])
+    names = first_few([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
 
 
@@ -298,12 +299,6 @@ def _is_hidden(path: Path) -> bool:
     return path.name.startswith((".", "__MACOSX"))
 
 
-def _first_few(things: Sequence[object]) -> str:
-    """The first of some things, and how many more there are."""
-    more = f" and {len(things) - _LISTED:,} more" if len(things) > _LISTED else ""
-    return ", ".join(map(str, things[:_LISTED])) + more
-
-
 def _sort_key(path: Path) -> list[tuple[int, str]]:
     """Names in the order of the numbers in them: 2 before 10."""
     parts = re.split(r"(\d+)", path.name)
@@ -335,10 +330,14 @@ def _read_file(parts: list[Path], options: _Options) -> Trajectories:
         raise TrajectoryError(
             f"{path}: is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`."
         )
+    if head.startswith(_BAG):
+        raise TrajectoryError(
+            f"{path}: is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {path.name} --dst FOLDER."
+        )
     try:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
             log = poses.read_recording(parts, topics)
-            read = logs.trajectories_of(log, path.stem, interpolation, (), origin)
+            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
         elif head.startswith((logs.ULOG, logs.BIN)) or suffix in _LOGS:
             log = logs.read_log(path)
             read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
@@ -449,7 +448,7 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
     if len(holes) > _LISTED:
         notes.append(f"{len(holes) - _LISTED:,} shorter gaps between samples are bridged, too")
     if frozen:
-        words = f"positions repeat to the last digit between moves, {_first_few(frozen)}"
+        words = f"positions repeat to the last digit between moves, {first_few(frozen)}"
         notes.append(f"{words}: a hold, or a tracker that lost sight of it")
     return notes
 
@@ -466,7 +465,7 @@ def _note_on_spans(read: Trajectories) -> list[str]:
     if not part:
         return []
     if not read.away:
-        return [f"{_first_few(part)}: each stays at its first and last place outside of its time"]
+        return [f"{first_few(part)}: each stays at its first and last place outside of its time"]
     apart = len(starts) ** 2 - int(np.searchsorted(np.sort(starts), ends, side="right").sum())
     never = f"; {apart:,} pairs are never there at one time, and not judged" if apart else ""
-    return [f"vehicles are judged only where they have data: {_first_few(part)}{never}"]
+    return [f"vehicles are judged only where they have data: {first_few(part)}{never}"]

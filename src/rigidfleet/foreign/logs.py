@@ -23,15 +23,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
+from rigidfleet._common.text import first_few
 from rigidfleet.foreign.curves import LoggedStates, Trajectories
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.geodesy import Geodetic, enu_of
+from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats, Ints
 
 #: Nanoseconds since 1970 from which on a stamp is a date; by how much a stamp goes back if a clock begins anew.
 _DATES, _ANEW = 10**15, 10**9
 #: A step of a position that its velocities do not explain: the least [m], and in usual ones.
 _JUMP, _UNUSUAL = 0.1, 20.0
+#: Distance of two topics that are places of one vehicle [m], and times at which they are compared.
+_TWINS, _TIMES = 0.05, 200
 #: Bytes after the last message of a log of ArduPilot that are the rest of its pages.
 _PAGES = 528
 #: Greatest number of things that a note lists.
@@ -229,6 +233,8 @@ def trajectories_of(
         both = track.velocity, track.deviation
         each = (None if x is None else np.resize(x, size) for x in both)
         measured.append(LoggedStates(*each, track.resets))
+    if not topics and all(who == track.topic for who, track in tracks.items()):
+        _refuse_twins([*tracks], curves)
     frames = [*dict.fromkeys(track.frame for track in tracks.values())]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
@@ -250,11 +256,29 @@ def trajectories_of(
     return read._replace(measured=tuple(measured), own_clocks=not log.clock)
 
 
+def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
+    """Refuse two topics that are at one place most of the time.
+
+    Raises
+    ------
+    ContentError
+        There are such.
+    """
+    begins, ends = np.transpose([curve.time[[0, -1]] for curve in curves])
+    t = np.linspace(begins.max(), ends.min(), _TIMES)
+    place = np.stack([curve.at(t)[:, :3] for curve in curves])
+    for k in range(1, len(place)):
+        apart = np.median(np.linalg.norm(place[:k] - place[k], axis=2), axis=1)
+        i = int(apart.argmin())
+        if apart[i] < _TWINS and t[0] < t[-1]:  # one after the other may be at one place
+            words = f"{names[i]} and {names[k]} are {apart[i]:.2g} m apart most of the time"
+            raise fault(f"{words}: is that one vehicle?", "Name the topics of vehicles: --topic")
+
+
 def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
     """Notes with the names of those whom they are on, unless it is the only one ("")."""
     for note, names in notes.items():
-        more = f" and {len(names) - _LISTED:,} more" if len(names) > _LISTED else ""
-        yield f"{', '.join(names[:_LISTED])}{more}: {note}" if any(names) else note
+        yield f"{first_few(names, _LISTED)}: {note}" if any(names) else note
 
 
 class _Track(NamedTuple):

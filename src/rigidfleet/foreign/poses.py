@@ -26,7 +26,7 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import RANK, Channel, Log, channel_of_px4, choose
+from rigidfleet.foreign.logs import DAMAGED, RANK, Channel, Log, channel_of_px4, choose
 
 MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
 _BILLION = 1_000_000_000
@@ -50,12 +50,16 @@ _UNDEFINED = (
 
 
 class _Rows(NamedTuple):
-    """Kind, layout if it is PX4's, and frame of the first message of a vehicle; stamps [ns] and numbers of all."""
+    """Kind, layout if it is PX4's, and frame of the first message of a vehicle; times and numbers of all.
+
+    ``stamps`` are 0 where a message has none; ``received``: when it was recorded [ns].
+    """
 
     message: str
     layout: np.dtype[Any] | None
     frame: str
     stamps: array[int]
+    received: array[int]
     numbers: array[float]
 
 
@@ -67,10 +71,11 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     Raises
     ------
     ContentError
-        The package `mcap` is missing, the recording is damaged, or has no positions.
+        The package `mcap` is missing, or the recording has no positions.
     """
     rows: dict[str, _Rows] = {}
     unread: dict[str, str] = {}
+    notes: list[str] = []
     try:
         for topic, kind, definition, data, received in (
             each for path in paths for each in _messages(path, unread)
@@ -78,9 +83,10 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
             layout = _layout(definition, data[1:2] == b"\1") if definition else None
             try:
                 for who, frame, stamp, numbers in _decode(kind, layout, data):
-                    new = _Rows(kind, layout, frame, array("q"), array("d"))
+                    new = _Rows(kind, layout, frame, array("q"), array("q"), array("d"))
                     own = rows.setdefault(f"{topic}{who}", new)
-                    own.stamps.append(stamp or received)
+                    own.stamps.append(stamp)
+                    own.received.append(received)
                     own.numbers.extend(numbers)
             except struct.error:
                 where = f"{topic}: message {len(rows[topic].stamps) + 1 if topic in rows else 1}"
@@ -90,13 +96,19 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     except ImportError as error:
         raise fault(f"is compressed, and a package is missing ({error})") from None
     except Exception as error:  # a damaged recording leads its packages to any
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise fault(f"the recording is damaged ({reason})", "Record again") from None
+        if not rows:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise fault(f"the recording is damaged ({reason})", "Record again") from None
+        notes.append(DAMAGED)  # as one is that ended with the power
     if unread and not rows:
         topic, why = next(iter(unread.items()))
         raise fault(f"{topic}: {why}")
     channels = [_channel(topic, own) for topic, own in rows.items()]
-    chosen, notes = choose(channels, topics), []
+    chosen = choose(channels, topics)
+    undated = [c for c in chosen if not (rows[c.topic].layout or any(rows[c.topic].stamps))]
+    if len(undated) < len(chosen):  # they have another clock, or nothing was sent yet
+        unread |= {c.topic: "has no stamps, as others have" for c in undated}
+        chosen = [c for c in chosen if c not in undated]
     if not topics:
         chosen = [c for c in chosen if c.message == chosen[0].message]
         parts = {c.topic.rpartition(":")[2] for c in chosen if c.message == "TFMessage"}
@@ -152,20 +164,24 @@ def _records_of_mcap(path: Path) -> Iterator[tuple[str, str, str, str, bytes, in
     """The same, of an MCAP."""
     if find_spec("mcap") is None:
         raise fault("needs the package 'mcap'", "Run: pip install rigidfleet[logs]")
-    from mcap.reader import make_reader
-    from mcap.records import Chunk
-    from mcap.stream_reader import StreamReader
+    from mcap import records
+    from mcap.stream_reader import StreamReader, breakup_chunk
 
+    schemas, topics = {0: ("", "")}, {}
     with path.open("rb") as stream:
-        for record in StreamReader(stream, emit_chunks=True).records:
-            if isinstance(record, Chunk) and record.uncompressed_size > _CHUNK:
-                more = f"unpacks to {record.uncompressed_size >> 20} MiB"
+        for whole in StreamReader(stream, emit_chunks=True).records:
+            packed = isinstance(whole, records.Chunk)
+            if packed and whole.uncompressed_size > _CHUNK:
+                more = f"unpacks to {whole.uncompressed_size >> 20} MiB"
                 raise fault(f"a chunk of it {more}", "Record poses")
-        stream.seek(0)
-        for schema, channel, message in make_reader(stream).iter_messages():
-            name, text = ("", b"") if schema is None else (schema.name, schema.data)
-            code, definition = channel.message_encoding, text.decode(errors="replace")
-            yield channel.topic, name, code, definition, message.data, message.log_time
+            for record in breakup_chunk(whole) if packed else [whole]:
+                if isinstance(record, records.Schema):
+                    schemas[record.id] = record.name, record.data.decode(errors="replace")
+                elif isinstance(record, records.Channel):
+                    name, definition = schemas[record.schema_id]
+                    topics[record.id] = record.topic, name, record.message_encoding, definition
+                elif isinstance(record, records.Message):
+                    yield *topics[record.channel_id], record.data, record.log_time
 
 
 @lru_cache(100)
@@ -224,10 +240,16 @@ def _decode(
 
 def _channel(topic: str, rows: _Rows) -> Channel:
     """Columns as forms of messages name them; velocities are turned into the frame of positions."""
-    table, time = np.frombuffer(rows.numbers).reshape(len(rows.stamps), -1), np.asarray(rows.stamps)
+    received, time = np.asarray(rows.received), np.asarray(rows.stamps)
+    order = np.argsort(received, kind="stable")
+    received, time = received[order], time[order]
+    table = np.frombuffer(rows.numbers).reshape(len(time), -1)[order]
     if rows.layout is not None:
-        columns = {"received": time} | dict(zip(rows.layout.names or (), table.T, strict=True))
+        columns = {"received": received} | dict(zip(rows.layout.names or (), table.T, strict=True))
         return channel_of_px4(topic, rows.message, columns)
+    if not time.any():
+        time = received
+    table[time == 0] = np.nan  # what was sent before there was a time is no place
     if rows.message == "NavSatFix":
         columns = dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
         return Channel(topic, rows.message, columns, rows.frame)

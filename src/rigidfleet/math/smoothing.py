@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.typing import Floats, Ints
+from rigidfleet.typing import Floats
 
 #: Weights (5, 5) of five control points, and powers of the share of a span, of a uniform quartic B-spline.
 QUARTIC = np.array(
@@ -88,9 +88,7 @@ class Smoothed:
     @property
     def way(self) -> Piecewise:
         """The likely way: pieces (M, 3, 5)."""
-        h, spans = self.knots[1] - self.knots[0], len(self.knots) - 1
-        windows = np.stack([self.points[k : k + spans] for k in range(_POINTS)], axis=-1)
-        return Piecewise(self.knots, windows @ QUARTIC / h ** np.arange(5.0))
+        return spline(self.knots, self.points)
 
     def draw(self, count: int, random: np.random.Generator) -> Floats:
         """Control points (M + 4, 3, count) of ways as likely as the true one, given the samples."""
@@ -98,18 +96,11 @@ class Smoothed:
         return self.points[..., None] + _draws(self.factor, normal).reshape(-1, 3, count)
 
 
-def spline_states(knots: Floats, points: Floats, t: Floats, orders: int) -> Floats:
-    """Value and derivatives (orders, T, ...) at times (T,) [s] of a spline with control points (M + 4, ...)."""
-    h = knots[1] - knots[0]
-    span = np.clip(((t - knots[0]) / h).astype(np.int64), 0, len(knots) - 2)
-    powers = ((t - knots[0]) / h - span)[:, None] ** np.arange(5.0)
-    out, basis = np.zeros((orders, len(t), *points.shape[1:])), QUARTIC
-    for order in range(orders):
-        weight = powers[:, : basis.shape[1]] @ basis.T
-        for k in range(_POINTS):
-            out[order] += weight[:, k].reshape(-1, *(1,) * (points.ndim - 1)) * points[span + k]
-        basis = basis[:, 1:] * np.arange(1.0, basis.shape[1]) / h
-    return out
+def spline(knots: Floats, points: Floats) -> Piecewise:
+    """The spline with control points (M + 4, ...) on even knots (M + 1,) [s]: pieces (M, ..., 5)."""
+    h, spans = knots[1] - knots[0], len(knots) - 1
+    windows = np.stack([points[k : k + spans] for k in range(_POINTS)], axis=-1)
+    return Piecewise(knots, windows @ QUARTIC / h ** np.arange(5.0))
 
 
 def knots_over(time: Floats, zero: float, step: float) -> Floats:
@@ -118,58 +109,30 @@ def knots_over(time: Floats, zero: float, step: float) -> Floats:
     return zero + step * np.arange(first - 1.0, max(last, first + 1.0) + 2.0)
 
 
-class _WhitenedRows(NamedTuple):
-    """Whitened samples: rows of a banded system, (K, 8) from control points (K,) on, and what they give (K, 3)."""
+def _whiten(samples: Positions, noise: PositionNoise, knots: Floats) -> tuple[Any, Floats, float]:
+    """A matrix (K, C), sparse, and values (K, 3): the matrix times control points (C, 3), with independent noise.
 
-    first: Ints
-    weight: Floats
-    value: Floats
-    deviance: float
+    The noise has variance 1; last comes -2 log of the determinant of what whitens all axes.
+    """
+    from scipy.sparse import csr_array, diags_array
 
-    @classmethod
-    def of(cls, samples: Positions, noise: PositionNoise, knots: Floats) -> _WhitenedRows:
-        h, spans, count = knots[1] - knots[0], len(knots) - 1, len(samples.time)
-        span = np.clip(((samples.time - knots[0]) / h).astype(np.int64), 0, spans - 1)
-        share = (samples.time - knots[0]) / h - span
-        sigma = noise.sigma * samples.scale
-        basis = (share[:, None] ** np.arange(5.0)) @ QUARTIC.T / sigma[:, None]
-        value = samples.position / sigma[:, None]
-        weight, first, left = np.zeros((count, _WINDOW)), span.copy(), np.ones(count)
-        shift = np.zeros(count, dtype=np.int64)
-        if noise.tau > 0.0:
-            # Over a longer gap, the noise counts as new: a little is left out of what is known of it.
-            near = np.append(False, np.diff(span) <= _APART)
-            share = np.where(near, np.exp(-np.diff(samples.time, prepend=0.0) / noise.tau), 0.0)
-            shift[1:] = np.where(near[1:], np.diff(span), 0)
-            first -= shift
-            left = 1.0 / np.sqrt(-np.expm1(2.0 * np.log(np.maximum(share, 1e-300))))
-            weight[1:, :_POINTS] = -share[1:, None] * basis[:-1]
-            value[1:] -= share[1:, None] * value[:-1]
-        row = np.arange(count)
-        for k in range(_POINTS):
-            weight[row, shift + k] += basis[:, k]
-        # The windows of the last spans would reach beyond the last control point: they begin earlier.
-        over = np.maximum(first + _WINDOW - (spans + _POINTS - 1), 0)
-        for k in np.unique(over[over > 0]):
-            some = np.flatnonzero(over == k)
-            weight[some] = np.roll(weight[some], k, axis=1)
-        deviance = 6.0 * float((np.log(sigma) - np.log(left)).sum())
-        return cls(first - over, weight * left[:, None], value * left[:, None], deviance)
-
-    def normal_equations(self, count: int) -> tuple[Floats, Floats]:
-        """The band (8, C) of the matrix, lower, and the right-hand sides (C, 3), of C control points."""
-        band, right = np.zeros((_WINDOW, count)), np.zeros((count, 3))
-        for i in range(_WINDOW):
-            at, own = self.first + i, self.weight[:, i]
-            for axis in range(3):
-                right[:, axis] += np.bincount(at, own * self.value[:, axis], count)
-            for j in range(i, _WINDOW):
-                band[j - i] += np.bincount(at, own * self.weight[:, j], count)
-        return band, right
-
-    def times(self, points: Floats) -> Floats:
-        """The rows times control points (C, 3)."""
-        return sum(self.weight[:, [i]] * points[self.first + i] for i in range(_WINDOW))
+    h, spans, count = knots[1] - knots[0], len(knots) - 1, len(samples.time)
+    span = np.clip(((samples.time - knots[0]) / h).astype(np.int64), 0, spans - 1)
+    share = (samples.time - knots[0]) / h - span
+    sigma = noise.sigma * samples.scale
+    basis = (share[:, None] ** np.arange(5.0)) @ QUARTIC.T / sigma[:, None]
+    columns, ends = span[:, None] + np.arange(_POINTS), _POINTS * np.arange(count + 1)
+    matrix = csr_array((basis.ravel(), columns.ravel(), ends), (count, spans + _POINTS - 1))
+    value, deviance = samples.position / sigma[:, None], 6.0 * float(np.log(sigma).sum())
+    if noise.tau > 0.0:
+        # Over a longer gap, the noise counts as new: a little is left out of what is known of it.
+        near = np.diff(span) <= _APART
+        share = np.where(near, np.exp(-np.diff(samples.time) / noise.tau), 0.0)
+        left = np.append(1.0, 1.0 / np.sqrt(-np.expm1(2.0 * np.log(np.maximum(share, 1e-300)))))
+        whitening = diags_array([left, -share * left[1:]], offsets=[0, -1])
+        matrix, value = (whitening @ matrix).tocsr(), whitening @ value
+        deviance -= 6.0 * float(np.log(left).sum())
+    return matrix, value, deviance
 
 
 def smooth(
@@ -187,31 +150,32 @@ def smooth(
 
     free = np.isnan(noise.sigma)
     unit = PositionNoise(1.0, noise.tau) if free else noise
-    rows, count = _WhitenedRows.of(samples, unit, knots), len(knots) + _POINTS - 2
-    band, right = rows.normal_equations(count)
+    (matrix, value, whitening), count = _whiten(samples, unit, knots), len(knots) + _POINTS - 2
+    normal, right = matrix.T @ matrix, matrix.T @ value
+    band = np.stack([np.pad(normal.diagonal(-k), (0, k)) for k in range(_WINDOW)])
     whole, turns = count - 3, _TURNS if calm is None else 0
     calm = np.ones(whole) if calm is None else calm
     numbers, about = 3 * max(len(samples.time) - 3, 1), np.zeros((count, 3))
+    third = np.zeros((whole, 3))  # differences of ``about``
 
     def solve(weight: Floats) -> tuple[Floats, Floats, Floats]:
         """Control points from ``about`` on (C, 3), what they were solved of, and the factor."""
         full, of = band.copy(), right.copy()
-        third = weight[:, None] * np.diff(about, 3, axis=0)
         for i in range(4):
-            of[i : i + whole] -= _THIRD[i] * third
+            of[i : i + whole] -= _THIRD[i] * weight[:, None] * third
             for j in range(i, 4):
                 full[j - i, i : i + whole] += _THIRD[i] * _THIRD[j] * weight
-        factor = cholesky_banded(full, lower=True)
-        return cho_solve_banded((factor, True), of), of, factor
+        factor = cholesky_banded(full, lower=True, check_finite=False)
+        return cho_solve_banded((factor, True), of, check_finite=False), of, factor
 
     def evaluate(log_variance: float) -> tuple[float, float]:
         weight = calm * np.exp(-log_variance)
         points, of, factor = solve(weight)
-        quadratic = squares + float((weight @ np.diff(about, 3, axis=0) ** 2).sum())
+        quadratic = squares + float((weight @ third**2).sum())
         quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
         variance = quadratic / numbers if free else 1.0
-        return rows.deviance + numbers * np.log(
+        return whitening + numbers * np.log(
             variance
         ) + quadratic / variance + 3.0 * of_points, variance
 
@@ -219,8 +183,9 @@ def smooth(
     bounds = _SMALLEST + zero, _LARGEST + zero
     # Only what a first way leaves is fitted: of far positions, the quadratic would be all rounding.
     about = solve(calm * np.exp(-_FIRST - zero))[0]
-    rows = rows._replace(value=rows.value - rows.times(about))
-    squares, right = float((rows.value**2).sum()), rows.normal_equations(count)[1]
+    third = np.diff(about, 3, axis=0)
+    value = value - matrix @ about
+    squares, right = float((value**2).sum()), matrix.T @ value
     best = minimize_scalar(
         lambda x: evaluate(x)[0], bounds=bounds, method="bounded", options={"xatol": _CLOSE}
     )
@@ -236,7 +201,7 @@ def smooth(
         weight = np.minimum(weight, np.exp(-bounds[0]))
     points, _, factor = solve(weight)
     sigma = float(np.sqrt(variance))
-    residual = (rows.value - rows.times(points)) / sigma
+    residual = (value - matrix @ points) / sigma
     known = PositionNoise(sigma * unit.sigma, noise.tau)
     calm = np.minimum(weight / np.median(weight), 1.0)
     return Smoothed(knots, about + points, factor / sigma, calm, known, deviance, residual)

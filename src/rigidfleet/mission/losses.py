@@ -59,13 +59,7 @@ def rules(m: Draft) -> Breaches:
     if d.hold_until is not None and d.hold_until <= first:
         problem = f"is not after the first loss at {first:g} s"
         yield Breach((_TABLE, "hold_until"), problem, "give a later time or remove it")
-    for k, p in under_way(m.phases, first):
-        if p.control != "tracking":
-            problem = (
-                f"may be under way at the loss at {first:g} s, but only tracked slots can brake"
-            )
-            remedy = "use control = 'tracking', or on_loss = 'continue'"
-            yield Breach(("phases", k, "control"), problem, remedy, p.control)
+    yield from _tracked(m, first, "loss", "brake", "on_loss = 'continue'")
     if d.on_loss == "land":
         if not grounded:
             yield Breach((_TABLE, "on_loss"), *_NO_GROUND)
@@ -89,10 +83,17 @@ def _abort(m: Draft) -> Breaches:
     if begins >= m.end:
         problem = f"and the reaction of {options.reaction:g} s are not before the end of the mission at {m.end:g} s"
         yield Breach(("abort", "at"), problem, "give an earlier time or remove it")
-    for k, p in under_way(m.phases, begins):
+    yield from _tracked(m, begins, "abort", "slow down", "abort at another time")
+
+
+def _tracked(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
+    """Slots are tracked in what may be under way at a loss or abort at a time [s]; words of it, and another remedy."""
+    for k, p in under_way(m.phases, when):
         if p.control != "tracking":
-            problem = f"may be under way at the abort at {begins:g} s, but only tracked slots can slow down"
-            remedy = "use control = 'tracking', or abort at another time"
+            problem = (
+                f"may be under way at the {what} at {when:g} s, but only tracked slots can {does}"
+            )
+            remedy = f"use control = 'tracking', or {other}"
             yield Breach(("phases", k, "control"), problem, remedy, p.control)
 
 

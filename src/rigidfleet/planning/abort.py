@@ -50,11 +50,14 @@ from rigidfleet.typing import Bools, Floats, Ints
 #: Greatest acceleration [m/s^2], jerk [m/s^3] and speed [m/s] of a vehicle on its way home, unless `limits` asks for
 #: less.
 BRAKING, JERK, SPEED = 2.0, 5.0, 5.0
+#: Greatest vertical speed of a vehicle with rotors [m/s], which descends in its own inflow.
+_SINKING = 2.5
 #: Height of the last straight way down [m], and the greatest speed [m/s] there.
 FINAL, DESCENT = 3.0, 1.0
-#: Shortest step [s], ratio of a time tried to the one before, and number of times tried; share that counts as kept: the
-#: state at the start may be beyond a limit by rounding.
-SHORTEST, _LONGER, _TRIES, _KEPT = 0.5, 1.1, 60, 1.01
+#: Shortest step [s], ratio of a time tried to the one before, and number of times tried.
+SHORTEST, _LONGER, _TRIES = 0.5, 1.1, 60
+#: Share of a limit that steps may use, which are looked at in samples alone; share of that which counts as kept.
+_USED, _KEPT = 0.98, 1.0 + 1e-6
 #: Time between knots of the plan as polynomials of degree 7 [s], which differ from it by micrometres; knots that are
 #: nearer count as one.
 _KNOTS, _NEAR = 0.2, 0.01
@@ -222,14 +225,18 @@ class Aborts:
         self.lost = np.zeros(mission.n_agents, dtype=np.bool_) if lost is None else lost
         self.left, self.radius = np.flatnonzero(~self.lost), mission.fleet.radius
         self.limits = limits_of(mission)
-        self.home_limits = gentle_limits(mission, acceleration=BRAKING, jerk=JERK, speed=SPEED)
-        self.need, widest = limits.separation or 0.0, 2.0 * float(self.radius.max())
-        # Vehicles with rotors are off their ways by what both may be off, and all by the drag that no law knows.
         rotors = not all(model.point for model in mission.vehicle_models or ())
-        allowed = limits.separation_allowance
-        self.off = 0.0
-        if rotors:
-            self.off = allowed if (off := limits.tracking_error) is None else 2.0 * off
+        sinking = _SINKING if rotors else math.inf
+        self.home_limits = gentle_limits(
+            mission, acceleration=BRAKING, jerk=JERK, speed=SPEED, vertical_speed=sinking
+        )
+        self.need, widest = limits.separation or 0.0, 2.0 * float(self.radius.max())
+        # In flight both are off their ways, as far as the verdict allows, but for points that only steady air pushes.
+        allowed, most, d = limits.separation_allowance, limits.tracking_error, mission.disturbances
+        steady = d is None or (d.noise is None and d.gusts is None and not np.any(d.mass_error))
+        self.off = 0.0 if steady and mission.vehicle_models is None else allowed
+        if rotors and most is not None:
+            self.off = 2.0 * most
         self.apart = widest + self.need + max(allowed, self.off)
         self.below = max(self.apart, widest + (limits.separation_below or 0.0))
         self.moves = any(x.solid.moves for x in mission.solids)
@@ -321,18 +328,12 @@ class Aborts:
         step : of it
         problem : what breaks a limit, or leads two vehicles too near; "" if nothing does
         """
-        plan, x = self.plan, np.linspace(0.0, 1.0, _LOOKS)
-
-        def excess(time: float) -> Floats:
-            at, *rates = _clock(begins, time, _SLOWING).states(time * x, 4)
-            states = plan.states(at, 4)
-            allowed = np.maximum(self._shares(self.limits, states), 1.0)
-            return self._shares(self.limits, _at_rates(states, np.array(rates))) / allowed
-
-        v = plan.states(np.array([begins]), 2)[1, 0, self.left]
+        v = self.plan.states(np.array([begins]), 2)[1, 0, self.left]
         speed = float(np.linalg.norm(v, axis=1).max())
         first = max(_STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
-        time, over = least_time(first, excess)
+        time, over = self._time_along(
+            first, self.limits, lambda time: _clock(begins, time, _SLOWING)
+        )
         if begins + 0.5 * time >= self.end and self.lands:
             clock = _clock(begins, max(self.end - begins, SHORTEST), _ON)
             return self.along("to its end", clock), ""
@@ -344,6 +345,20 @@ class Aborts:
             who, least = agent_names(step.least.agents), step.least.separation
             problem = f"the plan itself leads {who} within {max(least, 0.0):.2f} m of each other"
         return step, problem
+
+    def _time_along(
+        self, first: float, limits: list[Limit], clock: Callable[[float], Piecewise]
+    ) -> tuple[float, Floats]:
+        """`least_time` of a step along the plan by a clock of a time; where the plan exceeds a limit, that counts."""
+        share = np.linspace(0.0, 1.0, _LOOKS)
+
+        def excess(time: float) -> Floats:
+            at, *rates = clock(time).states(time * share, 4)
+            states = self.plan.states(at, 4)
+            allowed = np.maximum(self._shares(limits, states), _USED)
+            return self._shares(limits, _at_rates(states, np.array(rates))) / allowed
+
+        return least_time(first, excess)
 
     # -- what a step keeps --------------------------------------------------------------------------------
 
@@ -372,7 +387,7 @@ class Aborts:
     def _straight(self, name: str, start: Floats, end: Floats) -> Step:
         """The step of straight ways (N, 3) [m], from rest to rest and in step, in the least time that keeps limits."""
         states = _from_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
-        allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), 1.0)  # at rest
+        allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), _USED)  # at rest
 
         def excess(time: float) -> Floats:
             moves = states * time ** -np.arange(4.0)[:, None, None, None]
@@ -454,10 +469,14 @@ class Aborts:
     def _back(self, path: float, begin: float) -> Iterator[Home]:
         """Ways home from farther and farther back along the plan, from a time along it where all rest at a time [s]."""
         for far in np.append(np.arange(_BACK, path, _BACK), path).tolist():
-            time = max(_FASTEST * far, SHORTEST)
+
+            def clock(time: float, far: float = far) -> Piecewise:
+                return _clock(path, time, -far / time * _BLEND)
+
+            time, _ = self._time_along(_FASTEST * far, self.home_limits, clock)
             home = self.search(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
-                step = self.along("back", _clock(path, time, -far / time * _BLEND))
+                step = self.along("back", clock(time))
                 if not self.obstruction(step, begin):
                     yield Home((step, *home.steps), f"back along the plan, and {home.way}")
 
@@ -631,16 +650,18 @@ class Aborts:
         ]
 
 
-def least_time(time: float, excess: Callable[[float], Floats]) -> tuple[float, Floats]:
+def least_time(
+    time: float, excess: Callable[[float], Floats], kept: float = _KEPT
+) -> tuple[float, Floats]:
     """The least time from a first one on [s], to within a tenth, that exceeds no limit, and the shares that it takes.
 
-    If every time exceeds one, the best of those that were tried.
+    A share up to ``kept`` exceeds none. If every time exceeds one, the best of those that were tried.
     """
     tries: list[tuple[float, Floats]] = []
     time = max(time, SHORTEST)
     for _ in range(_TRIES):
         tries.append((time, excess(time)))
-        if tries[-1][1].max(initial=0.0) <= _KEPT:
+        if tries[-1][1].max(initial=0.0) <= kept:
             return tries[-1]
         time *= _LONGER
     return min(tries, key=lambda x: x[1].max())

@@ -40,15 +40,21 @@ from rigidfleet.typing import Floats
 _DESCENDING = 0.5
 #: Peaks of speed and acceleration of a septic blend over unit way and time.
 _PEAK_SPEED, _PEAK_ACCELERATION = 2.1875, 7.5132
+#: Share of a limit that counts as kept: from a state beyond it, some of its derivatives lead a bit farther.
+_KEPT = 1.01
 #: Tilt that counts as level [rad].
 _LEVEL = 1e-3
 
 
 class Answer(NamedTuple):
-    """What follows a loss or an order: legs, and why they lead to no place that is proved; "" if they do."""
+    """What follows a loss or an order: legs, and why they lead to no place that is proved; "" if they do.
+
+    Of a way home that is proved, `promise` is the least separation [m].
+    """
 
     legs: list[Leg]
     problem: str = ""
+    promise: float | None = None
 
 
 def legs_from(
@@ -77,8 +83,9 @@ def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
         return Answer(after_loss(mission, now, plan))
     legs = plan()
     abort = Aborts(mission, legs, now.lost).at(now.t - mission.aborting.reaction)
-    phases = phases_of(mission, abort.steps, "abort: ")
-    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason)
+    phases, least = phases_of(mission, abort.steps, "abort: "), abort.least.separation
+    promise = least if abort.way and math.isfinite(least) else None
+    return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason, promise)
 
 
 def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg]]) -> list[Leg]:
@@ -163,5 +170,5 @@ def _shortest(
         return np.array([x.share for x in use])
 
     allowed = np.maximum(shares(least, now.t + 1e-9 * max(1.0, now.t)), 1.0)
-    time, _ = least_time(least, lambda time: shares(time) / allowed)
+    time, _ = least_time(least, lambda time: shares(time) / allowed, _KEPT)
     return leg_from(mission, make(time), departure)

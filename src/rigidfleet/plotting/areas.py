@@ -88,7 +88,7 @@ def falls_of(result: Result) -> Floats:
 @st.in_style
 def sketch(result: Result, falls: Floats) -> Figure:
     """The ground from above: fences, people, and where vehicles fly and fall (`falls_of`)."""
-    fig = st.blank_figure(st.WIDTH, 4.6, "constrained")
+    fig = st.blank_figure(5.2, 3.6, "constrained")
     ax = fig.subplots()
     draw_from_above(ax, result.mission)
     handles = []

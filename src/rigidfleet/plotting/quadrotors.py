@@ -34,9 +34,8 @@ def rotor_limits(mission: Mission) -> Floats:
 
 
 def has_rotors(result: Result) -> bool:
-    """Whether a vehicle with rotors flies, and what they give is known: a log beside its plan does not say it."""
-    known = result.rotor_force is not None and "doubt" not in result.statistics
-    return known and bool(np.isfinite(rotor_limits(result.mission)).any())
+    """Whether a vehicle with rotors flies, and what they give is known."""
+    return result.rotor_force is not None and bool(np.isfinite(rotor_limits(result.mission)).any())
 
 
 def rotor_forces(result: Result) -> Floats:

@@ -397,7 +397,7 @@ def name_box(ax: Axes, box: Artist, x: float, y: float, name: str) -> None:
     """Write the name of a box above its lower edge, if it fits."""
     label = ax.text(
         x, y, clean_name(name, 20), fontsize=6.5, color=GREY, ha="center", va="bottom", zorder=1.5,
-        parse_math=False,
+        parse_math=False, clip_on=True,
     )  # fmt: skip
     if label.get_window_extent().width > box.get_window_extent().width:
         label.remove()

@@ -12,7 +12,7 @@ from rigidfleet.planning.losses import Answer, answer_to
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import copy_with
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
-from rigidfleet.preflight.obstacles import obstacle_remarks
+from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
 from rigidfleet.preflight.trajectory import (
     downwash_remarks,
     limit_remarks,
@@ -36,7 +36,7 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         text = f"{what} after the planned paths, at {first:g} s: what follows is not checked"
         yield Remark("note", "loss", text)
         return
-    way, problem = planned_answer(mission, at, legs)
+    way, problem, _ = planned_answer(mission, at, legs)
     end = way[-1].end
     does = "hold to" if mission.on_loss == "hold" or problem else "land by"
     stop = way[0].after.r.mean(axis=0)
@@ -53,8 +53,9 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
     part = Preflight(
         mission, preflight.formations, preflight.gains, [planned_phase(x, most) for x in way]
     )
-    judges = (separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, limit_remarks)
-    for judge in judges:
+    for judge in (
+        separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, boundary_remarks, limit_remarks,
+    ):  # fmt: skip
         yield from judge(mission, part)
 
 

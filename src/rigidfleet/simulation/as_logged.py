@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -29,14 +28,12 @@ from rigidfleet.math.smoothing import (
     knots_over,
     noise_of,
     smooth,
-    spline_states,
+    spline,
 )
-from rigidfleet.result import Extremum, Result, presence
-from rigidfleet.result.result import CLOSE, VARIABLES
+from rigidfleet.result import Extremum, Result
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.recording import Places, distances, text_of
-from rigidfleet.simulation.trajectories import of_curve, watch_curve
+from rigidfleet.simulation.trajectories import of_curve, result_of, watch_curve
 from rigidfleet.typing import Floats
 
 #: What is believed of clocks: that they are those of the plan as recorded, that one offset is all that they differ from
@@ -56,11 +53,11 @@ _MORE = 1.5
 _COURSES = (0.0, 0.05, 0.2)
 #: Time between the places that are aligned, at least [s], and that between samples beside obstacles.
 _ALIGNED, _NEAR = 0.05, 0.05
-#: What nobody can say of a flight of which positions alone are known.
-_FORCES = {
-    "input_force", "constraint_force", "external_force", "thrust", "wrench_asked", "wrench_achieved", "multiplier",
-    "singular_value", "integral", "attitude", "rates", "disturbance_force", "measured_position", "measured_velocity",
-}  # fmt: skip
+#: What is planned, and holds of a flight of which positions alone are known.
+_PLANNED = (
+    "time", "phase", "cm_reference", "cm_velocity_reference", "attitude_reference", "frame", "rates_reference",
+    "distance_reference", "distance_rate_reference", "slot_jerk", "yaw", "yaw_rate",
+)  # fmt: skip
 WORDS = "a smoothing spline, with doubt"
 
 
@@ -192,6 +189,7 @@ def _planned_ways(plan: Result) -> Piecewise:
     """The plan: ways of slots, and of vehicles as they fly in the simulator where no slots are tracked."""
     slots, flown = plan.motion(), plan.motion(flown=True)
     state = np.where(np.isnan(slots.state), flown.state, slots.state)
+    state[:, 2:] = np.nan_to_num(state[:, 2:])  # of straight lines
     still = np.zeros_like(slots.yaw)
     return ways_of(slots._replace(state=state, yaw=still, yaw_rate=still), slice(None))
 
@@ -204,8 +202,7 @@ def _alignment(
     for each, log in zip(smoothed, logs, strict=True):
         t = np.arange(log.time[0], log.time[-1], _ALIGNED)
         places.append((t, each.way.at(t)))
-    states = lambda i, t: tuple(alone[i].states(t, 2))  # noqa: E731
-    return align(places, states, (float(planned.time[0]), float(planned.time[-1])), clock)
+    return align(places, alone, clock)
 
 
 def _offsets(alignment: Alignment, clock: Clock) -> Floats:
@@ -222,7 +219,7 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
     offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
         raise TrajectoryError(
-            "the clock cannot be told: the plan hardly moves. Use --clock recorded."
+            "the clock cannot be told: the plan hardly moves. Give logs of one clock, with --clock recorded."
         )
     return offsets
 
@@ -237,9 +234,8 @@ def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Float
         inside = flown.left[:, i]
         drawn = [model[i].draw(share, random) for model, share in zip(models, shares, strict=True)]
         points = np.concatenate(drawn, axis=2) - likely.points[..., None]
-        off[:, :, inside, i] = np.moveaxis(
-            spline_states(likely.knots, points, time[inside], 3), -1, 0
-        )
+        states = spline(likely.knots, points).states(time[inside], 3)
+        off[:, :, inside, i] = np.moveaxis(states, -1, 0)
     rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
     for s, by in enumerate(late * random.standard_normal((count, len(late)))):
         off[s, :2] += by[:, None] * rates
@@ -249,14 +245,14 @@ def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Float
 def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list[Any]) -> Result:
     """A result of a plan with ways (K, N, 3, P) in place of what it flew, at the times that both have.
 
-    Forces and attitudes are unknown; those of single vehicles are the planned ones, and are not judged.
+    Forces, attitudes and messages are unknown.
 
     Raises
     ------
     TrajectoryError
         They have no time in common.
     """
-    mission, n = plan.mission, plan.n_agents
+    mission = plan.mission
     both = (plan.time >= way.time[0] - 1e-9) & (plan.time <= way.time[-1] + 1e-9)
     if np.count_nonzero(both) < 2:
         words = f"{way.time[0]:.6g} to {way.time[-1]:.6g} s, and the plan {plan.time[0]:g} to {plan.time[-1]:g} s"
@@ -274,30 +270,19 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
             fastest = watch_curve(watch, way.between(since, until), grid, spans)
             extremes = watch.phase() | fastest
         records.append(replace(record, extremes=extremes, settled=None, controller=None))
-    watch.only(np.ones(n, dtype=np.bool_))
+    watch.only(np.ones(plan.n_agents, dtype=np.bool_))
     watch.flight(records)
-    known: dict[str, Any] = {"edges": plan.edges}
-    for name in VARIABLES:
-        if name not in (*CLOSE, "edges") and (x := getattr(plan, name)) is not None:
-            known[name] = np.full_like(x[inside], np.nan) if name in _FORCES else x[inside]
+    every = {name: getattr(plan, name) for name in _PLANNED}
+    known: dict[str, Any] = {name: x[inside] for name, x in every.items() if x is not None}
     (r, v, a), slots = way.states(time, 3), planned.states(time, 3)[..., :3]
     share, (i, j) = mission.fleet.mass / mission.fleet.mass.sum(), plan.edges.T
     length = np.linalg.norm(r[:, i] - r[:, j], axis=2)
     known |= {
-        "position": r, "velocity": v, "acceleration": a, "slot_position": slots[0], "slot_velocity": slots[1],
-        "slot_acceleration": slots[2], "cm": share @ r, "cm_velocity": share @ v, "distance": length,
-        "constraint": length - known["distance_reference"],
+        "edges": plan.edges, "position": r, "velocity": v, "acceleration": a, "slot_position": slots[0],
+        "slot_velocity": slots[1], "slot_acceleration": slots[2], "cm": share @ r, "cm_velocity": share @ v,
+        "distance": length, "constraint": length - known["distance_reference"],
     }  # fmt: skip
-    left = presence(time, spans, n) if spans else None
-    worst = [record.extremes for record in records]
     whole = end >= plan.time[-1] - 1e-6
-    result = Result(
-        **known, **dict.fromkeys(CLOSE), phases=records, mission_text="", statistics={"spans": spans},
-        complete=plan.complete and whole, ending=plan.ending if whole else "the log ends",
-        later=[
-            (CLOSE, partial(distances, mission, worst, Places([r], n), time, left)),
-            (("mission_text",), partial(text_of, mission)),
-        ],
-    )  # fmt: skip
-    vars(result)["mission"] = mission
-    return result
+    ending = plan.ending if whole else "the log ends"
+    complete = plan.complete and whole
+    return result_of(mission, records, known, {"spans": spans}, complete=complete, ending=ending)

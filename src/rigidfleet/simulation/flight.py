@@ -22,7 +22,7 @@ from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.disturbances import disturbance
 from rigidfleet.planning.legs import Leg, at_start
-from rigidfleet.planning.losses import answer_to, legs_from
+from rigidfleet.planning.losses import Answer, answer_to, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import complete_times, timed_leg
@@ -282,7 +282,7 @@ class Flight:
             mission.abandons_at == math.inf
         )  # whether nothing (more) follows from a loss or abort
         self._following = 0  # index of the route's next phase
-        self._unproved = ""  # why no way home is proved, after an abort
+        self._answer = Answer([])  # what follows from it
         self._plans: list[
             PhasePlan
         ] = []  # of the phases begun, if the flight may have to leave them
@@ -362,10 +362,8 @@ class Flight:
                 self._leave_phase(changed=True)
                 self._react()
             if self._following >= len(self._route):
-                if self._unproved:
-                    self.ending = (
-                        f"no way home is proved from where the flight was aborted: {self._unproved}"
-                    )
+                if why := self._answer.problem:
+                    self.ending = f"no way home is proved from where the flight was aborted: {why}"
                 return False
             phase = self._route[self._following]
             self._following += 1
@@ -583,6 +581,8 @@ class Flight:
             statistics["message_numbers"] = self._vehicles.laws.numbers
         if mission.avoidance is not None and self.external is not None:
             statistics["pushed"] = True  # by a force that avoidance does not know
+        if self._answer.promise is not None:
+            statistics["promised"] = [self._answer.legs[0].start, self._answer.promise]
         ending = self.ending if ending is None else ending
         result = assemble(
             mission, phases, pieces, ending=ending, statistics=statistics, network=self.network
@@ -655,7 +655,8 @@ class Flight:
         if lost.any():
             self._extremes.lose(lost)
             self._now.lost = lost
-        legs, self._unproved = answer_to(self.mission, self._now, self._whole_plan)
+        self._answer = answer_to(self.mission, self._now, self._whole_plan)
+        legs = self._answer.legs
         if legs:
             self._reached = legs[0].before
         self._route = [*self._asked, *(leg.phase for leg in legs)]

@@ -302,7 +302,16 @@ def of_curve(
     if powers < 3:  # lines turn at once at samples
         state[2:] = np.nan
     facts = {"interpolation": interpolation, "names": list(names), "spans": spans, "clock": zero}
-    return _result(mission, record, at, state, yaws, facts)
+    r, v, a, j = state
+    turned = np.nan_to_num(yaws, copy=False)
+    known: dict[str, Any] = {
+        "time": at, "phase": np.zeros(len(at), dtype=np.int64), "position": r, "velocity": v, "acceleration": a,
+        "slot_position": r, "slot_velocity": v, "slot_acceleration": a, "slot_jerk": j,
+        "yaw": turned[0], "yaw_rate": turned[1],
+        "cm": r.mean(axis=1), "cm_velocity": v.mean(axis=1), "edges": np.zeros((0, 2), dtype=np.int64),
+    }  # fmt: skip
+    known |= {"cm_reference": known["cm"], "cm_velocity_reference": known["cm_velocity"]}
+    return result_of(mission, [record], known, facts)
 
 
 def of_curves(read: Trajectories, **judged: Any) -> Result:
@@ -476,37 +485,37 @@ def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: boo
             best[name] = Extremum(peak.value, float(t + peak.place * (end - t)), i, -1)
 
 
-def _result(
+def result_of(
     mission: Mission,
-    record: PhaseRecord,
-    time: Floats,
-    state: Floats,
-    yaw: Floats,
+    records: list[PhaseRecord],
+    known: dict[str, Any],
     statistics: dict[str, Any],
+    **ending: Any,
 ) -> Result:
-    r, v, a, j = state
+    """A result of what is known of a flight, with NaN for the rest; ``statistics`` have the spans of `of_curve`."""
+    time, r = known["time"], known["position"]
     k, n = r.shape[:2]
     left = presence(time, statistics["spans"], n)
-    turned = np.nan_to_num(yaw, copy=False)
-    sizes = {"time": k, "agent": n, "axis": 3, "quaternion": 4, "wrench": 6, "edge": 0}
+    sizes = {
+        "time": k,
+        "agent": n,
+        "axis": 3,
+        "quaternion": 4,
+        "wrench": 6,
+        "edge": len(known["edges"]),
+    }
     nothing = cache(lambda *shape: np.full(shape, np.nan))  # of each shape once
-    known: dict[str, Any] = {
-        "time": time, "phase": np.zeros(k, dtype=np.int64), "position": r, "velocity": v, "acceleration": a,
-        "slot_position": r, "slot_velocity": v, "slot_acceleration": a, "slot_jerk": j,
-        "yaw": turned[0], "yaw_rate": turned[1],
-        "cm": r.mean(axis=1), "cm_velocity": v.mean(axis=1), "edges": np.zeros((0, 2), dtype=np.int64),
-    }  # fmt: skip
-    known |= {"cm_reference": known["cm"], "cm_velocity_reference": known["cm_velocity"]}
     unknown = {
         name: nothing(*(sizes[dim] for dim in x.dims))
         for name, x in VARIABLES.items()
         if not x.optional and name not in (*known, *CLOSE)
     }
+    worst = [record.extremes for record in records]
     result = Result(
-        **known, **unknown, **dict.fromkeys(CLOSE), phases=[record], mission_text="",
-        statistics=statistics,
+        **known, **unknown, **dict.fromkeys(CLOSE), phases=records, mission_text="",
+        statistics=statistics, **ending,
         later=[
-            (CLOSE, partial(distances, mission, [record.extremes], Places([r], n), time, left)),
+            (CLOSE, partial(distances, mission, worst, Places([r], n), time, left)),
             (("mission_text",), partial(text_of, mission)),
         ],
     )  # fmt: skip

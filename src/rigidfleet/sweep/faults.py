@@ -31,6 +31,7 @@ from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
+    from rigidfleet.result import Result
 
 #: Faults of some vehicles, of the whole show or one vehicle, and those that are flown, with units of their magnitudes.
 PARTIAL = {"late": "s", "another": "", "stale": "", "bias": "m"}
@@ -143,6 +144,15 @@ def _heading(angle: Any) -> Floats:
     return np.column_stack([np.sin(angle), np.cos(angle)])
 
 
+class GeometricFault(NamedTuple):
+    """A geometric fault: its kind and size, the vehicles (S,) concerned, and its random numbers."""
+
+    kind: str
+    size: float
+    who: Ints
+    stream: np.random.Generator
+
+
 class _Chords(NamedTuple):
     """Ways by their chords between knots.
 
@@ -247,26 +257,35 @@ class Show:
             motion = result.motion(flown=True)
         return ways_of(motion, slice(None)), NAMES[7], assess(result)
 
-    def outcome(
-        self, fault: str, size: float, who: Ints, stream: np.random.Generator
-    ) -> tuple[dict[str, float | None], str, str]:
-        """What was measured of a fault of vehicles (S,), the checks that it fails, and the first of these in words.
-
-        Judged are these vehicles, and all that may come near them.
-        """
+    def outcome(self, fault: GeometricFault) -> tuple[dict[str, float | None], str, str]:
+        """What was measured of a fault, the checks that it fails, and the first of these in words."""
         from rigidfleet.assessment import assess
+
+        # A show that is moved as a whole changes no distance between its vehicles.
+        if fault.kind in SETUP and len(fault.who) == self.n and not self.bounded:
+            return {}, "", ""
+        result, every = self.flight(fault)
+        verdict = assess(result)
+        failed = [check for check in verdict.checks if not check.passed]
+        worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
+
+        def in_fleet(match: re.Match[str]) -> str:
+            return re.sub(r"\d+", lambda number: str(every[int(number[0]) - 1] + 1), match[0])
+
+        words = _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
+        return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
+
+    def flight(self, fault: GeometricFault) -> tuple[Result, Ints]:
+        """The flight of the vehicles of a fault and of all that may come near them, and which (M,) these are."""
         from rigidfleet.simulation.trajectories import of_curve
 
+        who = fault.who
         again = np.isin(np.arange(self.n), who)
-        # A show that is moved as a whole changes no distance between its vehicles.
-        whole = fault in SETUP and again.all()
-        if whole and not self.bounded:
-            return {}, "", ""
-        way, knots = self.way_with(fault, size, who, stream), self.curve.time
+        way, knots = self.way_with(fault), self.curve.time
         if not np.array_equal(knots, way.time):
             knots = common_knots([self.curve, way])
         way = way.on(knots, stays=True)
-        if not whole:
+        if fault.kind not in SETUP or not again.all():
             again |= self._near(who, _Chords.of(way), knots)
         every = np.flatnonzero(again)
         curve = self._some(every).on(knots, stays=True)
@@ -279,22 +298,13 @@ class Show:
         if air := data.get("disturbances"):
             data["disturbances"] = air | {"drag": [air["drag"][i] for i in every]}
         mission = Mission.from_plain(data, "drill")
-        verdict = assess(of_curve(Piecewise(knots, pieces), self.how, mission=mission))
-        failed = [check for check in verdict.checks if not check.passed]
-        worst = {c.check: c.worst for c in verdict.checks if c.judged and c.check in METRICS}
+        return of_curve(Piecewise(knots, pieces), self.how, mission=mission), every
 
-        def in_fleet(match: re.Match[str]) -> str:
-            return re.sub(r"\d+", lambda number: str(every[int(number[0]) - 1] + 1), match[0])
-
-        words = _AGENTS.sub(in_fleet, failed[0].message) if failed else ""
-        return worst, ", ".join(dict.fromkeys(check.check for check in failed)), words
-
-    def way_with(
-        self, fault: str, size: float, who: Ints, stream: np.random.Generator
-    ) -> Piecewise:
+    def way_with(self, fault: GeometricFault) -> Piecewise:
         """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
+        kind, size, who, stream = fault
         pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._some(who), np.eye(2), 0.0
-        match fault:
+        match kind:
             case "late":
                 return flown.later(size)
             case "stale":
@@ -304,7 +314,7 @@ class Show:
                 source = (who + int(size)) % self.n
                 flown, by = self._some(source), pads[who] - pads[source]
             case "bias" | "shifted":
-                by = size * _heading(stream.uniform(0.0, _TURN, len(who) if fault == "bias" else 1))
+                by = size * _heading(stream.uniform(0.0, _TURN, len(who) if kind == "bias" else 1))
             case "rotated":
                 u, v = _heading(np.radians(size) * stream.choice([-1.0, 1.0]))[0]
                 turn = np.array([[v, u], [-u, v]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,14 +12,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES
+from rigidfleet._common.text import agent_names
+from rigidfleet.assessment import assess
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.plotting import encode_figure, write_files
 from rigidfleet.plotting import style as st
+from rigidfleet.plotting.areas import draw_from_above
 from rigidfleet.sweep.dataset import unit_and_meaning
 from rigidfleet.sweep.metrics import METRICS, readable_unit
 from rigidfleet.sweep.record import reason_in_words
+from rigidfleet.sweep.run import flight_of_fault
 from rigidfleet.sweep.store import Table
-from rigidfleet.sweep.summary import borne, drivers, failures, interval, outcomes, varied_numbers
+from rigidfleet.sweep.summary import (
+    Borne,
+    borne,
+    drivers,
+    failures,
+    interval,
+    outcomes,
+    varied_numbers,
+)
 from rigidfleet.sweep.variation import Geomspace, LogUniform
 from rigidfleet.typing import Floats, Ints
 
@@ -43,6 +56,9 @@ _CELLS = 10
 _VALUES = 20
 #: Maximum number of varied numbers in the figure of drivers.
 _ROWS = 14
+#: How long before a failure the ways of those concerned are drawn [s], and the least half side of their map [m].
+_WAY, _NEAR = 4.0, 3.0
+_BOTH = np.array([-1.0, 1.0])
 #: Ratio of the largest to the smallest value beyond which an axis is logarithmic.
 _LOGARITHMIC = 100.0
 
@@ -80,7 +96,7 @@ def plot(
         "map": partial(map_over_two, over=over, metric=metric),
     }
     if table.sweep.drill is not None:
-        draw = {"drill": shares}
+        draw = {"drill": shares, "worst": worst_runs}
     files = []
     for name, drawn in draw.items():
         with st.settings(), st.figure_options(titles=titles):
@@ -149,6 +165,49 @@ def shares(table: Table) -> Figure | None:
     fig.supxlabel("magnitude, and to how many vehicles", fontsize=8)
     _draw_key(fig, table)
     return fig
+
+
+def worst_runs(table: Table) -> Figure | None:
+    """Of each fault that fails, the worst run from above: whom it concerns when it fails, and their ways until then."""
+    failed = [case for case in borne(table) if case.worst]
+    worst = {
+        name: min((x for x in failed if x.fault == name), key=lambda x: x.separation or 0.0)
+        for name in dict.fromkeys(case.fault for case in failed)
+    }
+    if not worst:
+        return None
+    fig, axes = _small_axes(
+        table, "The worst of each fault from above [m]: ways into it", list(worst), 2.4
+    )
+    for case, ax in zip(worst.values(), axes, strict=True):
+        _draw_worst(ax, table, case)
+    return fig
+
+
+def _draw_worst(ax: Axes, table: Table, case: Borne) -> None:
+    """Draw the worst run of a fault: vehicles when it fails, those concerned with their ways until then."""
+    assert case.worst is not None
+    result, every = flight_of_fault(table.sweep, case.worst.run)
+    failure = next(check for check in assess(result).checks if not check.passed)
+    end = result.time[-1] if failure.when is None else failure.when
+    now = int(np.searchsorted(result.time, end - 1e-9).clip(0, len(result.time) - 1))
+    since = int(np.searchsorted(result.time, end - _WAY))
+    who = [int(x) - 1 for x in re.findall(r"\d+", failure.who.partition(",")[0])]
+    xy = result.position[..., :2]
+    draw_from_above(ax, table.sweep.mission)
+    ax.plot(*xy[now].T, ".", color=PASSED, markersize=3)
+    for i in who:
+        ax.plot(*xy[since : now + 1, i].T, color=FAILED, linewidth=1.0)
+        ax.plot(*xy[now, i], "o", color=FAILED, markersize=3.5)
+    shown = xy[since : now + 1, who] if who else xy[now : now + 1]
+    middle = shown[-1].mean(axis=0)
+    half = max(_NEAR, 1.1 * float(np.abs(shown - middle).max()))
+    ax.set(xlim=middle[0] + half * _BOTH, ylim=middle[1] + half * _BOTH, box_aspect=1.0)
+    ax.set_title(
+        f"{case.fault} {case.magnitude:g} {readable_unit(case.unit)}", loc="left", fontsize=8.5
+    )
+    names = agent_names(every[who].tolist()) if who else failure.name
+    ax.set_xlabel(f"{names}, {end:.1f} s", fontsize=7.5)
 
 
 def histograms(table: Table) -> Figure | None:
@@ -322,11 +381,13 @@ def _titled_figure(table: Table, title: str, wide: float, high: float) -> Figure
     return fig
 
 
-def _small_axes(table: Table, title: str, names: Sequence[str]) -> tuple[Figure, list[Axes]]:
-    """Figure with small axes, one for each metric."""
+def _small_axes(
+    table: Table, title: str, names: Sequence[str], high: float = 1.75
+) -> tuple[Figure, list[Axes]]:
+    """Figure with small axes, one for each metric, in rows of a height [in]."""
     columns = min(_COLUMNS, max(2, len(names)))
     rows = -(-len(names) // columns)
-    fig = _titled_figure(table, title, st.WIDTH, 0.9 + 1.75 * rows)
+    fig = _titled_figure(table, title, st.WIDTH, 0.9 + high * rows)
     axes = fig.subplots(rows, columns, squeeze=False).ravel().tolist()
     for ax in axes[len(names) :]:
         ax.set_visible(False)

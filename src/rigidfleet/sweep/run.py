@@ -7,12 +7,15 @@ from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rigidfleet.errors import FlightError, MissionError
 from rigidfleet.mission import Mission
 from rigidfleet.sweep import faults
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS, measure
 from rigidfleet.sweep.record import BROKEN, RAISED, RunRecord, refusal
+from rigidfleet.typing import Ints
 
 if TYPE_CHECKING:
     from rigidfleet.result import Result
@@ -43,13 +46,28 @@ def fly_runs(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
 
 def _record_fault(sweep: Sweep, run: int) -> RunRecord:
     """Judge a geometric fault of a drill."""
-    show = faults.show_of(sweep.mission.text, sweep.header.drill or faults.Drill())
+    show, fault = _show_and_fault(sweep, run)
     begun = perf_counter()
-    fault, size, count = values = sweep.values(run)
+    outcome = _value_or_error(lambda: show.outcome(fault))
+    return _record(sweep, run, sweep.values(run), outcome, begun)
+
+
+def _show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults.GeometricFault]:
+    """The show of a drill, and the geometric fault of a run."""
+    assert sweep.drill is not None
+    show, (kind, size, count) = faults.show_of(sweep.mission.text, sweep.drill), sweep.values(run)
     who = faults.some_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
-    stream = faults.stream_of(sweep.seed, run, 2)
-    outcome = _value_or_error(lambda: show.outcome(fault, size, who, stream))
-    return _record(sweep, run, values, outcome, begun)
+    return show, faults.GeometricFault(kind, size, who, faults.stream_of(sweep.seed, run, 2))
+
+
+def flight_of_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
+    """The flight of a run of a drill again, and which vehicles (M,) it has."""
+    from rigidfleet.simulation.flight import simulate
+
+    if sweep.values(run)[0] in faults.FLOWN:
+        return simulate(sweep.mission_of(run)), np.arange(sweep.mission.n_agents)
+    show, fault = _show_and_fault(sweep, run)
+    return show.flight(fault)
 
 
 def _fly(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
