@@ -128,12 +128,13 @@ class GainsCheck:
         """Stability, and what a step of 1 cm in the error of an edge causes."""
         if not self.stabilised:
             return table_of([{"gains": "no feedback: stabilisation = 'none'"}])
-        name, force = max(self.force.items(), key=lambda item: item[1], default=("", math.nan))
+        name, force = max(self.force.items(), key=lambda item: item[1], default=("", None))
         row = {
             "gains": "stable", "margin": self.margin, "settles in [s]": self.settling_time,
-            "overshoot [%]": self.overshoot and 100 * self.overshoot, "force of 1 cm [N]": force / 100, "in": name,
+            "overshoot [%]": self.overshoot and 100 * self.overshoot, "force of 1 cm [N]": force and force / 100,
+            "in": name,
         }  # fmt: skip
-        return table_of([row if name else {k: row[k] for k in [*row][:4]}], ("in",))
+        return table_of([row], ("in",))
 
 
 @dataclass(frozen=True)
@@ -396,10 +397,10 @@ class Preflight(Shown):
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
         for table in self._tables():
-            columns = [("", ""), *(("", "") if table.bare else (n, u) for n, u, _ in table.columns)]
+            heads = [("", "") if table.bare else (x, unit) for x, unit, _ in table.columns[1:]]
             for heading, *texts in table.texts:
-                parts = zip(columns[2:], texts, strict=True)
-                yield heading, ", ".join(f"{n} {x} {u}".strip() for (n, u), x in parts if x)
+                cells = zip(heads, texts, strict=True)
+                yield heading, ", ".join(f"{x} {y} {unit}".strip() for (x, unit), y in cells if y)
 
     def _tables(self) -> list[FactTable]:
         """Formations and laws, what is said of them in words, and the planned paths."""
