@@ -211,6 +211,28 @@ def test_numbers_are_drawn_by_the_seed(kind):
     assert (drawn(1) != drawn(2)).any()
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [(f"network.{key}", value) for key, value in {
+        "rate": 25.0, "delay": 0.03, "jitter": 0.01, "loss": 0.2, "burst": 4.0, "range": 9.0, "budget": 300.0,
+        "silence": 0.4, "event": 0.01, "seed": 7, "outages[1].start": 1.5, "outages[1].end": 2.5, "lost[1].time": 6.0,
+    }.items()],
+)  # fmt: skip
+def test_sweeps_vary_numbers_of_the_network(key, value):
+    """Each number of [network] can be varied."""
+    m = mission(
+        {
+            "loss": 0.1, "burst": 2.0, "range": 20.0, "budget": 400.0, "event": 0.001,
+            "outages": [{"start": 1.0, "end": 2.0}], "lost": [{"between": [1, 2], "time": 5.0}],
+        }
+    )  # fmt: skip
+    varied = Sweep.of(m, [f"{key} = grid({value})"]).mission_of(0).to_dict()
+    name, _, rest = key.removeprefix("network.").partition("[1].")
+    here = varied["network"][name]
+    assert (here[0][rest] if rest else here) == value
+    assert varied != m.to_dict()
+
+
 def test_sweeps_vary_numbers_of_clocks():
     """Each number of [network.clocks] and of a stuck vehicle can be varied."""
     stuck = [{"agent": 2, "time": 1.0, "duration": 1.0}]

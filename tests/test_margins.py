@@ -20,7 +20,10 @@ from rigidfleet.math.margins import (
     tracking_loops,
 )
 from rigidfleet.physics import constraint_force
+from rigidfleet.planning.preview import preview
+from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.check import check
+from rigidfleet.preflight.margins import formation_laws
 
 TRIANGLE = 4 / math.sqrt(3) * np.array(
     [[math.cos(t), math.sin(t), 0.0] for t in np.deg2rad([90, 210, 330])]
@@ -138,15 +141,24 @@ def test_margins_are_those_of_python_control(lag, delay, constrained):
     assert found.delay == pytest.approx(min(np.deg2rad(phases % 360) / at), rel=1e-4)
 
 
+def test_a_heading_is_no_other_shape():
+    """A cube that turns about the vertical for a quarter has the loops of one cube, not of each heading."""
+    m = rf.load_mission("cube-by-neighbours")
+    laws, _ = formation_laws(m, preview(m)[0], vehicle_lags(m))
+    assert [law.where for law in laws].count("'cube'") == 1
+
+
 def test_parts_are_the_whole():
     """The loci of the parts are all loci of the whole loop, made of the kernel's own share."""
     m = np.random.default_rng(1).uniform(0.5, 2.0, 8)
+    anyhow = np.random.default_rng(2).normal(0.0, 2.0, (8, 3))
     lags = [delayed(LIGHT, 0.02)] * 5 + [delayed(HEAVY, 0.05, 50.0)] * 3
     for r, some in (
         (CUBE, lags),
         (CUBE @ TURN, lags),
         (CUBE, lags[:1] * 8),
         (CUBE @ TURN, lags[:1] * 8),
+        (anyhow, lags[:1] * 8),
     ):
         law, edges = LoopGains(), complete_graph(8)
         S = weighted_share(r, edges, m)

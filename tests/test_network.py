@@ -17,7 +17,7 @@ from rigidfleet.kernel.records import FINISHED
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import plan_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.vehicles import network_of, sampled_flight
+from rigidfleet.planning.vehicles import TickTables, YawTurn, network_of, sampled_flight
 from rigidfleet.plotting.messages import oldest_messages
 from rigidfleet.typing import Floats
 from rigidfleet.web.live.session import Session
@@ -31,6 +31,10 @@ EDGES = [
     [1, 2], [1, 4], [1, 5], [1, 6], [2, 3], [2, 4], [2, 6], [2, 7], [3, 4], [3, 7], [3, 8], [4, 5], [4, 8], [5, 6],
     [5, 8], [6, 7], [6, 8], [7, 8],
 ]  # fmt: skip
+
+
+#: Vehicles that keep the yaw that they start with.
+TURN = YawTurn(0.0, np.zeros(8), np.zeros(8))
 
 
 def mission(
@@ -123,6 +127,25 @@ def test_no_vehicle_reads_another_ones_state(network):
         assert alone.force[i].tobytes() == expected.force[i].tobytes()
 
 
+def test_vehicles_go_by_what_they_measured():
+    """Where measurements are a tick old, forces are to the bit the same wherever the vehicles truly are by now."""
+    late = {"noise": {"delay": 0.02, "rate": 50.0, "position": 0.01, "velocity": 0.02, "seed": 1}}
+    problem, work, flight, state = laid_out(mission({"delay": 0.04}, disturbances=late))
+    flight = flight._replace(
+        tables=TickTables(mission({}, disturbances=late), flight).tables_for(0, 100, problem, TURN)
+    )
+    fly(problem, work, flight, state, 40)
+    moved = deepcopy(state)
+    moved.S[:, :6] += np.random.default_rng(2).normal(0.0, 1.0, (8, 6))
+    for each in (state, moved):
+        fly(problem, work, flight, each, 1)
+    assert np.linalg.norm(state.f_C, axis=1).min() > 1e-4
+    assert moved.force.tobytes() == state.force.tobytes()
+    fly(problem, work, flight, state, 1)
+    fly(problem, work, flight, moved, 1)
+    assert moved.force.tobytes() != state.force.tobytes()
+
+
 def central_force(problem: Any, work: Any, state: Any, t: float) -> Floats:
     """Constraint forces (N, 3) of the law that knows all states."""
     S = state.S
@@ -159,13 +182,13 @@ def test_the_exact_law_is_that_of_all_edges(seed):
     np.testing.assert_allclose(by_neighbours, central, rtol=0, atol=1e-9 * np.abs(central).max())
 
 
-@pytest.mark.parametrize("shape", ["cube", "line", "plane"])
+@pytest.mark.parametrize("shape", ["cube", "complete", "line", "plane"])
 def test_the_default_law_is_that_of_all_edges(shape):
-    """Also with redundant edges, and on a line and in a plane, where the exact law has no force."""
+    """Also with ten redundant edges, and on a line and in a plane, where the exact law has no force."""
     slots, edges = CUBE, EDGES
     if shape != "cube":
-        slots = CUBE[:4] if shape == "plane" else np.arange(4.0)[:, None] * [3.0, 0, 0]
-        edges = [[i, j] for j in range(2, 5) for i in range(1, j)]
+        slots = {"line": np.arange(4.0)[:, None] * [3.0, 0, 0], "plane": CUBE[:4]}.get(shape, CUBE)
+        edges = [[i, j] for j in range(2, len(slots) + 1) for i in range(1, j)]
     off = np.random.default_rng(5).normal(0, 0.05, slots.shape)
     m = mission(
         {},
@@ -198,6 +221,17 @@ def test_messages_arrive_as_sent():
     under_way = sent - heard - lost
     assert under_way.min() >= 0
     assert under_way.max() <= (net.delay + net.jitter) // net.every + 1
+
+
+def test_nobody_hears_beyond_the_range():
+    """All that is sent along the diagonals of the faces (5.7 m) is lost, along the sides (4 m) nothing."""
+    problem, work, flight, state = laid_out(mission({"range": 4.9}), CUBE + [0, 0, 20])
+    fly(problem, work, flight, state, 20)
+    i, j = flight.network.links.T
+    sent, _, lost = state.mail.count
+    share = np.where(np.linalg.norm(CUBE[i] - CUBE[j], axis=1) > 4.9, 1.0, 0.0)
+    np.testing.assert_array_equal(lost, share * sent)
+    assert 0.0 < share.mean() < 1.0
 
 
 def test_losses_come_as_often_and_in_bursts_as_long_as_they_say():
@@ -312,6 +346,9 @@ def test_a_result_with_links_of_before_loads(tmp_path):
     result.save(file)
     assert rf.Result.load(file).mission.network == m.network
     with pytest.raises(MissionError, match=r"it is now called '\[network\]'"):
+        rf.Mission.from_dict(data)
+    data["network"] = data["disturbances"].pop("links")
+    with pytest.raises(MissionError, match=r"network.dropped = 0.3: .*\n *it is now called 'loss'"):
         rf.Mission.from_dict(data)
 
 

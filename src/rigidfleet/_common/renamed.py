@@ -22,6 +22,7 @@ RENAMED: dict[str | tuple[str, str], str] = {
     "judged": "evaluate",
     "--ends": "--final-states",
     "links": "[network]",
+    "dropped": "loss",
 }
 
 

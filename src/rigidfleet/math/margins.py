@@ -271,11 +271,10 @@ def formation_loops(
     channels = tuple(dict.fromkeys(kinds))
     P = np.stack([np.diag([float(kind == channel) for kind in kinds]) for channel in channels])
     parts = [S, Q, *P]
-    basis = np.eye(3 * n)
     if law.control == "open":
         # Nothing feeds rigid motions back, and deformations do not depend on them.
         basis = np.linalg.svd(Q)[0][:, rigid.shape[1] :]
-    parts = [basis.T @ part @ basis for part in parts]
+        parts = [basis.T @ part @ basis for part in parts]
     loops = []
     acting = [k for k in range(len(parts)) if k != 1 or law.control != "tracking"]
     for V in _invariant([parts[k] for k in acting]):
@@ -301,14 +300,10 @@ def shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     J = jacobian(r, edges) * np.repeat(np.sqrt(m.mean() / m), 3)
     w, V = np.linalg.eigh(J.T @ J)
     w[w < _SINGULAR * w[-1]] = 0.0
-    sigma = filter_factors(
-        w,
-        law.solver,
-        damping=law.damping,
-        iterations=law.iterations,
-        threshold=law.threshold,
-        cutoff=law.cutoff,
-    )
+    options = {
+        name: getattr(law, name) for name in ("damping", "iterations", "threshold", "cutoff")
+    }
+    sigma = filter_factors(w, law.solver, **options)
     sigma[sigma < _NO_SHARE] = 0.0
     some = sigma > 0
     sigma[some] = np.exp(np.round(np.log(sigma[some]) / _ALIKE) * _ALIKE)
@@ -323,27 +318,40 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     doi:10.1007/s13160-010-0006-9).
     """
     random = np.random.default_rng(0).uniform(1.0, 2.0, len(matrices))
-    X = sum(c * A for c, A in zip(random, matrices, strict=True))
-    n = len(X)
-    done, bases = np.zeros((n, 0)), {}
-    for v in np.linalg.eigh(X)[1].T:
-        rest = v - done @ (done.T @ v)
-        size = np.linalg.norm(rest)
-        if size < 1e-3:
-            continue
-        V = (rest / size)[:, None]
-        at = 0
-        while at < V.shape[1]:
-            for A in matrices:
-                y = A @ V[:, at]
-                for _ in range(2):  # once leaves rounding errors of the others' size
-                    y = y - V @ (V.T @ y) - done @ (done.T @ y)
-                if (size := np.linalg.norm(y)) > _ROUNDING:
-                    V = np.column_stack([V, y / size])
-            at += 1
-        done = np.column_stack([done, V])
-        bases.setdefault(tuple(np.round(np.linalg.eigvalsh(V.T @ X @ V), 6)), V)
+    w, V = np.linalg.eigh(sum(c * A for c, A in zip(random, matrices, strict=True)))
+    turned = np.stack([V.T @ A @ V for A in matrices])
+    turned[np.abs(turned) < _ROUNDING] = 0.0
+    bases: dict[tuple[float, ...], Floats] = {}
+    for own in _connected(turned.any(axis=0) | np.eye(len(w), dtype=np.bool_)):
+        done = np.zeros((len(own), 0))
+        for v in np.eye(len(own)):
+            rest = v - done @ (done.T @ v)
+            size = np.linalg.norm(rest)
+            if size < 1e-3:
+                continue
+            U = (rest / size)[:, None]
+            at = 0
+            while at < U.shape[1]:
+                for A in turned[:, own[:, None], own]:
+                    y = A @ U[:, at]
+                    for _ in range(2):  # once leaves rounding errors of the others' size
+                        y = y - U @ (U.T @ y) - done @ (done.T @ y)
+                    if (size := np.linalg.norm(y)) > _ROUNDING:
+                        U = np.column_stack([U, y / size])
+                at += 1
+            done = np.column_stack([done, U])
+            bases.setdefault(
+                tuple(np.round(np.linalg.eigvalsh((U.T * w[own]) @ U), 6)), V[:, own] @ U
+            )
     return list(bases.values())
+
+
+def _connected(joined: Bools) -> list[Ints]:
+    """Sets of what is joined (n, n), each also with itself, directly or through others."""
+    first = np.arange(len(joined))
+    while ((least := np.where(joined, first, len(joined)).min(axis=1)) < first).any():
+        first = least
+    return [np.flatnonzero(first == k) for k in np.unique(first)]
 
 
 def is_stable(loops: Sequence[Loop], law: LoopGains, growth: float = GROWTH) -> bool:
@@ -484,13 +492,17 @@ def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
 
 def _follow(loci: Complexes) -> Complexes:
     """Logarithms (K, n), reordered and unwrapped so that each column is continuous."""
-    from scipy.optimize import linear_sum_assignment
-
     if loci.shape[1] > 1:
         for k in range(1, len(loci)):
             gap = loci[k][None, :] - loci[k - 1][:, None]
             turned = (gap.imag + math.pi) % (2 * math.pi) - math.pi
-            loci[k] = loci[k][linear_sum_assignment(np.hypot(gap.real, turned))[1]]
+            order: list[int] = []
+            for distance in np.hypot(
+                gap.real, turned
+            ):  # each goes on with the nearest that is left
+                distance[order] = math.inf
+                order.append(int(distance.argmin()))
+            loci[k] = loci[k][order]
     return loci.real + 1j * np.unwrap(loci.imag, axis=0)
 
 

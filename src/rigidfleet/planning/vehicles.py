@@ -73,17 +73,13 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
         np.full((n, 3), mission.tracking.integral),
     )
     around = disturbance(mission)
+    same = ("wind", "gust_step", "gust", "floor", "radius", "roofs")
     air = flight.air._replace(
-        wind=around.wind,
-        gust_step=around.gust_step,
-        gust=around.gust,
+        **{name: getattr(around, name) for name in same},
         downwash=d is not None and d.downwash,
         ground_effect=d is not None and d.ground_effect,
         density=DENSITY,
         ground=mission.ground,
-        floor=around.floor,
-        radius=around.radius,
-        roofs=around.roofs,
     )
     return flight._replace(
         air=air, guidance=guidance, sensing=_sensing(mission), network=network_of(mission),

@@ -213,10 +213,11 @@ class LinearFlight:
                 z.commanded -= law.ki * z.error
             a = z.commanded + z.gust
             pace, change = other @ v, other @ a
-            sent[k % len(sent)] = [
+            news = (
                 integral - integral[self.back], (1.0 - FRESH) * nearer - other @ r, (1.0 - FRESH) * faster - pace,
                 (1.0 - FRESH) * (own @ a) - change, pace, change, other @ put, *rest,
-            ]  # fmt: skip
+            )  # fmt: skip
+            np.stack(news, out=sent[k % len(sent)])
             motion = np.concatenate([z.orders, z.commanded[None]])
             if len(z.seen):
                 z.seen[1:] = z.seen[:-1].copy()

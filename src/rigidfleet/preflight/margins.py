@@ -114,21 +114,12 @@ def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGai
     c = mission.constraint
     k1, k2 = mission.tracking_gains
     on = float(c.stabilisation == "pid")
+    law = {key: getattr(c, key) for key in ("solver", "iterations", "threshold", "cutoff")}
+    law |= {key: on * getattr(c, key) for key in ("alpha", "beta", "gamma")}
     return LoopGains(
-        ki=mission.tracking.integral,
-        alpha=on * c.alpha,
-        beta=on * c.beta,
-        gamma=on * c.gamma,
-        k1=k1,
-        k2=k2,
-        control="tracking" if phase is None else phase.control,
-        k_def=c.deformation_damping,
-        solver=c.solver,
-        damping=mission.damping(held),
-        iterations=c.iterations,
-        threshold=c.threshold,
-        cutoff=c.cutoff,
-    )
+        **law, k1=k1, k2=k2, ki=mission.tracking.integral, k_def=c.deformation_damping,
+        control="tracking" if phase is None else phase.control, damping=mission.damping(held),
+    )  # fmt: skip
 
 
 def _changes_shape(planned: PlannedPhase) -> bool:
@@ -156,7 +147,7 @@ def _seen_from_above(r: Floats) -> tuple[bytes, bytes]:
     """What the loop depends on: all but place and heading, to a millimetre or so."""
     x = r - r.mean(axis=0)
     across = x[:, :2] @ x[:, :2].T
-    size = max(float(np.abs(x).max()), 1e-9)
+    size = max(float(np.linalg.norm(x, axis=1).max()), 1e-9)
     rounded = (
         np.round(part / scale, 3) + 0.0 for part, scale in ((across, size**2), (x[:, 2], size))
     )

@@ -64,7 +64,7 @@ def check_network(
     checks: dict[str, FormationNetwork] = {}
     for name, flight, unheard in linear_flights(mission, way, lags):
         check = _formation_network(mission, flight, unheard)
-        checks[name] = check if name not in checks else checks[name].lesser(check)
+        checks[name] = check.lesser(checks.get(name, check))
     return checks
 
 
@@ -183,7 +183,7 @@ def mean_square_growth(
     delay, every = flight.radio.delay, flight.radio.every
     kept = np.repeat(1.0 - losses, states)
     spread = np.sqrt(kept * (1.0 - kept))
-    block = np.arange(len(losses))[:, None] * states
+    block = np.arange(len(flight.links) * len(losses)).reshape(-1, len(losses), 1) * states
 
     def arrive(k: int, news: Callable[[int], Floats]) -> Floats | float:
         if (k - delay) % every:
@@ -192,9 +192,9 @@ def mean_square_growth(
         # Of which other state each link has its noise: a rotation of those with the same loss. One rotation for all
         # links would draw the states together.
         turn = (np.arange(states) + rng.integers(0, states, (len(flight.links), 1, 1))) % states
-        other = np.take_along_axis(change, (block + turn).reshape(1, len(turn), -1), axis=2)
+        other = np.take(change.reshape(len(change), -1), (block + turn).ravel(), axis=1)
         sign = rng.integers(0, 2, (len(turn), len(kept))) * 2.0 - 1.0
-        return kept * change + spread * sign * other
+        return kept * change + spread * sign * other.reshape(change.shape)
 
     squares = _squares_flown(flight, delay, len(kept), time, arrive)
     return growth_of(squares.reshape(len(squares), len(losses), states).mean(axis=2), time)

@@ -86,23 +86,20 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
         self.neighbours = [x.tolist() for x in np.split(net.links[:, 1], net.first[1:-1])]
         self.width = _NEIGHBOUR + numbers
         self.size = _SELF + max(map(len, self.neighbours)) * self.width
-        self.observation_spaces = {
-            name: Box(-np.inf, np.inf, (self.size,), np.float32) for name in self.possible_agents
-        }
-        self.action_spaces = {
-            name: Box(-1.0, 1.0, (3 + numbers,), np.float32) for name in self.possible_agents
-        }
+        #: Spaces of an observation and of an action, those of all agents.
+        self.seen = Box(-np.inf, np.inf, (self.size,), np.float32)
+        self.acts = Box(-1.0, 1.0, (3 + numbers,), np.float32)
         self.silence = np.zeros(numbers)
         self.rng = np.random.default_rng()
         self._actions: dict[str, Vector] = {}
 
     def observation_space(self, agent: str) -> Space[Vector]:
         """The space of observations of an agent."""
-        return self.observation_spaces[agent]
+        return self.seen
 
     def action_space(self, agent: str) -> Space[Vector]:
         """The space of actions of an agent."""
-        return self.action_spaces[agent]
+        return self.acts
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None

@@ -121,7 +121,7 @@ class OwnLaws:
                 raise FlightError(what) from error
             try:
                 state.f_u[i], said[i], numbers = _answer_of(answer)
-            except _AnswerError as unfit:
+            except ValueError as unfit:
                 what, remedy = unfit.args
                 what = f"the law of agent {i + 1} returned {what} {where}: {remedy}"
                 raise FlightError(what) from None
@@ -130,12 +130,17 @@ class OwnLaws:
         self.said.append(said)
         state.count[ANSWERED] = k + 1
 
+    def has_views(self, problem: Problem, state: SampledState) -> bool:
+        """Whether the views last made are those of the tick that comes."""
+        last = self.last
+        return last is not None and last[0] == state.count[TICKS] and last[1] is problem
+
     def views(
         self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
     ) -> list[View | None]:
         """What each vehicle knows at the tick that comes, as the kernel has it ready; None for those that are lost."""
         k, mail = int(state.count[TICKS]), state.mail
-        if self.last is not None and self.last[0] == k and self.last[1] is problem:
+        if self.last is not None and self.has_views(problem, state):
             return self.last[2]
         t, dt, g = k * self.tick, self.every * self.tick, problem.vehicles.g
         has_heard = mail.stamp >= 0
@@ -169,33 +174,35 @@ class OwnLaws:
         return views
 
 
-class _AnswerError(Exception):
-    """What a law returned cannot be flown: what it was, and the remedy."""
-
-
 def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
-    """Force (3,) [N] of what a law returned, a copy of its message, and how many numbers that has."""
+    """Force (3,) [N] of what a law returned, a copy of its message, and how many numbers that has.
+
+    Raises
+    ------
+    ValueError
+        It cannot be flown: what it is, and the remedy.
+    """
     try:
         force, message = answer
     except (TypeError, ValueError):
-        raise _AnswerError(repr(answer), "return a force (3,) [N] and a message") from None
+        raise ValueError(repr(answer), "return a force (3,) [N] and a message") from None
     try:
         f = np.array(force)
     except (TypeError, ValueError):
         f = np.array(None)
     if f.dtype.kind not in "biuf":
-        raise _AnswerError(f"the force {force!r}", _FORCE)
+        raise ValueError(f"the force {force!r}", _FORCE)
     if f.shape != (3,):
-        raise _AnswerError(f"a force of shape {f.shape}", _FORCE)
+        raise ValueError(f"a force of shape {f.shape}", _FORCE)
     if not all(map(math.isfinite, f.tolist())):
-        raise _AnswerError("a force that is not finite", f.tolist())
+        raise ValueError("a force that is not finite", f.tolist())
     try:
         return f, *((None, 0) if message is None else plain_copy(message))
     except TypeError as error:
         remedy = (
             f"it contains {error}; send numbers, arrays, tuples or dictionaries of these, or None"
         )
-        raise _AnswerError("a message that cannot be sent", remedy) from None
+        raise ValueError("a message that cannot be sent", remedy) from None
 
 
 def plain_copy(x: Any) -> tuple[Any, int]:

@@ -151,9 +151,8 @@ class SampledPhase(Stepper):
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
-        lose = (
-            self.first_tick is not None
-        )  # edges that end within a phase are those of what is lost
+        # Edges that end within a phase are those of what is lost.
+        lose = self.first_tick is not None
         assign_edges(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
@@ -331,12 +330,13 @@ class SampledPhase(Stepper):
         self.flown = problem
         times = phase.times(t_end)
         phase.begun, arrays = True, self.vehicles.avoidance
-        network = self.vehicles.flight.network
-        self.flight = self.flight._replace(network=network)
-        links = len(network.links)
-        call = fleet.segment(n, m, t_end, times, _STEPS, links=links)
+        network, laws = self.vehicles.flight.network, self.vehicles.laws
+        if network is not self.flight.network:
+            self.flight = self.flight._replace(network=network)
+        call = fleet.segment(n, m, t_end, times, _STEPS, links=len(network.links))
         sampled.count[fleet.SAMPLES] = 0
-        status, laws = records.PAUSED, self.vehicles.laws
+        looked = laws is not None and laws.has_views(problem, sampled)
+        status = records.ASKS if looked else records.PAUSED
         try:
             while status in (records.PAUSED, records.ASKS):
                 if status == records.PAUSED:
