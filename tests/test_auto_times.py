@@ -193,5 +193,5 @@ def test_points_need_no_reserve():
 def test_a_check_prints_the_reserve():
     """A check of vehicles prints what automatic times leave."""
     found = check(vehicles("x500", [FLY]), search=False)
-    assert dict(found.describe())["reserve"].startswith("automatic times leave 0.065 s")
+    assert dict(found.describe())["reserve of automatic times"].startswith("worst 0.065")
     assert found.data()["reserve_s"] == pytest.approx(0.065, abs=5e-4)

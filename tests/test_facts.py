@@ -193,18 +193,27 @@ def test_a_check_shows_what_its_json_holds(name):
     data = json.loads(json.dumps(ahead.data(), allow_nan=False))
     words = plain(printed(ahead))
     paths, vehicles = data["paths"], data["vehicles"] or {}
+    proof = min(paths["certificates"], key=lambda c: c["separation_m"], default=None)
     worst: list[tuple[str, str, Any, str]] = [
         ("separation", "m", paths["separation"], "separation_m"),
         ("speed", "m/s", paths["speed"], "speed_m_s"),
         ("vertical speed", "m/s", paths["vertical_speed"], "speed_m_s"),
         ("thrust", "N", paths["thrust"], "thrust_n"),
+        ("separation, proved", "m", proof, "separation_m"),
         ("rotor force", "N", vehicles.get("rotor_force"), "force_n"),
         ("tilt", "deg", vehicles.get("tilt"), "tilt_deg"),
+        ("thrust, disturbed", "N", (data["disturbances"] or {}).get("thrust"), "thrust_n"),
+        *(("width of a gap", "m", g, "wide_m") for g in paths["gaps"]),
         *(("clearance", "m", c, "clearance_m") for c in paths["clearance"]),
     ]  # fmt: skip
     tables = [part for part in ahead.facts().shown if isinstance(part, FactTable)]
-    rows = rows_of(next(table for table in tables if table.heads[0] == "planned").html())
-    rows = [row for row in rows[1:] if not row.startswith("spacing")]
+    every = rows_of(next(table for table in tables if table.heads[0] == "planned").html())
+    rows = [row for row in every[1:] if not row.startswith(("spacing", "reserve", "force of"))]
+    forces = [v for k, v in (data["disturbances"] or {}).items() if k.endswith("_n") and v > 0]
+    alone = {"reserve of automatic times": [data["reserve_s"]], "force of": forces}
+    for what, values in alone.items():
+        shown = [row.removeprefix(what).split()[-2] for row in every if row.startswith(what)]
+        assert all(near(x, y) for x, y in zip(shown, filter(None, values), strict=True)), what
     wanted = [x for x in worst if x[2] is not None]
     assert len(rows) == len(wanted)
     for row, (what, unit, entry, key) in zip(rows, wanted, strict=True):
@@ -214,17 +223,52 @@ def test_a_check_shows_what_its_json_holds(name):
         assert match, row
         assert near(match[1], entry[key])
         assert float(match[3]) == pytest.approx(entry["time_s"], abs=0.006)
-        assert match[4].startswith(entry["who"])
-        if entry.get("limit_n") is not None:
-            assert near(match[2], entry["limit_n"])
+        agents = " and ".join(map(str, entry.get("agents", ())))
+        assert match[4].startswith(entry.get("who") or entry.get("between") or f"agents {agents},")
+        limit = entry.get("limit_n", entry.get("takes_m"))
+        assert limit is None or near(match[2], limit)
     assert all(
         f"{r['level']} {plain(r['text'])}" in words or plain(r["text"]) in words
         for r in data["remarks"]
     )
-    for form, judged in data["formations"].items():
-        if (r := judged["rigidity"]) is not None and name != "show":
-            assert f"{form} {r['rigidity_class']}" in words
-            assert f"{r['edges']} edges, rank {r['rank']} of {r['needed']}" in words
+    shown = numbers_shown(ahead)
+    wanted = numbers_wanted(data, name == "show")
+    assert shown.keys() == wanted.keys()
+    for key, values in wanted.items():
+        assert all(near(x, y) for x, y in zip(shown[key], values, strict=True)), key
+
+
+def numbers_shown(ahead: Any) -> dict[tuple[str, str], list[str]]:
+    """Numbers in the tables of a check but for worst values: by table and row, in the order of the columns."""
+    shown = {}
+    for table in ahead.facts().shown[1:]:
+        if isinstance(table, FactTable) and not table.bare and table.heads[0] != "planned":
+            for row, *cells in table.texts:
+                numbers = re.findall(r"(?<![\w.])[-\d.][\d.e+-]*", " ".join(cells))
+                shown[table.heads[0], row] = numbers
+    return shown
+
+
+def numbers_wanted(data: Any, show: bool) -> dict[tuple[str, str], list[float]]:
+    """The same numbers as JSON has them, in the units of the columns."""
+    gains, wanted = data["gains"], {}
+    for form, judged in {} if show else data["formations"].items():
+        r = judged["rigidity"]
+        wanted["formation", form] = [r[k] for k in ("edges", "rank", "needed", "index", "w")] + [
+            1 / r["index"]
+        ]
+    if not show:
+        force = max(gains["force_per_error_n_m"].values()) / 100
+        numbers = [gains["margin"], gains["settling_time_s"], 100 * gains["overshoot"], force]
+        wanted["gains", "stable"] = numbers
+    margins: dict[str, Any] = data["margins"] or {"tracking": None, "formations": {}}
+    own = {"tracking": margins["tracking"]} if margins["tracking"] else {}
+    for where, m in (own | margins["formations"]).items():
+        numbers = [1e3 * m["delay_s"], m["phase_deg"], *m["gain"], m.get("largest_p")]
+        wanted["margins", where] = [x for x in numbers if x is not None]
+    for name, way in data["paths"]["assignments"].items():
+        wanted["assignment", name] = [way["path_length_m"], way["min_clearance_m"]]
+    return wanted
 
 
 @pytest.mark.usefixtures("quick")
@@ -249,7 +293,7 @@ def test_a_show_is_checked_for_what_concerns_it():
     assert re.search(r"speed \S+ m/s <= 6 m/s", words)
     assert re.search(r"vertical speed \S+ m/s <= 3 m/s", words)
     assert "ball 1 colour of lights" in words
-    assert "proved no two agents come nearer" in words
+    assert re.search(r"separation, proved \S+ m >= 0.5 m \S+ agents \d+ and \d+, '\w", words)
     heights = [planned.velocity[..., 2] for planned in ahead.planned_phases]
     assert ahead.vertical_speed is not None
     assert ahead.vertical_speed[0] == max(abs(v).max() for v in heights)

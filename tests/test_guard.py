@@ -2,6 +2,7 @@
 
 import math
 from itertools import combinations
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 from vehicle_samples import PAPER, begun
 
-from rigidfleet.kernel import fleet
+from rigidfleet.kernel import barriers, fleet
 from rigidfleet.kernel.avoidance import (
     BARRIER,
     BRAKE,
@@ -789,3 +790,70 @@ def test_hulls_of_quadrotors_keep_their_distance(seed):
         # The search of hulls ends after many steps, a little below.
         assert -0.1 <= a.margin[PAIR, 0] - min(of.kept.values()) + need <= 1e-6
     assert acted > 0
+
+
+def as_python(module: Any, *names: str) -> Any:
+    """The last of some functions of the kernel, as plain Python that calls the others."""
+    every = {name: getattr(module, name) for name in names}
+    space = dict(vars(module))
+    for name, function in every.items():
+        space[name] = FunctionType(getattr(function, "py_func", function).__code__, space)
+    return space[names[-1]]
+
+
+@pytest.mark.parametrize("ask", [(-1.0, 3.0), (-9.0, -8.0)])
+def test_sweeps_push_all_and_then_those_that_push_until_little_changes(ask):
+    """A sweep is projected over-relaxation of all rows of A, then of those that push and the edges, up to 8 times.
+
+    The oracle has A as a matrix, and no accelerations.
+    """
+    rng = np.random.default_rng(3)
+    n, count, m, mu = 6, 7, 3, 0.02
+    pairs = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (0, 3), (2, -1)]
+    edges = np.array([(0, 2), (1, 4), (3, 5)])
+    normals, u = (x / np.linalg.norm(x, axis=1)[:, None] for x in rng.normal(size=(2, count, 3)))
+    inverse = rng.uniform(0.3, 2.0, n)
+    J = np.zeros((count + m, n, 3))
+    for k, (i, j) in enumerate([*pairs, *edges.tolist()]):
+        J[k, i] = normals[k] if k < count else u[k - count]
+        J[k, j] -= J[k, i] if j >= 0 else 0.0
+    J = J.reshape(count + m, -1)
+    A = J @ (np.repeat(inverse, 3)[:, None] * J.T)
+    diagonal, missing = np.diag(A).copy(), rng.uniform(*ask, count)
+    mean, most = float(np.mean(1.0 / inverse)), np.full(count, 2.5)
+    problem = SimpleNamespace(
+        graph=SimpleNamespace(edges=edges, diagonal=diagonal[count:]),
+        law=SimpleNamespace(mu=mu),
+        vehicles=SimpleNamespace(mean=mean),
+    )
+    a = SimpleNamespace(
+        rows=np.array(pairs), normals=normals, shift=np.zeros((n, 3)), missing=missing, push=np.zeros(count),
+        reduced=1.0 / diagonal[:count], most=most, inverse=inverse, pushing=np.zeros(count, dtype=np.int64),
+        pull=np.zeros(m), hold=np.ones(n),
+    )  # fmt: skip
+    sweep = as_python(
+        barriers, "relative", "shove", "edge_softness", "relax", "relax_edges", "sweep"
+    )
+    x, right = np.r_[np.zeros(count), rng.normal(size=m)], np.r_[missing, np.zeros(m)]
+    a.pull[:], a.shift[:] = x[count:], (np.repeat(inverse, 3) * (x @ J)).reshape(n, 3)
+    A += np.diag([0.0] * count + [mu / mean] * m)
+    low, high = np.r_[np.zeros(count), np.full(m, -np.inf)], np.r_[most, np.full(m, np.inf)]
+
+    def relax(rows: Any) -> float:
+        change = 0.0
+        for k in rows:
+            new = np.clip(x[k] + 1.5 * (right[k] - A[k] @ x) / A[k, k], low[k], high[k])
+            change = max(change, abs(new - x[k]) * diagonal[k])
+            x[k] = new
+        return change
+
+    for _ in range(4):
+        took = sweep(count, problem, SimpleNamespace(u=u[:m]), a)
+        first = relax(range(count + m))
+        again = [*np.flatnonzero(x[:count] > 0.0), *range(count, count + m)]
+        for _ in range(8 if first >= 5e-5 else 0):
+            if relax(again) < 5e-5:
+                break
+        assert took == pytest.approx(first, rel=1e-9)
+        assert np.r_[a.push, a.pull] == pytest.approx(x, rel=1e-9, abs=1e-12)
+    assert np.count_nonzero(x[:count]) > 3 or ask[1] < 0.0

@@ -347,9 +347,9 @@ def test_check_tells_margins():
     found, remarks = told(mission, delayed(LIGHT, 0.02, 500.0))
     assert found.passed
     assert not remarks
-    words = [text for heading, text in found.describe() if heading == "margins"]
-    assert words[0].startswith("tracking: stable; bears")
-    assert any("'triangle' to 'line'" in text for text in words)
+    words = dict(found.describe())
+    assert words["tracking"].startswith("stable, more delay ")
+    assert words["'triangle' to 'line'"].startswith("stable, more delay ")
     law, slots = LoopGains(damping=0.03), mission.formation_slots("line")
     assert slots is not None
     alone = formation_loops(

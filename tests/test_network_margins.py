@@ -9,6 +9,7 @@ from oracles import FULL
 from test_network import CUBE, EDGES, fly, laid_out, mission
 
 import rigidfleet as rf
+from rigidfleet._common.facts import FactTable
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.mail import LOST, SENT
 from rigidfleet.math import pid
@@ -362,10 +363,12 @@ def checked(network: dict[str, Any], **tables: Any) -> rf.Preflight:
 def test_check_says_what_the_network_is_beside_what_is_borne():
     """Broadcasts a second, last stable delay, loss in mean square, and the mission's own; also as data."""
     cube = checked({"delay": 0.06, "loss": 0.3})
-    (words,) = (words for heading, words in cube.describe() if heading == "network")
-    assert "400 broadcasts a second" in words
-    assert "its own are 3 (60 ms)" in words
-    assert "its own are 30 %" in words
+    (table,) = (
+        x for x in cube.facts().shown if isinstance(x, FactTable) and x.heads[0] == "network"
+    )
+    (row,) = (dict(zip(table.heads, texts, strict=False)) for texts in table.texts)
+    assert (row["network"], row["broadcasts [/s]"]) == ("cube", "400")
+    assert (row["has [ms]"], row["has [%]"]) == ("60", "30")
     data = cube.data()["network"]["cube"]
     assert data["delay_ticks"] == last_stable_delay(linear_flight(cube.mission))
     assert data["own_delay_ticks"] == 3
@@ -417,4 +420,4 @@ def test_without_a_network_nothing_is_said():
     """Neither a row nor data."""
     cube = rf.check(mission(None), search=False)
     assert cube.network == {}
-    assert "network" not in dict(cube.describe())
+    assert "broadcasts" not in str([*cube.describe()])

@@ -390,14 +390,11 @@ def test_disturbances_and_their_thrust_are_told():
     assert d.offset[0] == pytest.approx(np.hypot(1.2 / m[0], 0.981) / 2)
     flown = simulate(disturbed)
     assert flown.thrust.max() < d.thrust[0] < 1.2 * flown.thrust.max()
-    told = dict(found.describe())["disturbances"]
-    for part in (
-        "steady wind up to 1.2 N",
-        "gusts (3 sigma) up to 0.6 N",
-        "maximum thrust",
-        "offset from its slot",
-    ):
-        assert part in told, part
+    facts = dict(found.describe())
+    assert facts["force of steady wind"] == "worst 1.2 N"
+    assert facts["force of gusts (3 sigma)"] == "worst 0.6 N"
+    assert facts["thrust, disturbed"].startswith(f"worst {d.thrust[0]:.3g} N")
+    assert facts["steady offset from a slot"].startswith(f"worst {d.offset[0]:.3g} m")
     assert any("no integral" in remark.text for remark in found.remarks)
     assert found.data()["disturbances"]["air_n"] == d.air
 
@@ -405,7 +402,7 @@ def test_disturbances_and_their_thrust_are_told():
 def test_losses_are_told_and_judged_as_if_flown_on():
     """A vehicle to be lost is named with its time, and a note says that its way is judged to the end."""
     found = check(mission(disturbances={"lost": [{"agent": 3, "time": 7.5}]}))
-    assert "agent 3 is lost at 7.5 s" in dict(found.describe())["disturbances"]
+    assert dict(found.describe())["loss"] == "at 7.50 s, who or where agent 3"
     assert any("as if agent 3 flew on" in remark.text for remark in found.remarks)
     assert found.passed
 
@@ -414,7 +411,7 @@ def test_calm_missions_tell_of_no_disturbances():
     """Without [disturbances] there is no line about them."""
     found = check(mission())
     assert found.disturbed is None
-    assert "disturbances" not in dict(found.describe())
+    assert "thrust, disturbed" not in dict(found.describe())
     assert found.data()["disturbances"] is None
 
 

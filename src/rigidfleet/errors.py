@@ -94,3 +94,21 @@ def wrong_type(expected: str, value: object) -> TypeError:
 
 def _short(text: str) -> str:
     return text if len(text) <= _WIDTH else text[: _WIDTH - 3] + "..."
+
+
+def refuse_format(
+    place: object, what: str, made: int, known: int, *, newer: str = "", older: str
+) -> None:
+    """Refuse a file of another format than the ``known`` one; ``newer`` and ``older`` are remedies.
+
+    Raises
+    ------
+    ResultError
+        The format is another one.
+    """
+    if made > known:
+        reads = f"this version of rigidfleet reads format {known}. Use a newer version{newer}."
+        raise ResultError(f"{place}: has {what} format {made}; {reads}")
+    if made < known:
+        by = f"an earlier version of rigidfleet ({what} format {made}); this version reads format {known}"
+        raise ResultError(f"{place}: was written by {by}. {older}.")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -240,6 +240,12 @@ class Fact(NamedTuple):
         return Row((self.name, worst, self.doubt, self.bound, when, self.who), self.level)
 
 
+def table_of(rows: Sequence[Mapping[str, Any]], words: Collection[str] = ()) -> FactTable:
+    """Table of things by the names of their quantities, of which each has its own."""
+    heads = [*dict.fromkeys(name for row in rows for name in row)]
+    return FactTable(heads, [Row([row.get(name) for name in heads]) for row in rows], words)
+
+
 def worst_values(what: str, facts: Iterable[Fact]) -> FactTable:
     """Table of worst values with their limits."""
     heads = (what, "worst", "true value", "limit", "at [s]", "who or where")
@@ -264,7 +270,7 @@ class Sheet:
         """What is printed: the head, and the parts with blank lines around tables."""
         from rich.text import Text
 
-        head = Text.assemble((self.name, "bold"), f": {self.title}")
+        head = Text.assemble((self.name, "bold"), f": {self.title}" * bool(self.title))
         begin: list[Any] = [head] if self.name else []
         blocks = [*begin]
         for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):

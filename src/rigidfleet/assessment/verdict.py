@@ -6,7 +6,16 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from rigidfleet._common.facts import FactTable, Level, Line, Row, Sheet, Shown, worst_values
+from rigidfleet._common.facts import (
+    FactTable,
+    Level,
+    Line,
+    Row,
+    Sheet,
+    Shown,
+    table_of,
+    worst_values,
+)
 from rigidfleet._common.plain import plain
 from rigidfleet._common.quantities import QUANTITIES, quantity
 from rigidfleet._common.text import all_hold
@@ -224,15 +233,9 @@ def _waypoint_table(phases: list[PhaseVerdict]) -> FactTable:
     rows = []
     for p in phases:
         points = [(f"{p.name}, point {k}", w) for k, w in enumerate(p.through, 1)]
-        points += [] if p.waypoint is None else [(p.name, p.waypoint)]
-        for name, w in points:
-            rows.append(Row((name, f"{w.time:.2f}", w.position, w.velocity, w.attitude, w.rates)))
-    heads = (
-        "waypoint, missed by",
-        "at [s]",
-        "position [m]",
-        "velocity [m/s]",
-        "attitude [deg]",
-        "rates [deg/s]",
-    )
-    return FactTable(heads, rows)
+        for name, w in points if p.waypoint is None else [*points, (p.name, p.waypoint)]:
+            rows.append({
+                "waypoint, missed by": name, "at [s]": f"{w.time:.2f}", "position [m]": w.position,
+                "velocity [m/s]": w.velocity, "attitude [deg]": w.attitude, "rates [deg/s]": w.rates,
+            })  # fmt: skip
+    return table_of(rows)

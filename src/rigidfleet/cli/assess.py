@@ -167,8 +167,8 @@ def assess(
     for part in verdict.read if explain and not json else ():
         for key, value in part.items():
             words = ", ".join(map(str, value)) if isinstance(value, list) else f"{value}"
-            line = f"{key.replace('_', ' ')}: {words}"
-            console.out().print(line, highlight=False, markup=False, soft_wrap=True)
+            if words:
+                console.out().print(f"{key.replace('_', ' ')}: {words}", soft_wrap=True)
     console.show_verdict(verdict, json=json)
     if made is not None:
         from rigidfleet.cli.report import write_report

@@ -210,7 +210,7 @@ def shove(i, j, n, force, a):
 
 
 @jit
-def softness(e, p, a):
+def edge_softness(e, p, a):
     """What an edge adds to its own diagonal of A: the law's damping, and more the less it holds."""
     i, j = p.graph.edges[e, 0], p.graph.edges[e, 1]
     hold = max(min(a.hold[i], a.hold[j]), _LOOSE)
@@ -241,7 +241,7 @@ def relax_edges(p, w, a):
         along = relative(i, j, n, a.shift)
         if along == 0.0 and a.pull[e] == 0.0:
             continue
-        soft, diagonal = softness(e, p, a), p.graph.diagonal[e]
+        soft, diagonal = edge_softness(e, p, a), p.graph.diagonal[e]
         pull = -_BEYOND * (along + soft * a.pull[e]) / (diagonal + soft)
         change = max(change, abs(pull) * diagonal)
         shove(i, j, n, pull, a)
@@ -315,7 +315,7 @@ def finish(count, p, w, a):
         if row < size:
             a.right[row] += a.missing[a.active[row]]
         else:
-            soft = softness(row - size, p, a)
+            soft = edge_softness(row - size, p, a)
             a.system[row, row] += soft
             a.right[row] -= soft * a.pull[row - size]
     if not cholesky(a.system[:whole, :whole]):

@@ -212,7 +212,7 @@ def distance_beyond_plane(piece, distance, x, y, z):
 
 
 @jit
-def touch_box(x, y, z, b, _, boxes):
+def tangent_of_box(x, y, z, b, _, boxes):
     """Signed distance of a point from box b, negative inside, and the normal of its tangent plane."""
     nx, ny, nz = box_normal(x, y, z, boxes[b])
     return from_box(x, y, z, boxes[b]), nx, ny, nz
@@ -250,16 +250,18 @@ def put_whole(curve, pieces):
 def nearest_box(curve, b, part, floor, pieces, boxes):
     """Least distance of a curve with control points (5, 3) from box b, if below ``floor``, and its place; else -1.
 
-    `obstacles` makes of this source the same for any solid, or a ``part`` of one, by a function beside `touch_box`.
+    `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `tangent_of_box`.
     """
     best, at, top, count, close = floor, -1.0, 0, 0, put_whole(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
-        distance, x, y, z = touch_box(piece[6], piece[7], piece[8], b, part, boxes)
+        distance, x, y, z = tangent_of_box(piece[6], piece[7], piece[8], b, part, boxes)
         bound = distance_beyond_plane(piece, distance, x, y, z)
         if bound < best - close:
             for k in (0, 12):
-                distance, _, _, _ = touch_box(piece[k], piece[k + 1], piece[k + 2], b, part, boxes)
+                distance, _, _, _ = tangent_of_box(
+                    piece[k], piece[k + 1], piece[k + 2], b, part, boxes
+                )
                 if distance < best:
                     best, at = distance, piece[15] + (piece[16] if k == 12 else 0.0)
         best, at, top = refine(bound, best, at, close, count, top, pieces)

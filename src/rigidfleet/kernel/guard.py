@@ -39,10 +39,10 @@ from rigidfleet.kernel.moving import (
     clearance_beside_moving,
     follow_flow,
     is_known,
-    look,
-    miss,
+    miss_distance,
     room_beside,
     stop_beside,
+    update_tracks,
     way_to_rest,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
@@ -108,7 +108,7 @@ def brake(i, v, a, out):
 
 
 @jit
-def take(i, far, a):
+def accept(i, far, a):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = a.trial
     a.far[i] = far
@@ -363,7 +363,7 @@ def set_floors(t, r, v, lost, a):
         for q in range(3):
             a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
-        take(i, max(predict(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+        accept(i, max(predict(i, r[i], v[i], acceleration, a, a.trial), stop), a)
     # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
@@ -440,7 +440,7 @@ def room_if_braking(i, r, v, late, a):
     c = a.trial[3]
     brake(i, v[i], a, c)
     if late:
-        return miss(r[i], v[i], c, a)
+        return miss_distance(r[i], v[i], c, a)
     predict(i, r[i], v[i], c, a, a.trial)
     return room_beside(i, v[i], a)
 
@@ -466,21 +466,21 @@ def choose(i, r, v, a):
         far = predict(i, r[i], v[i], c, a, a.trial)
         if not safe(i, r, v, far, a):
             continue
-        room = miss(r[i], v[i], c, a) if late else room_beside(i, v[i], a)
+        room = miss_distance(r[i], v[i], c, a) if late else room_beside(i, v[i], a)
         if late or room < 0.0:
             if room > most:
                 most, second = room, k
             continue
         best, nearest = away, k
         if k == 0:
-            take(i, far, a)
+            accept(i, far, a)
             return 0
     if nearest < 0:
         if second < 0 or room_if_braking(i, r, v, late, a) >= most:
             return 2
         nearest = second
     propose(i, nearest, v[i], a, c)
-    take(i, predict(i, r[i], v[i], c, a, a.trial), a)
+    accept(i, predict(i, r[i], v[i], c, a, a.trial), a)
     return 1
 
 
@@ -501,7 +501,7 @@ def command(i, state, a):
 
 
 @jit
-def want(i, state, a):
+def wanted_acceleration(i, state, a):
     """The acceleration that vehicle i is asked for, with its thrust limited."""
     force = state.force[i]
     size = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
@@ -567,14 +567,14 @@ def avoid(p, w, flight, state, a):
         for q in range(3):
             r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
             v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
-        want(i, state, a)
+        wanted_acceleration(i, state, a)
         if a.soft[i] > 0.0:
             foresee(i, flight.vehicles, state, r[i], v[i], a)
         else:
             for q in range(3):
                 a.ways[i, 4, q] = a.ways[i, 5, q] = r[i, q]
         state.layers[i] = 0
-    look(t, a.ways[:, 4], lost, a)
+    update_tracks(t, a.ways[:, 4], lost, a)
     flows = False
     if a.flow:
         for i in range(n):

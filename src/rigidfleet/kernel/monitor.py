@@ -29,7 +29,7 @@ from rigidfleet.kernel.bernstein import (
     shortest_above,
     span_of,
     square,
-    touch_box,
+    tangent_of_box,
     weights,
 )
 from rigidfleet.kernel.compiler.jit import jit
@@ -101,7 +101,7 @@ def quaternion_of(points, p):
 
 
 @jit
-def angle_of(points, p):
+def rotation_bound(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
         return 0.0
@@ -124,14 +124,14 @@ def find_attitudes(points, part, parts, p, monitor):
         basis = monitor.basis[k]
         weights((part + KNOTS[k]) / parts, basis)
         for s in range(4):
-            quaternion[s] = along(basis, points, first + s)
+            quaternion[s] = value_of_column(basis, points, first + s)
         for s in range(6):
-            monitor.centres[k, s] = along(basis, points, first + 4 + s)
+            monitor.centres[k, s] = value_of_column(basis, points, first + 4 + s)
         attitude_matrix(quaternion, monitor.attitudes[k])
 
 
 @jit
-def along(basis, points, q):
+def value_of_column(basis, points, q):
     """Column q of control points (5, n) where a curve has the Bernstein polynomials ``basis`` (5,)."""
     value = 0.0
     for k in range(5):
@@ -153,7 +153,7 @@ def in_world(points, i, moving, p, monitor, out):
     for k in range(5):
         T = monitor.attitudes[k]
         for q in range(3):
-            in_body[q] = along(monitor.basis[k], points, first + q)
+            in_body[q] = value_of_column(monitor.basis[k], points, first + q)
         for q in range(3):
             at_knots[k, q] = monitor.centres[k, 3 * moving + q]
             for s in range(3):
@@ -266,16 +266,16 @@ def bound_moves(p, state, monitor):
 
 
 @jit
-def put(curve, ball):
+def enclose(curve, ball):
     """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
     ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
 
 
 @jit
-def place(points, monitor):
+def enclose_agents(points, monitor):
     """Balls that hold the agents' positions over a step, in the axes of the states."""
     for i in range(monitor.balls.shape[0]):
-        put(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
+        enclose(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
 
 
 @jit
@@ -381,7 +381,7 @@ def take_clearance(value, t, i, b, above, monitor):
 
 
 @jit
-def leave(i, monitor):
+def note_departure(i, monitor):
     """Agent i is away from all obstacles below it: it no longer stands on one, and was not landing."""
     low = monitor.low
     if monitor.standing[i] != 0:
@@ -416,10 +416,10 @@ def watch_obstacles(i, curve, t, h, last, monitor):
     if not last or not (standing or monitor.low[i, 0] < math.inf):
         return
     for b in range(monitor.boxes.shape[0]):
-        end, _, _, up = touch_box(curve[4, 0], curve[4, 1], curve[4, 2], b, -1, monitor.boxes)
+        end, _, _, up = tangent_of_box(curve[4, 0], curve[4, 1], curve[4, 2], b, -1, monitor.boxes)
         if end - radius <= monitor.pad and up >= STEEP:
             return
-    leave(i, monitor)
+    note_departure(i, monitor)
 
 
 @jit
@@ -434,10 +434,10 @@ def watch_step(step, p, state, monitor):
     """Take the extremes of distances and speeds over one step of the trail."""
     trail, row = state.trail, row_of(step, state)
     points, t, h = trail.points[row], trail.clock[row, 0], trail.clock[row, 1]
-    place(points, monitor)
+    enclose_agents(points, monitor)
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
     watch_pairs(LOST, monitor.struck, points, t, h, monitor)
-    angle = angle_of(points, p)
+    angle = rotation_bound(points, p)
     parts = pieces_over(angle)
     h /= parts
     for part in range(parts):
@@ -455,7 +455,7 @@ def watch_step(step, p, state, monitor):
                 watch_speed(VERTICAL_SPEED, curve, 2, 3, start, h, i, monitor)
             curve = monitor.places[i]
             in_world(points, i, 0, p, monitor, curve)
-            put(curve, monitor.balls[i])
+            enclose(curve, monitor.balls[i])
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
             for f in range(monitor.fence.shape[0]):
@@ -525,7 +525,7 @@ def evaluate(t, step, p, w, state, monitor, values):
     basis, y = monitor.basis[0], monitor.states[0]
     weights(min(max(x, 0.0), 1.0), basis)
     for q in range(y.shape[0]):
-        y[q] = along(basis, trail.points[row], q)
+        y[q] = value_of_column(basis, trail.points[row], q)
     monitor.time[0] = t
     # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
@@ -534,7 +534,7 @@ def evaluate(t, step, p, w, state, monitor, values):
 
 
 @jit
-def promise(c, a, b, v, ta, tb, tc, p, monitor):
+def expected_excess(c, a, b, v, ta, tb, tc, p, monitor):
     """Expected excess over the worst value, and its time, from the parabola through |values| a, b, v at ta < tb < tc.
 
     The excess of entry c is a share of the worst value, with the rise to the top of the parabola counted twice. It is
@@ -576,7 +576,7 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     for c in range(middle.shape[0]):
         a, b, v = abs(before[c]), abs(middle[c]), abs(after[c])
         if b >= a and b >= v:
-            more, x = promise(c, a, b, v, ta, tb, tc, p, monitor)
+            more, x = expected_excess(c, a, b, v, ta, tb, tc, p, monitor)
             if more > best:
                 best, top = more, x
     if best == 0.0:
@@ -603,7 +603,7 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
             for c in range(middle.shape[0]):
                 a, b, v = abs(values[i, c]), abs(values[j, c]), abs(values[l, c])
                 if b >= a and b >= v:
-                    more, x = promise(c, a, b, v, at[i], at[j], at[l], p, monitor)
+                    more, x = expected_excess(c, a, b, v, at[i], at[j], at[l], p, monitor)
                     if more > best:
                         best, top = more, x
         if best == 0.0:

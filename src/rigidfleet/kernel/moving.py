@@ -40,7 +40,7 @@ _FLOW_RATE, _WIDER, _WEAK = 4.0, 1.2, 1e-3
 
 
 @jit
-def expect(o, T, sight):
+def predict_track(o, T, sight):
     """Predict the track of obstacle o by T [s]: constant velocity, with white noise of its acceleration."""
     x, P = sight.track[o], sight.spread[o]
     q = sight.swerve * sight.swerve * _LASTS  # density of the noise [m^2/s^3]
@@ -89,7 +89,7 @@ def in_sight(o, x, y, z, r, lost, a):
 
 
 @jit
-def see(o, k, x, y, z, u, v, w, a):
+def use_measurement(o, k, x, y, z, u, v, w, a):
     """Take a measurement of obstacle o at tick k, at the displacement x, y, z [m] with the velocity u, v, w [m/s]."""
     s = a.sight
     track, spread, seen = s.track[o], s.spread[o], a.shifted[0]
@@ -110,7 +110,7 @@ def see(o, k, x, y, z, u, v, w, a):
 
 
 @jit
-def look(t, r, lost, a):
+def update_tracks(t, r, lost, a):
     """Bring what is known of all obstacles that move to t [s], with vehicles at r (N, 3)."""
     s, T = a.sight, a.period
     k = int(t / T + 0.5)
@@ -123,9 +123,9 @@ def look(t, r, lost, a):
         x, y, z = displacement(t, o, a.solids)
         u, v, w = velocity(t + 0.5 * T, o, a.solids)
         if s.known[o] != UNKNOWN:
-            expect(o, T, s)
+            predict_track(o, T, s)
         if not s.reach < math.inf or in_sight(o, x, y, z, r, lost, a):
-            see(o, k, x, y, z, u, v, w, a)
+            use_measurement(o, k, x, y, z, u, v, w, a)
             s.known[o] = FOLLOWED
         if s.known[o] == UNKNOWN:
             continue
@@ -245,7 +245,7 @@ def room_beside(i, v, a):
 
 
 @jit
-def miss(r, v, c, a):
+def miss_distance(r, v, c, a):
     """By how much a vehicle at r with v (3,) misses all obstacles that move [m], if it holds an acceleration c (3,).
 
     That is the least distance of its centre at some times, up to twice that of the nearest approach without c.

@@ -15,12 +15,12 @@ from rigidfleet.kernel.bernstein import nearest_box, point_at, span_of
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled_copy, jit
 from rigidfleet.kernel.monitor import (
-    angle_of,
     clearance_of_interest,
     find_attitudes,
     in_world,
-    leave,
+    note_departure,
     pieces_over,
+    rotation_bound,
     take_clearance,
 )
 from rigidfleet.solids.distance import (
@@ -40,8 +40,8 @@ _SHORTEST = 2.0**-32
 
 
 @jit
-def touch_solid(x, y, z, b, triangle, s):
-    """As `bernstein.touch_box`, of solid b, or of one of its triangles if that is not -1."""
+def tangent_of_solid(x, y, z, b, triangle, s):
+    """As `bernstein.tangent_of_box`, of solid b, or of one of its triangles if that is not -1."""
     if triangle < 0:
         nx, ny, nz = outward_normal(x, y, z, b, s)
         return signed_distance(x, y, z, b, s), nx, ny, nz
@@ -53,7 +53,7 @@ def touch_solid(x, y, z, b, triangle, s):
 
 
 #: As `nearest_box`, of solid b or of one of its triangles.
-nearest_along = compiled_copy(nearest_box, "nearest_along", touch_box=touch_solid)
+nearest_along = compiled_copy(nearest_box, "nearest_along", tangent_of_box=tangent_of_solid)
 
 
 @jit
@@ -172,13 +172,13 @@ def watch_landing(i, curve, t, s, monitor):
             continue
         if is_below(u, v, w, b, s):
             return
-    leave(i, monitor)
+    note_departure(i, monitor)
 
 
 @jit
 def watch_step(points, start, length, p, s, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
-    curve, parts = monitor.curves[0], pieces_over(angle_of(points, p))
+    curve, parts = monitor.curves[0], pieces_over(rotation_bound(points, p))
     h = length / parts
     for part in range(parts):
         t = start + part * h

@@ -315,7 +315,7 @@ def release_silent_edges(k, p, w, flight, state):
 
 
 @jit
-def desire(k, t, p, w, flight, state, call):
+def find_desired_forces(k, t, p, w, flight, state, call):
     """Desired forces of all vehicles at tick k, time t [s]; returns False if there are none (a singular law)."""
     n, dt = state.S.shape[0], flight.every * flight.steps * flight.h
     advance_frame(t, p, state)
@@ -372,7 +372,7 @@ def tick(k, t, p, w, flight, state, call):
         hear(k, flight, state)
     measure(k, flight, state)
     due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
-    if due and not desire(k, t, p, w, flight, state, call):
+    if due and not find_desired_forces(k, t, p, w, flight, state, call):
         return False
     for i in range(state.S.shape[0]):
         state.saturated[i] = steer(k, i, flight, state)
@@ -400,7 +400,7 @@ def advance(S, h, flight, state):
 
 
 @jit
-def breathe(t, h, S, p, flight, state):
+def find_air(t, h, S, p, flight, state):
     """Velocity of the air [m/s] over a step from states S (N, 17), into ``work.air``; a user's force in its middle.
 
     The force is asked before: position and velocity in the middle of the step stand in rows of the air's until then.
@@ -422,7 +422,7 @@ def breathe(t, h, S, p, flight, state):
 @jit
 def write_derivatives(c, t, p, flight, state, call):
     """Derivatives of the states of sample c: those at the start of a step without length."""
-    breathe(t, 0.0, call.S[c], p, flight, state)
+    find_air(t, 0.0, call.S[c], p, flight, state)
     advance(call.S[c], 0.0, flight, state)
     for i in range(state.S.shape[0]):
         for q in range(17):
@@ -439,7 +439,7 @@ def write_samples(t, h, p, flight, state, call):
         if x > h * (1.0 + _SAME):
             return
         x = h if x > h * (1.0 - _SAME) else x
-        breathe(t, x, state.S, p, flight, state)
+        find_air(t, x, state.S, p, flight, state)
         advance(state.S, x, flight, state)
         for i in range(state.S.shape[0]):
             for q in range(17):
@@ -526,7 +526,7 @@ def advance_fleet(t, h, p, flight, state):
 
     Returns False, and advances none, if a user's force is not finite.
     """
-    if not breathe(t, h, state.S, p, flight, state):
+    if not find_air(t, h, state.S, p, flight, state):
         return False
     row, trail = state.count[TRAILED], state.trail
     kept = trail.clock.shape[0] > 0

@@ -137,7 +137,7 @@ def _files_named(data: dict[str, Any]) -> Iterator[_Named]:
     forms, agents, things, phases = (
         data.get(key) for key in ("formations", "agents", "obstacles", "phases")
     )
-    for k, phase in _with_file(phases, "follow", "trajectories"):
+    for k, phase in _tables_with_file(phases, "follow", "trajectories"):
         said = {key: phase[key] for key in ("units", "axes") if isinstance(phase.get(key), str)}
         read = partial(_read_trajectories, yaw=phase.get("yaw") == "file", said=said)
         yield _Named(phase, "file", "trajectories", f"phases[{k}].file", read, True)
@@ -146,18 +146,20 @@ def _files_named(data: dict[str, Any]) -> Iterator[_Named]:
             yield _Named(form, "slots", "slots", f"formations.{name}.slots", _read_points)
     if isinstance(agents, dict) and isinstance(agents.get("position"), str):
         yield _Named(agents, "position", "position", "agents.position", _read_points)
-    for k, thing in _with_file(things, "heights", "heights"):
+    for k, thing in _tables_with_file(things, "heights", "heights"):
         yield _Named(thing, "file", "heights", f"obstacles[{k}].file", _read_heights)
     for key in ("fences", "people"):
-        for k, area in _with_file(data.get(key), None, "coordinates"):
+        for k, area in _tables_with_file(data.get(key), None, "coordinates"):
             yield _Named(area, "file", "coordinates", f"{key}[{k}].file", _read_areas)
 
 
-def _with_file(tables: Any, kind: str | None, becomes: str) -> Iterator[tuple[int, dict[str, Any]]]:
+def _tables_with_file(
+    tables: Any, kind: str | None, numbers: str
+) -> Iterator[tuple[int, dict[str, Any]]]:
     """Numbers, from 1, and tables of a kind, if any, that name a file instead of giving its numbers."""
     for k, table in enumerate(tables if isinstance(tables, list) else (), start=1):
         own = table if isinstance(table, dict) and kind in (None, table.get("kind")) else {}
-        if becomes not in own and isinstance(own.get("file"), str):
+        if numbers not in own and isinstance(own.get("file"), str):
             yield k, own
 
 

@@ -111,6 +111,8 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         problem = f"is not valid TOML: {error}"
         remedy = "correct the line; toml.io describes the format"
+        if Path(origin).suffix not in ("", ".toml"):
+            remedy = "name a mission; trajectories are judged by `rigidfleet assess`"
     except ValueError as error:  # a number of thousands of digits
         problem = f"cannot be read as TOML: {error}"
         remedy = "correct it; toml.io describes the format"

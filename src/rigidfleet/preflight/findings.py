@@ -7,7 +7,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, Shown, worst_values
+from rigidfleet._common.facts import (
+    Fact,
+    FactTable,
+    Line,
+    Row,
+    Sheet,
+    Shown,
+    table_of,
+    worst_values,
+)
 from rigidfleet._common.plain import plain
 from rigidfleet._common.text import agent_names
 from rigidfleet.math import proximity
@@ -114,6 +123,19 @@ class GainsCheck:
     overshoot: float | None
     force: dict[str, float]
 
+    @property
+    def table(self) -> FactTable:
+        """Stability, and what a step of 1 cm in the error of an edge causes."""
+        if not self.stabilised:
+            return table_of([{"gains": "no feedback: stabilisation = 'none'"}])
+        name, force = max(self.force.items(), key=lambda item: item[1], default=("", None))
+        row = {
+            "gains": "stable", "margin": self.margin, "settles in [s]": self.settling_time,
+            "overshoot [%]": self.overshoot and 100 * self.overshoot, "force of 1 cm [N]": force and force / 100,
+            "in": name,
+        }  # fmt: skip
+        return table_of([row], ("in",))
+
 
 @dataclass(frozen=True)
 class FormationMargins:
@@ -146,15 +168,12 @@ class MarginsCheck:
     skipped: bool = False
 
     @property
-    def rows(self) -> Iterator[tuple[str, str]]:
-        """In words, the tracking first."""
-        if self.tracking is not None:
-            yield "margins", f"tracking: {_margin_words(self.tracking)}"
-        alike: dict[str, list[str]] = {}
+    def table(self) -> FactTable:
+        """What the tracking bears, then each formation and way."""
+        rows = [] if self.tracking is None else [_margin_row("tracking", self.tracking)]
         for where, f in self.formations.items():
-            pole = f"p up to {f.largest_pole:.3g} /s" if f.largest_pole < math.inf else "any p"
-            alike.setdefault(f"{_margin_words(f.margins)}; {pole}", []).append(where)
-        yield from (("margins", f"{', '.join(places)}: {words}") for words, places in alike.items())
+            rows.append(_margin_row(where, f.margins) | {"p up to [/s]": f.largest_pole})
+        return table_of(rows, ("", "margins"))
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -205,24 +224,14 @@ class FormationNetwork:
         return min(self, other, key=lambda f: (f.borne, f.delay, f.loss or 0.0))
 
     @property
-    def words(self) -> str:
-        """In words."""
-        ms = 1e3 * self.tick
-        parts = [
-            f"{self.broadcasts:.0f} broadcasts a second",
-            f"bears messages {self.delay} ticks late ({self.delay * ms:.0f} ms), its own are {self.own_delay}"
-            f" ({self.own_delay * ms:.0f} ms)",
-        ]
-        if self.loss is not None:
-            most = f"up to {100 * self.loss:.0f}" if self.loss < 0.95 else "with 95"
-            parts.append(
-                f"stable in mean square {most} % of losses, its own are {100 * self.own_loss:.0f} %"
-            )
-        if self.growing is not None:
-            parts.append(
-                f"errors grow in {100 * self.growing:.0f} % of sampled flights over its own network"
-            )
-        return "; ".join(parts)
+    def row(self) -> dict[str, Any]:
+        """What it bears and what it has, by the names of columns; losses are stable in mean square."""
+        ms, bears = 1e3 * self.tick, None if self.loss is None else 100 * self.loss
+        return {
+            "broadcasts [/s]": self.broadcasts, "bears delay [ms]": ms * self.delay, "has [ms]": ms * self.own_delay,
+            "bears loss [%]": bears, "has [%]": None if bears is None else 100 * self.own_loss,
+            "flights that grow [%]": None if self.growing is None else 100 * self.growing,
+        }  # fmt: skip
 
     def data(self) -> dict[str, Any]:
         """Plain data for JSON."""
@@ -379,8 +388,7 @@ class Preflight(Shown):
         verdict = "no problems found" if self.passed else "the flight will fail"
         parts = [
             self.mission.phase_table,
-            FactTable(heads, [*map(Row, self._rows())], heads, bare=True),
-            worst_values("planned", self._worst()),
+            *self._tables(),
             FactTable(heads, remarks, heads, bare=True),
             Line(f"{name}: {verdict}", "ok" if self.passed else "fails"),
         ]
@@ -388,9 +396,29 @@ class Preflight(Shown):
 
     def describe(self) -> Iterator[tuple[str, str]]:
         """Facts, each with its heading: formations, gains, planned paths. `remarks` are separate."""
-        yield from self._rows()
-        for name, *words in worst_values("planned", self._worst()).texts:
-            yield name, ", ".join(filter(None, words))
+        for table in self._tables():
+            heads = [("", "") if table.bare else (x, unit) for x, unit, _ in table.columns[1:]]
+            for heading, *texts in table.texts:
+                cells = zip(heads, texts, strict=True)
+                yield heading, ", ".join(f"{x} {y} {unit}".strip() for (x, unit), y in cells if y)
+
+    def _tables(self) -> list[FactTable]:
+        """Formations and laws, what is said of them in words, and the planned paths."""
+        tables = [] if self.margins is None else [self.margins.table]
+        if self.formations and not self.is_show:
+            tables = [_formation_table(self.formations), self.gains.table, *tables]
+        words = "about", "result"
+        ways = [
+            {"assignment": name, "path length [m]": a.path_length, "least clearance [m]": a.min_clearance}
+            for name, a in self.assignments.items()
+        ]  # fmt: skip
+        return [
+            *tables,
+            table_of([{"network": name} | f.row for name, f in self.network.items()]),
+            FactTable(words, [*map(Row, self._rows())], words, bare=True),
+            table_of(ways if len(ways) > 1 else []),
+            worst_values("planned", self._worst()),
+        ]
 
     def _worst(self) -> Iterator[Fact]:
         """Worst values of the planned paths, with their limits."""
@@ -405,60 +433,46 @@ class Preflight(Shown):
                 limit = own[0] if own else getattr(self.mission.limits, name)
                 limit = None if limit is None or not math.isfinite(limit) else limit
                 yield Fact(name.replace("_", " "), value, unit, limit, name == "separation", t, who)
+        if certificates := self.certificates:
+            phase, least = min(certificates.items(), key=lambda item: item[1].separation)
+            who = f"{agent_names(least.agents)}, '{phase}' ({least.how})"
+            limit = self.mission.limits.separation
+            yield Fact("separation, proved", least.separation, "m", limit, True, least.time, who)
         if self.vehicles is not None:
             force, t, who, limit, _ = self.vehicles.rotor_force
             yield Fact("rotor force", force, "N", limit, when=t, who=who)
             tilt, t, who, _ = self.vehicles.tilt
             yield Fact("tilt", tilt, "deg", when=t, who=who)
+        if (d := self.disturbed) is not None:
+            for name, what in _FORCES.items():
+                if (force := getattr(d, name)) > 0:
+                    yield Fact(f"force of {what}", force, "N")
+            force, t, who, limit = d.thrust
+            limit = limit if math.isfinite(limit) else None
+            yield Fact("thrust, disturbed", force, "N", limit, when=t, who=who)
+            if d.offset[0] > 0:
+                yield Fact("steady offset from a slot", d.offset[0], "m", who=d.offset[1])
+            for i, t in d.lost:
+                yield Fact("loss", None, when=t, who=f"agent {i + 1}")
+        for between, wide, takes, t in self.gaps:
+            yield Fact("width of a gap", wide, "m", takes, True, t, between)
         for name, least, t, who in self.clearance:
             yield Fact("clearance", least, "m", when=t, who=f"{who}, '{name}'")
+        if self.reserve:
+            yield Fact("reserve of automatic times", self.reserve, "s")
 
     def _rows(self) -> Iterator[tuple[str, str]]:
-        """Facts in words, each with its heading."""
-        if self.is_show:
-            yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
-        else:
-            yield from ((f.name, _formation_words(f)) for f in self.formations)
-            if self.formations:
-                yield "gains", _gain_words(self.gains)
-        if self.margins is not None:
-            yield from self.margins.rows
-        yield from (("network", f"'{name}': {f.words}") for name, f in self.network.items())
-        yield from self._proof()
-        if self.reserve:
-            text = f"automatic times leave {self.reserve:.2g} s times the greatest jerk of limits of acceleration, tilt"
-            text += " and thrust, and times the greatest acceleration of those of speed, for lag and drag of vehicles"
-            yield "reserve", text
-        if self.disturbed is not None:
-            yield "disturbances", _disturbed_words(self.disturbed)
-        for between, wide, takes, t in self.gaps:
-            text = f"{between}: {wide:.2f} m wide, the formation needs {takes:.2f} m at {t:.2f} s"
-            yield "gap", text
-        if len(self.assignments) > 1:
-            ways = (
-                f"{x} {a.path_length:.1f} m, {a.min_clearance:.2f} m"
-                for x, a in self.assignments.items()
-            )
-            yield "assignment", f"total path length, minimum clearance: {'; '.join(ways)}"
+        """What is said in words, each with its heading."""
+        in_words = _scene_words if self.is_show else _formation_words
+        yield from ((f.name, words) for f in self.formations if (words := in_words(f)))
+        lacking = [p.phase for p in self.planned_phases if p.certificate is None]
+        if lacking and self.certificates:
+            yield "not proved", f"{names_in_words(lacking)} flown without tracked slots"
         guessed = [planned.phase for planned in self.planned_phases if not planned.exact]
         if guessed:
             names = ", ".join(f"'{name}'" for name in guessed)
             text = f"straight paths are assumed in {names}, where only distances guide the agents"
             yield "guessed", text
-
-    def _proof(self) -> Iterator[tuple[str, str]]:
-        """The least of the certificates, and the phases that have none."""
-        if not (certificates := self.certificates):
-            return
-        phase, least = min(certificates.items(), key=lambda item: item[1].separation)
-        text = (
-            f"no two agents come nearer than {least.separation:.2f} m in the planned paths, {agent_names(least.agents)}"
-            f" at {least.time:.2f} s in '{phase}' ({least.how})"
-        )
-        lacking = [p.phase for p in self.planned_phases if p.certificate is None]
-        if lacking:
-            text += f"; {names_in_words(lacking)} not proved, as no slots are tracked"
-        yield "proved", text
 
     @property
     def certificates(self) -> dict[str, Certificate]:
@@ -542,18 +556,6 @@ class Preflight(Shown):
         return plain(data)
 
 
-def _disturbed_words(d: Disturbed) -> str:
-    forces = {what: getattr(d, name) for name, what in _FORCES.items()}
-    parts = [f"{what} up to {force:.2g} N" for what, force in forces.items() if force > 0]
-    force, t, who, limit = d.thrust
-    of = f" (limit {limit:g} N)" if math.isfinite(limit) else ""
-    parts.append(f"maximum thrust with them {force:.1f} N{of}, {who} at {t:.2f} s")
-    if d.offset[0] > 0:
-        parts.append(f"steady offset from its slot up to {d.offset[0]:.2g} m, {d.offset[1]}")
-    parts += [f"agent {i + 1} is lost at {t:g} s" for i, t in d.lost]
-    return "; ".join(parts)
-
-
 def _scene_words(f: FormationCheck) -> str:
     """What concerns a formation of a show, besides its spacing."""
     parts = ["not used in any phase"] if f.held_by == "nothing" else []
@@ -562,26 +564,42 @@ def _scene_words(f: FormationCheck) -> str:
     return "; ".join(parts)
 
 
+def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
+    """How rigid each formation is. An error of all edges of 1 cm allows the positions an offset."""
+    rows = []
+    for f in formations:
+        held = "not used in any phase" if f.held_by == "nothing" else f.held_by
+        row: dict[str, Any] = {"formation": f.name, "rigidity": "", "held by": held}
+        rows.append(row)
+        if (r := f.rigidity) is not None:
+            row |= {
+                "rigidity": r.rigidity_class,
+                "edges": len(r.edges),
+                "rank": f"{r.rank} of {r.needed}",
+            }
+            row |= (
+                {"index": r.index, "w": r.w, "offset by 1 cm [cm]": r.offset(1.0)} if r.rank else {}
+            )
+        elif (ends := f.spectrum) is not None and not ends.free:
+            row |= {"rigidity": "rigid", "index": ends.index, "condition": ends.condition}
+        elif ends is not None:
+            row["rigidity"] = f"flexible to first order, at least {ends.free} free motions"
+        elif f.method != "dense" or f.skipped:
+            row["rigidity"] = f"{'skipped' if f.skipped else 'too large'}, rigidity not checked"
+        else:
+            row["rigidity"] = (
+                "its distances do not determine positions, so its rigidity is not checked"
+            )
+    return table_of(rows, ("rigidity", "held by"))
+
+
 def _formation_words(f: FormationCheck) -> str:
-    r = f.rigidity
-    held = "not used in any phase" if f.held_by == "nothing" else f"held by {f.held_by}"
-    solved = f"{held}; solved by {solvers.WORDS[f.method]}"
-    if f.spectrum is not None and f.spectrum.free:
-        return f"{solved}; flexible to first order, at least {f.spectrum.free} free motions"
-    if f.spectrum is not None:
-        return (
-            f"{solved}; rigid, index {f.spectrum.index:.3g}, condition {f.spectrum.condition:.3g}"
-        )
-    if f.skipped:
-        return f"{solved}; skipped, rigidity not checked"
-    if r is None and f.method != "dense":
-        return f"{solved}; too large to check its rigidity"
-    if r is None:
-        return f"{held}; its distances do not determine positions, so its rigidity is not checked"
-    held = held if f.method == "dense" else solved.replace("; ", ", ")
-    parts = [f"{r.rigidity_class}, {held}: {len(r.edges)} edges, rank {r.rank} of {r.needed}"]
+    """What no column says of a formation."""
+    parts = [] if f.method == "dense" else [f"solved by {solvers.WORDS[f.method]}"]
+    if (r := f.rigidity) is None:
+        return "; ".join(parts)
     if r.reachable < r.needed:
-        parts[0] += f" ({r.reachable} reachable on a {WHERE[r.dimension]})"
+        parts.append(f"of its rank, {r.reachable} is reachable on a {WHERE[r.dimension]}")
     if len(r.redundant):
         names = ", ".join(f"{i}-{j}" for i, j in (r.edges[r.redundant][:6] + 1).tolist())
         more = ", ..." if len(r.redundant) > 6 else ""
@@ -590,10 +608,6 @@ def _formation_words(f: FormationCheck) -> str:
         free = "; ".join(agent_names(flex.agents) for flex in r.flexes[:3])
         more = f" and {len(r.flexes) - 3} more" if len(r.flexes) > 3 else ""
         parts.append(f"{len(r.flexes)} motions free to first order: {free}{more}")
-    if r.rank:
-        parts.append(
-            f"index {r.index:.3g}, w {r.w:.3g}: 1 cm edge error allows {r.offset(1.0):.2g} cm position error"
-        )
     if f.realisations is not None:
         parts.append(_realisation_words(f.realisations))
         parts[-1] += f" (in its {WHERE[r.own.space]})" * (r.own.space < 3)
@@ -620,26 +634,12 @@ def _realisation_words(r: Realisations) -> str:
     return text + (f", and there are {len(others) - 3} more shapes" if len(others) > 3 else "")
 
 
-def _gain_words(g: GainsCheck) -> str:
-    if not g.stabilised:
-        return "no feedback: stabilisation = 'none'"
-    text = f"stable, margin {g.margin:.3g} (2 alpha beta^2 / gamma > 1)"
-    if g.settling_time is not None and g.overshoot is not None:
-        text += f"; settles to 2 % in {g.settling_time:.3g} s, overshoot {100 * g.overshoot:.0f} %"
-    if g.force:
-        name, force = max(g.force.items(), key=lambda item: item[1])
-        text += f"; a step of 1 cm in an edge error causes up to {force / 100:.2g} N ('{name}')"
-    return text
-
-
-def _margin_words(m: Margins) -> str:
-    if not m.stable:
-        return "unstable"
-    low, high = m.gain
-    upper = f"{high:.3g}" if high < math.inf else "any factor"
-    gain = f"gains times {low:.2g} to {upper}" if low > 0 else f"gains times up to {upper}"
-    delay = f"{1e3 * m.delay:.0f} ms more delay" if m.delay < math.inf else "any delay"
-    return f"stable; bears {delay}, {math.degrees(m.phase):.0f} deg of phase, {gain}"
+def _margin_row(where: str, m: Margins) -> dict[str, Any]:
+    row: dict[str, Any] = {"margins": where, "": "stable" if m.stable else "unstable"}
+    if m.stable:
+        row |= {"more delay [ms]": 1e3 * m.delay, "phase [deg]": math.degrees(m.phase)}
+        row |= dict(zip(("gains from", "gains to"), m.gain, strict=True))
+    return row
 
 
 def names_in_words(names: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rigidfleet._common.files import why_not
 from rigidfleet._common.plain import plain_text
-from rigidfleet.errors import ResultError
+from rigidfleet.errors import ResultError, refuse_format
 from rigidfleet.result.phases import PhaseRecord
 
 #: Version of the file format. Files of any other version are rejected.
@@ -155,16 +155,7 @@ def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
                 "Give the path of a result of `rigidfleet run`."
             )
         made = reader.attribute(file, _MARK, int)
-        if made > SCHEMA_VERSION:
-            raise ResultError(
-                f"{path}: has result format {made}; this version of rigidfleet reads format "
-                f"{SCHEMA_VERSION}. Use a newer version."
-            )
-        if made < SCHEMA_VERSION:
-            raise ResultError(
-                f"{path}: was written by an earlier version of rigidfleet (result format {made}); this version reads "
-                f"format {SCHEMA_VERSION}. Fly the mission again."
-            )
+        refuse_format(path, "result", made, SCHEMA_VERSION, older="Fly the mission again")
         attributes = {
             name: reader.attribute(file, _attribute_name(name), kind)
             for name, kind in ATTRIBUTES.items()

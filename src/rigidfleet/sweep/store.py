@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigidfleet._common.files import unwritable
-from rigidfleet.errors import ResultError
+from rigidfleet.errors import ResultError, refuse_format
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
 from rigidfleet.sweep.record import RunRecord
@@ -235,16 +235,9 @@ def _check_format(db: sqlite3.Connection, folder: Path) -> None:
     if db.execute("SELECT 1 FROM sqlite_master WHERE name = 'sweep'").fetchone() is None:
         return  # a new file
     made = max(1, db.execute("PRAGMA user_version").fetchone()[0])
-    if made > _FORMAT:
-        raise ResultError(
-            f"{folder}: has sweep format {made}; this version of rigidfleet reads format {_FORMAT}. Use a newer"
-            " version, or choose another folder by --out."
-        )
-    if made < _FORMAT:
-        raise ResultError(
-            f"{folder}: was written by an earlier version of rigidfleet (sweep format {made}); this version reads"
-            f" format {_FORMAT}. Fly the sweep again: use --force to overwrite, or --out to choose another folder."
-        )
+    older = "Fly the sweep again: use --force to overwrite, or --out to choose another folder"
+    newer = ", or choose another folder by --out"
+    refuse_format(folder, "sweep", made, _FORMAT, newer=newer, older=older)
 
 
 @contextmanager

@@ -211,13 +211,9 @@ class Summary(Shown):
         ]
 
     def _percentiles(self) -> FactTable:
-        rows = [
-            Row((name, readable_unit(METRICS[name].unit), *values))
-            for name, values in self.percentiles.items()
-        ]
-        return FactTable(
-            ("metric", "unit", "min", "5 %", "25 %", "median", "75 %", "95 %", "max"), rows
-        )
+        heads = "metric", "unit", "min", "5 %", "25 %", "median", "75 %", "95 %", "max"
+        units = {name: readable_unit(METRICS[name].unit) for name in self.percentiles}
+        return FactTable(heads, [Row((x, units[x], *v)) for x, v in self.percentiles.items()])
 
     def _reasons(self) -> FactTable:
         rows = []
