@@ -603,6 +603,15 @@ def test_messages_without_a_stamp_are_no_places(tmp_path):
     assert said(read, "/b is not read: it has no stamps, as others have")
     read = read_trajectories(poses_bag(tmp_path / "alone", none))  # when it was recorded counts
     assert read.since == now / 1e9
+    simulated = [("/a", now + t, t, place[k]) for k, t in enumerate(at)]  # a clock that begins at 0
+    np.testing.assert_allclose(
+        at_samples(read_trajectories(poses_bag(tmp_path / "simulated", simulated)))[1],
+        place,
+        atol=1e-12,
+    )
+    leaps = [("/a", now + t, begin + t if k else 0, place[k]) for k, t in enumerate(at)]
+    read = read_trajectories(poses_bag(tmp_path / "leaps", leaps))
+    np.testing.assert_allclose(at_samples(read)[1], place[1:], atol=1e-12)
 
 
 def test_one_vehicle_is_not_two(tmp_path):

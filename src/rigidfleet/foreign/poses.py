@@ -249,7 +249,10 @@ def _channel(topic: str, rows: _Rows) -> Channel:
         return channel_of_px4(topic, rows.message, columns)
     if not time.any():
         time = received
-    table[time == 0] = np.nan  # what was sent before there was a time is no place
+    lacking = time == 0
+    if lacking.sum() == 1 and lacking[0]:  # a clock that begins at 0, unless it begins with a leap
+        lacking[0] = len(time) > 2 and time[1] > 2 * np.median(np.diff(time[1:]))
+    table[lacking] = np.nan  # what was sent before there was a time is no place
     if rows.message == "NavSatFix":
         columns = dict(zip(("time", "lat", "lon", "alt"), (time, *table.T), strict=True))
         return Channel(topic, rows.message, columns, rows.frame)
