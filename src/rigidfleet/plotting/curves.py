@@ -305,7 +305,7 @@ def constraint_force(result: Result) -> Figure:
     edges = Panel(below, result, tension, "N", result.extreme("tension"), name)
     if not len(result.edges):
         st.write_note(below, "no edges")
-    elif not edges.note_if_idle():
+    elif not edges.note_if_rounding():
         draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
         edges.leave_out_final_peak()

@@ -98,7 +98,7 @@ class Panel:
                 ax.plot(when, peak, "o", markersize=4, **ring)
             st.annotate(ax, caption, st.corner_places())
 
-    def note_if_idle(self) -> bool:
+    def note_if_rounding(self) -> bool:
         """If values are only rounding errors, say so in the axes; return whether they are."""
         size = np.where(np.isfinite(self.values), np.abs(self.values), -np.inf)
         k, i = np.unravel_index(int(size.argmax()), size.shape) if size.size else (0, 0)
@@ -117,7 +117,7 @@ class Panel:
 
     def draw_from_zero(self) -> bool:
         """Draw each agent's values from zero, and write the greatest; return whether there was anything to draw."""
-        if self.note_if_idle():
+        if self.note_if_rounding():
             return False
         st.draw_agent_lines(self.ax, self.result, self.values)
         top = peak_before_breakdown(self.result, self.values)

@@ -370,7 +370,7 @@ class Extremes(CurveWatch):
         self.avoidance: avoidance.AvoidanceArrays | None = None  # that of the phase under way
         self.of_layers: dict[str, Extremum] = {}  # what its clock and its body layer did
 
-    def among(self, obstacles: Sequence[Obstacle]) -> None:
+    def use_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Continue among these obstacles; the first of them are those before."""
         self._take_obstacles(obstacles)
         if "monitor" in vars(self):

@@ -596,7 +596,7 @@ class Flight:
         if self._active is not None:
             self._active.watch(last=True)
         self.mission = self.mission.model_copy(update={"obstacles": tuple(obstacles)})
-        self._extremes.among(obstacles)
+        self._extremes.use_obstacles(obstacles)
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
             solids = join([thing.solid for thing in obstacles])
