@@ -107,9 +107,12 @@ def drill() -> None:
     """What the example of a drill bears."""
     sweep = Sweep.load(IMAGES.parents[1] / "examples" / "market_square.toml")
     with TemporaryDirectory() as folder:
-        figure = shares(fly(sweep, folder, workers=2))
+        table = fly(sweep, folder, workers=2)
+    with settings():
+        figure = shares(table)
         assert figure is not None
-    _save_with_few_colours(io.BytesIO(encode_figure(figure, ["png"])["png"]), "drill")
+        picture = encode_figure(figure, ["png"])["png"]
+    _save_with_few_colours(io.BytesIO(picture), "drill")
 
 
 def _save_with_few_colours(path: Path | io.BytesIO, name: str) -> None:
