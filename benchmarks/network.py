@@ -322,10 +322,8 @@ def checks(page: Page) -> None:
         whole = process_time() - begun
         way, lags, begun = preview(m)[0], vehicle_lags(m), process_time()
         check_network(m, way, lags)
-        part, what = (
-            process_time() - begun,
-            f"{m.name}: {m.n_agents} vehicles, {len(m.edges):,} edges",
-        )
+        part = process_time() - begun
+        what = f"{m.name}: {m.n_agents} vehicles, {len(m.edges):,} edges"
         page.row(what, f"{part:.1f} s", f"{whole:.1f} s", f"{goal:g} s", kept=part <= goal)
 
 

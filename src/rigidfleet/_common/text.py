@@ -13,10 +13,10 @@ def agent_names(indices: Iterable[int]) -> str:
     return f"agents {', '.join(numbers[:-1])} and {numbers[-1]}"
 
 
-def first_few(things: Sequence[object], most: int = 5) -> str:
+def first_few(things: Sequence[object], most: int = 5, between: str = ", ") -> str:
     """The first of some things, and how many more there are: "a, b and 1,000 more"."""
     more = f" and {len(things) - most:,} more" if len(things) > most else ""
-    return ", ".join(map(str, things[:most])) + more
+    return between.join(map(str, things[:most])) + more
 
 
 def all_hold(count: int) -> str:

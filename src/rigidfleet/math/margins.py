@@ -497,9 +497,8 @@ def _follow(loci: Complexes) -> Complexes:
             gap = loci[k][None, :] - loci[k - 1][:, None]
             turned = (gap.imag + math.pi) % (2 * math.pi) - math.pi
             order: list[int] = []
-            for distance in np.hypot(
-                gap.real, turned
-            ):  # each goes on with the nearest that is left
+            # Each goes on with the nearest that is left.
+            for distance in np.hypot(gap.real, turned):
                 distance[order] = math.inf
                 order.append(int(distance.argmin()))
             loci[k] = loci[k][order]

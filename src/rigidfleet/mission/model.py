@@ -14,7 +14,7 @@ from pydantic import PrivateAttr
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.renamed import with_earlier_names
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.text import agent_names, first_few
 from rigidfleet._common.toml import plain_data, to_toml
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.assignment import assign_slots, downwash_metric
@@ -518,11 +518,8 @@ class Mission(Contents, Shown):
 
         near = KDTree(start[:, :2]).query(end[:, :2])[1]
         others = np.flatnonzero(stand & (near != np.arange(len(end))))
-        who = [f"{i + 1} where {near[i] + 1} did" for i in others[:_LISTED]]
-        who += [f"and {len(others) - _LISTED} more"] if len(others) > _LISTED else []
-        words = (
-            f"{len(others)} of {len(end)} vehicles land where another one stood: {', '.join(who)}"
-        )
+        who = first_few([f"{i + 1} where {near[i] + 1} did" for i in others], _LISTED)
+        words = f"{len(others)} of {len(end)} vehicles land where another one stood: {who}"
         return words if others.size else ""
 
     @cached_property

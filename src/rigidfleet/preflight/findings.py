@@ -18,7 +18,7 @@ from rigidfleet._common.facts import (
     worst_values,
 )
 from rigidfleet._common.plain import plain
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.math import proximity
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import Mission
@@ -572,14 +572,10 @@ def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
         row: dict[str, Any] = {"formation": f.name, "rigidity": "", "held by": held}
         rows.append(row)
         if (r := f.rigidity) is not None:
-            row |= {
-                "rigidity": r.rigidity_class,
-                "edges": len(r.edges),
-                "rank": f"{r.rank} of {r.needed}",
-            }
-            row |= (
-                {"index": r.index, "w": r.w, "offset by 1 cm [cm]": r.offset(1.0)} if r.rank else {}
-            )
+            row |= {"rigidity": r.rigidity_class, "edges": len(r.edges)}
+            row["rank"] = f"{r.rank} of {r.needed}"
+            if r.rank:
+                row |= {"index": r.index, "w": r.w, "offset by 1 cm [cm]": r.offset(1.0)}
         elif (ends := f.spectrum) is not None and not ends.free:
             row |= {"rigidity": "rigid", "index": ends.index, "condition": ends.condition}
         elif ends is not None:
@@ -605,9 +601,8 @@ def _formation_words(f: FormationCheck) -> str:
         more = ", ..." if len(r.redundant) > 6 else ""
         parts.append(f"{len(r.redundant)} edges, any one of which is redundant ({names}{more})")
     if r.flexes:
-        free = "; ".join(agent_names(flex.agents) for flex in r.flexes[:3])
-        more = f" and {len(r.flexes) - 3} more" if len(r.flexes) > 3 else ""
-        parts.append(f"{len(r.flexes)} motions free to first order: {free}{more}")
+        free = first_few([agent_names(flex.agents) for flex in r.flexes], 3, "; ")
+        parts.append(f"{len(r.flexes)} motions free to first order: {free}")
     if f.realisations is not None:
         parts.append(_realisation_words(f.realisations))
         parts[-1] += f" (in its {WHERE[r.own.space]})" * (r.own.space < 3)
@@ -644,9 +639,8 @@ def _margin_row(where: str, m: Margins) -> dict[str, Any]:
 
 def names_in_words(names: Sequence[str]) -> str:
     """First names, the number of the others, and "is" or "are"."""
-    text = ", ".join(f"'{name}'" for name in names[:_TOLD])
-    more = f" and {len(names) - _TOLD:,} more" if len(names) > _TOLD else ""
-    return f"{text}{more} {'is' if len(names) == 1 else 'are'}"
+    text = first_few([f"'{name}'" for name in names], _TOLD)
+    return f"{text} {'is' if len(names) == 1 else 'are'}"
 
 
 def _by_name(names: tuple[str, ...], values: tuple[Any, ...] | None) -> dict[str, Any] | None:

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from rigidfleet._common.text import agent_names
+from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.formation import distance_geometry
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.proximity import nearest
@@ -263,9 +263,8 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]
 
 def _flexible(name: str, r: Rigidity, forecast: tuple[int, float] | None) -> Iterator[Remark]:
     """Remark on a formation that is flexible or in a plane; the forecast is None where slots hold it."""
-    who = "; ".join(agent_names(flex.agents) for flex in r.flexes[:4])
-    more = f" and {len(r.flexes) - 4} more" if len(r.flexes) > 4 else ""
-    text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}{more}"
+    who = first_few([agent_names(flex.agents) for flex in r.flexes], 4, "; ")
+    text = f"'{name}' is flexible: {r.rank} of {r.needed} independent distances; free: {who}"
     if not r.flexes:
         text = f"'{name}' has dimension = 2, but its agents leave their plane"
     level, held = "note", "; slots hold it"
