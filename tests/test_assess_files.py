@@ -6,6 +6,7 @@ import json
 import re
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -367,14 +368,14 @@ def test_a_zip_bomb_is_refused_unopened(tmp_path, monkeypatch):
 def test_an_entry_that_all_drones_refer_to_is_not_read_without_end(tmp_path, monkeypatch):
     """An entry counts as often as it is read; drones that fly the same way share what was read once."""
     way = '{"points": [[0, [0, 0, 1], []], [1, [1, 0, 1], []]]' + " " * 1000 + "}"
-    drones = [{"settings": {"trajectory": {"$ref": "./way.json#"}}} for _ in range(100)]
+    drones: Any = [{"settings": {"trajectory": {"$ref": "./way.json#"}}} for _ in range(100)]
     show = {"swarm": {"drones": drones}}
     path = tmp_path / "show.skyc"
     monkeypatch.setattr(shows._Archive, "room", 20_000)
     path.write_bytes(zipped({"show.json": json.dumps(show), "way.json": way}))
     assert len(read_trajectories(path).curves) == 100
     for k, drone in enumerate(drones):
-        drone["settings"]["yawControl"] = {"setpoints": [[0, k]]}
+        drone["settings"] |= {"yawControl": {"setpoints": [[0, k]]}}
     path.write_bytes(zipped({"show.json": json.dumps(show), "way.json": way}))
     with pytest.raises(rf.RigidfleetError, match=r"way\.json: drones refer to it too often"):
         read_trajectories(path)

@@ -26,8 +26,6 @@ _UNSEEN = r"(?<![-\w])opacity\s*:\s*[0.]+%?\s*(;|!|$)"
 #: Lengths, and of which side of the view around (2: its diagonal) they may be shares.
 _SIDES = {key: side for side, keys in enumerate(("x cx x1 x2 rx width", "y cy y1 y2 ry height", "r"))
           for key in keys.split()}  # fmt: skip
-#: Where a view is: keys, their defaults, axes.
-_VIEW = (("x", "0", 0), ("y", "0", 1), ("width", "100%", 0), ("height", "100%", 1))
 #: Attributes that ask for more than a browser may have.
 _ASKS = {"systemLanguage", "requiredExtensions", "requiredFeatures"}
 #: Rules of a style sheet that hold for some media alone, and selectors that depend on more than the element.
@@ -104,7 +102,10 @@ class Drawing:
                     target.tag = _SPACE + "svg"
                     target.attrib.update({k: own[k] for k in ("width", "height") if k in own})
         if tag in ("svg", "use"):
-            x, y, w, h = (_length(own.pop(key, usual), size[k]) for key, usual, k in _VIEW)
+            x, y = (float(own.pop(key, 0)) for key in "xy")
+            w, h = (
+                float(own.pop(key, x)) for key, x in zip(("width", "height"), size, strict=True)
+            )
             move = f"translate({x},{y})"
             if tag == "svg":
                 box = _numbers(own.pop("viewBox", f"0 0 {w} {h}"))

@@ -131,14 +131,15 @@ def _findings(faults: Sequence[Fault], name: str, place: str = "line") -> list[F
     return findings
 
 
-def _hexadecimal(colours: Floats, *, shares: bool) -> tuple[str, ...]:
-    """Colours of rows (N, 3) from 0 to 255, or of shares from 0 to 1.
+def _hexadecimal(colours: Floats, *, real: bool) -> tuple[str, ...]:
+    """Colours of rows (N, 3) from 0 to 255; of shares from 0 to 1, if they are real numbers and none is larger.
 
     Raises
     ------
     ValueError
         They are no colours.
     """
+    shares = real and colours.max(initial=0.0) <= 1.0
     colours = np.round(255.0 * colours) if shares else colours
     bad = ~((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all(axis=1)
     if bad.any():
@@ -189,13 +190,12 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
         if odd := next((x for x in colours if not re.fullmatch(r"#[0-9a-f]{6}", x)), None):
             raise fault(f"has the colour {odd[1:]!r}", "write colours as #rrggbb")
     elif hues:
-        shares = values[:, n:].max(initial=0.0) <= 1.0
-        decimal = shares and any("." in x for k in hues for x in table.columns[k].tolist())
-        if shares and not decimal and values[:, n:].any():
+        lights, real = values[:, n:], any("." in x for k in hues for x in table.columns[k].tolist())
+        if not real and lights.any() and lights.max() <= 1.0:
             remedy = "write shares from 0 to 1 with a point (1.0)"
             notes.append(f"colours are at most 1 of 255; {remedy}")
         notes += ["six numbers are read as x, y, z, red, green, blue"] * (not table.named)
-        colours = _hexadecimal(values[:, n:], shares=decimal)
+        colours = _hexadecimal(lights, real=real)
     return table.lines, points, colours, tuple(notes)
 
 
@@ -213,9 +213,7 @@ def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     points[:, : array.shape[1]] = array[:, :3]
     if array.shape[1] < 6:
         return points, None, ()
-    hues = array[:, 3:].astype(np.float64)
-    shares = hues.max(initial=0.0) <= 1.0 and bool((hues % 1.0).any())
-    return points, _hexadecimal(hues, shares=shares), ()
+    return points, _hexadecimal(array[:, 3:].astype(np.float64), real=array.dtype.kind == "f"), ()
 
 
 def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
@@ -263,11 +261,12 @@ def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     if len(names) == 3:
         return values, None, ()
     types = {columns[name] for name in names[3:]}
-    colours, shares = values[:, 3:] / (65535.0 if types == {"u2"} else 1.0), types == {"u2"}
-    if types <= {"f4", "f8"}:
-        shares = colours.max(initial=0.0) <= 1.0
-        colours = colours if shares else np.round(colours)
-    return values[:, :3].copy(), _hexadecimal(colours, shares=shares), ()
+    colours, real = (
+        values[:, 3:] / (65535.0 if types == {"u2"} else 1.0),
+        types <= {"u2", "f4", "f8"},
+    )
+    colours = colours if colours.max(initial=0.0) <= 1.0 else np.round(colours)
+    return values[:, :3].copy(), _hexadecimal(colours, real=real), ()
 
 
 def _bytes_before_vertices(
