@@ -145,7 +145,7 @@ SAME = {
             "secs,uav,tx,ty,tz",
             "t,agent,east,north,up",
             "t,agent,e,n,u",
-            "ts,agent,easting,northing,elevation",
+            "t,agent,easting,northing,elevation",
             "t,agent,x,y,altitude",
             "t,agent,pos_e,pos_n,pos_u",
         )

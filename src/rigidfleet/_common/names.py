@@ -37,7 +37,7 @@ _WORDS = {
     "none": "std var cov covariance err error sigma noise rate offset min max mean limit size scale omega angular "
             "gyro mag torque force thrust gyr ang euler rpy bias w b",
     "wanted": "ref reference setpoint sp target desired des cmd command goal",
-    "time": "t ts time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
+    "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
     "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world in boot",
     "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
              "rigid track sysid mav uri callsign tail craft bot ship rover",
@@ -130,7 +130,7 @@ def _meaning_without_unit(name: str) -> ColumnMeaning:
         if bare in letters or (way in bare and {*bare} <= {way, *"xyz"}):
             return ColumnMeaning(way)
     units = [word for word in words if (unit_of(word) or ("",))[0] == "time"]
-    alone = len(words) == len(units) == 1 and len(plain) > 1 and plain not in ("min", "ns")
+    alone = len(words) == len(units) == 1 and len(plain) > 1 and plain not in ("min", "ns", "us")
     if (every & _IS["time"] or alone) and every <= _IS["time"] | _IS["time too"] | {*units}:
         return ColumnMeaning("time", units[-1] if units else "")
     if (
