@@ -295,9 +295,11 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
         raise fault("has no names of columns that are understood", "Give shorter lines", long)
     bare = [texts[k].lstrip("#") for k in head]
-    most = [max(sum(map(is_number, split_fields(line, s))) for s in SEPARATORS) for line in bare]
-    rows = [k for k, count in zip(head, most, strict=True) if count > 1]
-    start, names, own = _names(texts, head, [k for k in rows if texts[k][0] != "#"])
+    split = [[split_fields(line, s) for s in SEPARATORS] for line in bare]
+    most = [max((sum(map(is_number, x)), len(x)) for x in fields) for fields in split]
+    rows = [k for k, (count, _) in zip(head, most, strict=True) if count > 1]
+    words = [k for k, (count, n) in zip(head, most, strict=True) if 2 * count <= n]
+    start, names, own = _names(texts, words, [k for k in rows if texts[k][0] != "#"])
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
         start = min(rows, default=len(texts))
@@ -316,8 +318,8 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
         why = f"has no names of columns that are understood: {texts[k][:60]}"
         raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
     numbers = dict(zip(head, most, strict=True))
-    least = min((numbers[k] for k in rows if k >= start), default=width)
-    alike = [k for k in rows if k < line - 1 and numbers[k] >= least and texts[k][0] != "#"]
+    least = min((numbers[k][0] for k in rows if k >= start), default=width)
+    alike = [k for k in rows if k < line - 1 and numbers[k][0] >= least and texts[k][0] != "#"]
     if names and (early := [k for k in alike if len(split_fields(texts[k], separator)) == width]):
         raise fault(f"has a row before its names, which are in line {line}", "", early[0] + 1)
     return line, start, names, units, separator, width
@@ -327,7 +329,7 @@ def _names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, lis
     """Line, from 1, names and separator: of the lines before the first row below names, the one understood best."""
     best, names = (False, 0.0), (0, [], "")
     for k in head:
-        if k in rows and names[0]:
+        if names[0] and any(names[0] <= row <= k for row in rows):
             break
         first = next((row for row in rows if row > k), len(texts))
         counts = {len(split_fields(x, s)) for x in texts[first : first + 1] for s in SEPARATORS}
