@@ -294,12 +294,11 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
         raise fault("has no names of columns that are understood", "Give shorter lines", long)
-    bare = [texts[k].lstrip("#") for k in head]
-    split = [[split_fields(line, s) for s in SEPARATORS] for line in bare]
-    most = [max((sum(map(is_number, x)), len(x)) for x in fields) for fields in split]
-    rows = [k for k, (count, _) in zip(head, most, strict=True) if count > 1]
-    words = [k for k, (count, n) in zip(head, most, strict=True) if 2 * count <= n]
-    start, names, own = _names(texts, words, [k for k in rows if texts[k][0] != "#"])
+    split = {k: [split_fields(texts[k].lstrip("#"), s) for s in SEPARATORS] for k in head}
+    most = {k: max((sum(map(is_number, x)), len(x)) for x in fields) for k, fields in split.items()}
+    rows = {k: count for k, (count, _) in most.items() if count > 1}
+    plain = [k for k in rows if texts[k][0] != "#"]
+    start, names, own = _names(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
         start = min(rows, default=len(texts))
@@ -317,11 +316,10 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
         k = above[-1 if width else 0]
         why = f"has no names of columns that are understood: {texts[k][:60]}"
         raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
-    numbers = dict(zip(head, most, strict=True))
-    least = min((numbers[k][0] for k in rows if k >= start), default=width)
-    alike = [k for k in rows if k < line - 1 and numbers[k][0] >= least and texts[k][0] != "#"]
-    if names and (early := [k for k in alike if len(split_fields(texts[k], separator)) == width]):
-        raise fault(f"has a row before its names, which are in line {line}", "", early[0] + 1)
+    least = min((rows[k] for k in plain if k >= start), default=width)
+    for k in plain if names else ():
+        if k < line - 1 and rows[k] >= least and len(split_fields(texts[k], separator)) == width:
+            raise fault(f"has a row before its names, which are in line {line}", "", k + 1)
     return line, start, names, units, separator, width
 
 
