@@ -36,10 +36,16 @@ Gaps = Literal["refuse", "bridge"]
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
-_ZIP, _HDF, _BAG = b"PK", b"\x89HDF", b"#ROSBAG"
+_ZIP = b"PK"
+#: What is not read, by its first bytes, and what to do with it.
+_REFUSED = {
+    b"\x89HDF": "is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`",
+    b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
+    poses.ZSTANDARD: "is compressed as a whole. Unpack it: zstd -d {}",
+}
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
 #: in a folder. Files ``.bin`` are logs only by their content.
-_RECORDINGS, _LOGS = {".mcap", ".db3"}, {".ulg", ".tlog"}
+_RECORDINGS, _LOGS = {".mcap", ".db3", ".zstd"}, {".ulg", ".tlog"}
 _SUFFIXES = {".csv", ".skyc"} | _RECORDINGS | _LOGS
 #: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
 #: positions that are noted.
@@ -55,6 +61,7 @@ class _Options(NamedTuple):
     units: Units
     topics: tuple[str, ...] = ()
     origin: logs.Geodetic | None = None
+    alone: bool = True
 
 
 def read_trajectories(
@@ -111,7 +118,8 @@ def read_trajectories(
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
     topics = (topic,) if isinstance(topic, str) else tuple(topic)
-    options, parts = _Options(interpolation, units_of(units, axes), topics, origin), []
+    words, parts = units_of(units, axes), []
+    options = _Options(interpolation, words, topics, origin, alone=len(listed) == 1)
     for group in listed:
         parts.append(_read_sequence(group, options))
         place = parts[-1].read[0].get("origin")
@@ -189,19 +197,21 @@ def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> li
 
 def _records_of_alike_files(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
     """What was taken for what, once for files that are alike."""
-    every: dict[str, dict[str, Any]] = {}
+    alike: dict[str, list[Trajectories]] = {}
     for part in parts:
         record = {k: v for k, v in part.read[0].items() if k not in ("rows", "since_1970_ns")}
-        nothing = {"files": 0, "vehicles": 0, "rows": 0, "begin_s": np.inf, "end_s": -np.inf}
-        own = every.setdefault(repr(record), nothing | {"rate_hz": 0.0} | record)
-        own["files"] += 1
-        own["vehicles"] += len(part.names)
-        own["rows"] += part.read[0].get("rows", 0)
-        own["begin_s"] = min(own["begin_s"], *(float(curve.time[0]) for curve in part.curves))
-        own["end_s"] = max(own["end_s"], *(float(curve.time[-1]) for curve in part.curves))
-        seconds = own["vehicles"] * (own["end_s"] - own["begin_s"])
-        own["rate_hz"] = round(own["rows"] / seconds, 6)
-    return tuple(every.values())
+        alike.setdefault(repr(record), []).append(part._replace(read=(record, part.read[0])))
+    records = []
+    for same in alike.values():
+        times = [curve.time for part in same for curve in part.curves]
+        begins, ends = np.transpose([time[[0, -1]] for time in times])
+        steps, seconds = sum(len(time) - 1 for time in times), float((ends - begins).sum())
+        records.append({
+            "files": len(same), "vehicles": len(times), "rows": sum(part.read[1].get("rows", 0) for part in same),
+            "begin_s": float(begins.min()), "end_s": float(ends.max()), "rate_hz": round(steps / seconds, 6),
+            **same[0].read[0],
+        })  # fmt: skip
+    return tuple(records)
 
 
 def groups_of_files(path: Path) -> list[list[Path]]:
@@ -254,7 +264,9 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
         One of them may be a further vehicle.
     """
     read = {p for group in listed for p in group}
-    rest = [p for p in sorted(path.rglob("*"), key=_sort_key) if p.is_file() and p not in read]
+    rest = [
+        p for p in sorted(path.rglob("*"), key=logs.natural_key) if p.is_file() and p not in read
+    ]
     for p in rest:
         hidden = _is_read(p) and not _is_hidden(p)
         with suppress(TrajectoryError):
@@ -270,7 +282,7 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
 
 def _seen_in(folder: Path) -> list[Path]:
     """What is in a folder, in order, and not hidden."""
-    return [p for p in sorted(folder.iterdir(), key=_sort_key) if not _is_hidden(p)]
+    return [p for p in sorted(folder.iterdir(), key=logs.natural_key) if not _is_hidden(p)]
 
 
 def _is_read(path: Path) -> bool:
@@ -299,12 +311,6 @@ def _is_hidden(path: Path) -> bool:
     return path.name.startswith((".", "__MACOSX"))
 
 
-def _sort_key(path: Path) -> list[tuple[int, str]]:
-    """Names in the order of the numbers in them: 2 before 10."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
-
-
 def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
     """What is in the file of a vehicle, in the parts of a recording, or in several files that follow each other."""
     if len(group) == 1 or group[0].suffix.lower() in _RECORDINGS:
@@ -324,23 +330,19 @@ def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
 
 def _read_file(parts: list[Path], options: _Options) -> Trajectories:
     """What is in one file, or in the parts of a recording, by its content."""
-    path, (interpolation, units, topics, origin) = parts[0], options
-    head, suffix = _head_of(path), path.suffix.lower()
-    if head.startswith(_HDF):
-        raise TrajectoryError(
-            f"{path}: is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`."
-        )
-    if head.startswith(_BAG):
-        raise TrajectoryError(
-            f"{path}: is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {path.name} --dst FOLDER."
-        )
+    path, (interpolation, units, topics, origin, alone) = parts[0], options
+    head, suffix, log = _head_of(path), path.suffix.lower(), None
+    for begin, why in _REFUSED.items():
+        if head.startswith(begin):
+            raise TrajectoryError(f"{path}: {why.format(path.name)}.")
     try:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
             log = poses.read_recording(parts, topics)
-            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
         elif head.startswith((logs.ULOG, logs.BIN)) or suffix in _LOGS:
             log = logs.read_log(path)
-            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
+        if log is not None:
+            stem = path.stem
+            read = logs.trajectories_of(log, stem, interpolation, topics, origin, alone=alone)
         elif topics:
             raise fault("has no topics", "Remove --topic")
         elif head.startswith(_ZIP) or suffix == ".skyc":

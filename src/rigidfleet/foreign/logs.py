@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -101,11 +102,15 @@ RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
 _BESIDE = {
     "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
-    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode", "BAD_DATA": "",
+    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode autopilot", "BAD_DATA": "",
 }  # fmt: skip
-#: Fields that are not 0 where a place of PX4 is valid, and those that count how often its estimator set it anew.
-_VALID = {"xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"}
+#: What fields are at least where a place is valid (a fix of GNSS in three dimensions is 3), and those that count how
+#: often an estimator set it anew.
+_VALID = {name: 1 for name in ("xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned")}
+_VALID |= {"fix_type": 3, "Status": 3}
 _RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
+#: What MAVLink writes for a heading that is not known [0.01 deg], and who is no autopilot.
+_UNKNOWN, _NO_AUTOPILOT = 65535, 8
 #: Frames of the Earth of MAVLink's `MAV_FRAME`: local ones that are turned anyhow are not read.
 _FRAMES = {1: "local_ned", 4: "local_enu"}
 
@@ -126,6 +131,12 @@ class Channel(NamedTuple):
     columns: dict[str, Any]
     frame: str = ""
     reference: Geodetic | None = None
+
+    @property
+    def is_about_unknown_origin(self) -> bool:
+        """Whether positions are about an origin that the log of an autopilot does not tell."""
+        form = next(form for name, form in _MESSAGES if name == self.message)
+        return form.frame == "ned" and self.reference is None
 
 
 class Log(NamedTuple):
@@ -193,12 +204,19 @@ def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
     return sorted(chosen, key=lambda c: RANK[c.message])
 
 
-def trajectories_of(
-    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None
-) -> Trajectories:
-    """Curves through the places of a log, in east, north, up about an origin.
+def natural_key(name: object) -> list[tuple[int, str]]:
+    """Names in the order of the numbers in them: 2 before 10."""
+    parts = re.split(r"(\d+)", str(name))
+    return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
 
-    Without one, places are about the origin of the first vehicle's estimator, or its first place.
+
+def trajectories_of(
+    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None, *, alone: bool
+) -> Trajectories:  # fmt: skip
+    """Curves through the places of a log, in east, north, up about an origin; vehicles in the order of their names.
+
+    Without one, places are about the origin of the first vehicle's estimator, or its first place. Unless a vehicle is
+    ``alone``, places about an origin that the log does not tell come last: those of two have nothing in common.
 
     Raises
     ------
@@ -206,9 +224,11 @@ def trajectories_of(
         A vehicle has no valid position.
     """
     tracks, notes = {}, {note: [""] for note in log.notes}
-    for who, channels in log.vehicles.items():
+    alone &= len(log.vehicles) == 1
+    for who in sorted(log.vehicles, key=natural_key):
         reasons: list[str] = []
-        for channel in choose(channels, topics):
+        channels = choose(log.vehicles[who], topics)
+        for channel in sorted(channels, key=lambda c: not alone and c.is_about_unknown_origin):
             try:
                 track = _track_of(channel, origin)
                 break
@@ -313,8 +333,8 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     place = _fields(columns, form.place) * form.units[:3]
     known = np.isfinite(place).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
-    for name in _VALID & columns.keys():
-        known &= columns[name] != 0
+    for name in _VALID.keys() & columns.keys():
+        known &= columns[name] >= _VALID[name]
     if not known.any():
         turned = "is_ned" in columns and not columns["is_ned"].any()
         why = (
@@ -350,6 +370,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     for name in {*form.yaw.split()} & own.keys():
         yaw = own[name].astype(np.float64) * form.units[4]
         yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
+        yaw = yaw if np.isfinite(yaw).all() else None
     resets = _resets(own, time / 1e9, place, velocity)
     if len(resets):
         far = np.linalg.norm(place[resets] - place[resets - 1], axis=1)
@@ -444,24 +465,25 @@ def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) 
     return Channel(topic, name, data, "", _place_of(data, "ref_lat ref_lon ref_alt"))
 
 
-def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
-    """Columns of the messages of a log that matter, by system, message and lane of the estimator.
+def _collect(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
+    """Columns of the messages of a log that matter, by system, message and lane: a core, or a component of a system.
 
     ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log.
     """
     names = {name: own.split() for name, own in _BESIDE.items()}
     for name, form in _MESSAGES:
         every = f"{form.place} {form.velocity} {form.yaw} {form.spread}"
-        names[name] = [*every.split(), "frame_id", *_RESETS]
-    rows: dict[tuple[str, str, int], array[float]] = defaultdict(lambda: array("d"))
+        names[name] = [*every.split(), "frame_id", *_RESETS, *_VALID]
+    rows: dict[tuple[int, str, int], array[float]] = defaultdict(lambda: array("d"))
     while (message := log.recv_match(type=[*names])) is not None:
         kind, received = message.get_type(), message._timestamp
-        who = f"{message.get_srcSystem()}" if hasattr(message, "get_srcSystem") else ""
-        lane = 0 if kind in _BESIDE else getattr(message, "C", getattr(message, "I", 0))
+        who, lane = 0, getattr(message, "C", getattr(message, "I", 0))
+        if hasattr(message, "get_srcSystem"):
+            who, lane = message.get_srcSystem(), message.get_srcComponent()
         stamp = getattr(message, "time_usec", 0.0) / 1e6 or received
         stamp = getattr(message, "time_boot_ms", 1e3 * stamp) / 1e3
         own = (_number_of(message, *name.split("[")) for name in names[kind])
-        rows[who, kind, lane].extend((stamp, received, *own))
+        rows[who, kind, 0 if kind in _BESIDE else lane].extend((stamp, received, *own))
     table = {}
     for key, numbers in rows.items():
         own = np.frombuffer(numbers).reshape(-1, 2 + len(names[key[1]])).T
@@ -476,6 +498,8 @@ def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
 def _number_of(message: Any, field: str, index: str = "") -> float:
     """A field of a message, or the one with an index such as "0]" in it; NaN if there is none."""
     value: Any = getattr(message, field, math.nan)
+    if field == "hdg" and value == _UNKNOWN:
+        return math.nan
     return value[int(index[:-1])] if index else value
 
 
@@ -516,20 +540,24 @@ def _read_tlog(path: Path) -> Log:
 
     with closing(mavlogfile(str(path))) as log:
         table = _collect(log)
-    vehicles: dict[str, list[Channel]] = defaultdict(list)
-    for (who, kind, _), columns in table.items():
+    vehicles: dict[int, list[Channel]] = defaultdict(list)
+    for (who, kind, lane), columns in sorted(table.items(), key=lambda each: each[0][2]):
         if kind not in _BESIDE:
             own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
             place, frame = _place_of(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
             if "frame_id" in columns:
                 frame = _FRAMES.get(int(columns["frame_id"][0]), "")
                 columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)
-            vehicles[f"system {who}"].append(Channel(kind, kind, columns, frame, place))
+            # An autopilot has the least number of those who tell of a system: a camera or a computer may, too.
+            first = all(kind != other.message for other in vehicles[who])
+            name = kind if first else f"{kind}:{lane}"
+            vehicles[who].append(Channel(name, kind, columns, frame, place))
     armed, notes = None, (DAMAGED,) if any(kind == "BAD_DATA" for _, kind, _ in table) else ()
-    if len(vehicles) == 1:
-        ((who, channels),) = vehicles.items()
-        if own := table.get((who.removeprefix("system "), "HEARTBEAT", 0)):
-            armed = own["received"], own["base_mode"].astype(int) & 128
-        vehicles = {"": channels}
-    clock = "that of who wrote the log, less the shortest delay"
-    return Log(vehicles or {"": []}, clock, armed, notes)
+    named = {f"system {who}": channels for who, channels in vehicles.items()}
+    if len(vehicles) < 2:
+        ((who, channels),) = vehicles.items() or [(0, [])]
+        if own := table.get((who, "HEARTBEAT", 0)):
+            flies = own["autopilot"] != _NO_AUTOPILOT
+            armed = own["received"][flies], own["base_mode"][flies].astype(int) & 128
+        named = {"": channels}
+    return Log(named, "that of who wrote the log, less the shortest delay", armed, notes)

@@ -28,8 +28,11 @@ from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
 from rigidfleet.foreign.logs import DAMAGED, RANK, Channel, Log, channel_of_px4, choose
 
-MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
+#: How recordings begin, and what Zstandard packed.
+MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _BILLION = 1_000_000_000
+#: Frames of REP 105 in which robots move; that of odometry moves in the map itself.
+_FRAMES = {"map", "odom"}
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: What no position [m] or quaternion reaches.
@@ -111,8 +114,10 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         chosen = [c for c in chosen if c not in undated]
     if not topics:
         chosen = [c for c in chosen if c.message == chosen[0].message]
-        parts = {c.topic.rpartition(":")[2] for c in chosen if c.message == "TFMessage"}
-        chosen = [c for c in chosen if c.frame not in parts]  # what moves in a body is a part of it
+        bodies = {c.topic.partition(":")[2] for c in chosen if c.message == "TFMessage"} - _FRAMES
+        # What moves in a body is a part of it, and what a robot moves in is no robot.
+        moving = [c for c in chosen if c.topic.partition(":")[2] not in _FRAMES]
+        chosen = [c for c in moving or chosen if c.frame not in bodies]
         others = sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]
         if others:
             notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")
@@ -142,6 +147,10 @@ def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, st
         elif kind in (RANK if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
                 raise fault(f"{topic}: is encoded as {code!r}, not as CDR")
+            if data.startswith(ZSTANDARD):  # recorded with --compression-mode message
+                from zstandard import ZstdDecompressor
+
+                data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
             yield topic, kind, definition if own else "", data, received
 
 
