@@ -97,9 +97,7 @@ class DrawnWays:
             return _greatest_length(shifts[:, 0, k, i] - shifts[:, 0, k, j])
         if _is_of_pairs(name):
             return 2.0 * most
-        if (
-            name == "people"
-        ):  # where a vehicle falls depends on its velocity, for the time of a fall
+        if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
             return most + math.sqrt(2.0 * height / gravity) * _greatest_length(shifts[:, 1])
         values = -self.measurements.close.each if name == "clearance" else None
@@ -271,21 +269,19 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
     else:
         late = _lateness(*explained["offset_s"])
         yield f"the log is {late} against the plan; {applied}. Positions alone do not tell a clock from a lag"
+    turn, scale = explained["turn_deg"], explained["scale"]
     parts = []
-    for key, one, words in (
-        ("turn_deg", 0.0, "turned by {} deg about the vertical"),
-        ("scale", 1.0, "scaled by {}"),
-    ):
-        if (x := explained[key]) and abs(x[0] - one) > _SURE * x[1]:
-            parts.append(words.format(_pair(*x)))
+    if turn and abs(turn[0]) > _SURE * turn[1]:
+        parts.append(f"turned by {_pair(*turn)} deg about the vertical")
+    if scale and abs(scale[0] - 1.0) > _SURE * scale[1]:
+        parts.append(f"scaled by {_pair(*scale)}")
     if any(x and abs(x[0]) > max(_SURE * x[1], _OFF) for x in explained["shift_m"]):
         parts.append(f"shifted by ({', '.join(value(x[0]) for x in explained['shift_m'])}) m")
     if parts:
         far, left = (value(explained[key], "m") for key in ("rms_as_logged_m", "rms_explained_m"))
-        yield (
-            f"against the plan the log is {' and '.join(parts)}. It is judged as flown, {far} off (root mean square); "
-            f"without clock and set-up, {left} are left"
-        )
+        judged = f"It is judged as flown, {far} off (root mean square)"
+        causes = f"against the plan the log is {' and '.join(parts)}"
+        yield f"{causes}. {judged}; without clock and set-up, {left} are left"
     for each in facts["vehicles"]:
         if each["off_its_slot"]:
             off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])

@@ -107,9 +107,8 @@ def read_trajectories(
         if word not in get_args(known):
             raise ValueError(f"there is no {word!r}; use {' or '.join(get_args(known))}")
     if origin and not (abs(origin[0]) < 90.0 and abs(origin[1]) <= 180.0 and abs(origin[2]) < 2e4):
-        raise TrajectoryError(
-            f"origin: {origin} is no place on the Earth. Give latitude, longitude [deg] and height [m]."
-        )
+        remedy = "Give latitude, longitude [deg] and height [m]"
+        raise _error("origin", f"{origin} is no place on the Earth", remedy)
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
@@ -117,61 +116,75 @@ def read_trajectories(
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
-    topics = (topic,) if isinstance(topic, str) else tuple(topic)
-    words, parts = units_of(units, axes), []
+    topics, words = (topic,) if isinstance(topic, str) else tuple(topic), units_of(units, axes)
     options = _Options(interpolation, words, topics, origin, alone=len(listed) == 1)
+    sources, parts = [group[0] for group in listed], []
     for group in listed:
         parts.append(_read_sequence(group, options))
         place = parts[-1].read[0].get("origin")
         options = options._replace(origin=options.origin or (place and tuple(place)))
-    parts = _put_on_one_clock(parts, listed)
-    own_clocks = len(parts) > 1 and any(part.own_clocks for part in parts)
-    kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
-    if len(kinds) > 1:
-        (_, first), (_, second), *_ = kinds.items()
-        why = f"{second}: is of another kind than {first}"
-        raise TrajectoryError(f"{why}. Give files of one kind for one flight.")
-    names = [name for part in parts for name in part.names]
-    sources = [group[0] for part, group in zip(parts, listed, strict=True) for _ in part.names]
-    if len(set(names)) < len(names):
-        stems = [group[0].stem for group in listed]
-        # Tables of one name are told apart by their folders.
-        files = [group[0].stem if stems.count(stem) == 1 else group[0].resolve().parent.name
-                 for stem, group in zip(stems, listed, strict=True)]  # fmt: skip
-        names = [file if len(part.names) == 1 else f"{file}/{name}"
-                 for part, file in zip(parts, files, strict=True) for name in part.names]  # fmt: skip
-    if len(set(names)) < len(names):
-        again = next(name for name in names if names.count(name) > 1)
-        raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
+    parts = _put_on_one_clock(parts, sources)
+    assumed, several = parts[0].assumed, len(parts) > 1
+    for part, source in zip(parts, sources, strict=True):
+        if part.assumed != assumed:
+            remedy = "Give files of one kind for one flight"
+            raise _error(source, f"is of another kind than {sources[0]}", remedy)
+    names = _names_of_vehicles(parts, sources)
     curves = tuple(curve for part in parts for curve in part.curves)
     whose: dict[str, list[str]] = {}
-    for part, group in zip(parts, listed, strict=True):
-        who = group[0].stem if len(parts) > 1 and "clock" in part.read[0] else ""
+    for part, source in zip(parts, sources, strict=True):
         for note in part.notes:
+            who = source.stem if several and "clock" in part.read[0] else ""
             whose.setdefault(note, []).append(who)
     notes = [*logs.of_all(whose)]
-    if len(parts) > 1 and any(part.read[0].get("clock") == logs.GNSS for part in parts):
+    if several and any(part.read[0].get("clock") == logs.GNSS for part in parts):
         notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
+    own_clocks = several and any(part.own_clocks for part in parts)
     if own_clocks:
-        words = "each vehicle has a clock of its own: times of one say nothing of another's"
-        notes.insert(0, words)
+        spans = "away"
+        notes.insert(
+            0, "each vehicle has a clock of its own: times of one say nothing of another's"
+        )
     if len(notes) > _NOTES:
         notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
-    sampled = parts[0].assumed in ASSUMED.values()
-    spans = "away" if own_clocks else spans
+    sampled = assumed in ASSUMED.values()
     away = spans == "away" or (sampled and spans == "refuse")
     since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
     records = _records_of_alike_files(parts)
     measured = tuple(own for part in parts for own in part.measured)
     measured = measured if len(measured) == len(curves) else ()
-    read = Trajectories(
-        tuple(names), curves, parts[0].assumed, (), records, away, since, measured, own_clocks
-    )
-    notes += _notes_on_gaps(read, sources, spans, gaps) if sampled else []
+    read = Trajectories(names, curves, assumed, (), records, away, since, measured, own_clocks)
+    if sampled:
+        whence = [x for part, x in zip(parts, sources, strict=True) for _ in part.names]
+        notes += _notes_on_gaps(read, whence, spans, gaps)
     return read._replace(notes=(*left_out, *notes, *_note_on_spans(read)))
 
 
-def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[Trajectories]:
+def _error(where: object, why: str, remedy: str) -> TrajectoryError:
+    return TrajectoryError(f"{where}: {why}. {remedy}.")
+
+
+def _names_of_vehicles(parts: list[Trajectories], sources: list[Path]) -> tuple[str, ...]:
+    """Names as files have them; if two are alike, those of files, or of their folders, say whose they are.
+
+    Raises
+    ------
+    TrajectoryError
+        Two are alike all the same.
+    """
+    names = [name for part in parts for name in part.names]
+    if len(set(names)) < len(names):
+        stems = [path.stem for path in sources]
+        files = [x.stem if stems.count(x.stem) == 1 else x.resolve().parent.name for x in sources]
+        own = [(file, part.names) for file, part in zip(files, parts, strict=True)]
+        names = [f"{x}/{name}" if len(every) > 1 else x for x, every in own for name in every]
+    for again in names if len(set(names)) < len(names) else ():
+        if names.count(again) > 1:
+            raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
+    return tuple(names)
+
+
+def _put_on_one_clock(parts: list[Trajectories], sources: list[Path]) -> list[Trajectories]:
     """The same parts, those that count their times from a date all from the first one.
 
     Raises
@@ -179,19 +192,15 @@ def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> li
     TrajectoryError
         Some times are dates and others not.
     """
-    since = [part.read[0].get("since_1970_ns") for part in parts]
-    dated = [x for x in since if x is not None]
-    if not dated:
-        return parts
-    if len(dated) < len(parts):
-        i, j = since.index(None), next(k for k, x in enumerate(since) if x is not None)
-        raise TrajectoryError(
-            f"{listed[i][0]}: has times that are no dates, and {listed[j][0]} has dates. Give all files one clock."
-        )
-    begins = [(x - min(dated)) / 1e9 for x in dated]
+    dates = [part.read[0].get("since_1970_ns") for part in parts]
+    dated = {date: source for date, source in zip(dates, sources, strict=True) if date is not None}
+    if dated and None in dates:
+        why = f"has times that are no dates, and {next(iter(dated.values()))} has dates"
+        raise _error(sources[dates.index(None)], why, "Give all files one clock")
+    since = [(date - min(dated)) / 1e9 if dated else 0.0 for date in dates]
     return [
         part._replace(curves=tuple(curve.later(begin) for curve in part.curves))
-        for part, begin in zip(parts, begins, strict=True)
+        for part, begin in zip(parts, since, strict=True)
     ]
 
 
@@ -231,28 +240,23 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     files = [p for p in inside if p.is_file() and _is_read(p)]
     kinds = {p.suffix.lower() for p in files}
     if len(kinds) > 1:
-        raise TrajectoryError(
-            f"{path}: the folder has files {' and '.join(sorted(kinds))}. Give files of one kind for one flight."
-        )
+        why = f"the folder has files {' and '.join(sorted(kinds))}"
+        raise _error(path, why, "Give files of one kind for one flight")
     if files:
         return [[p] for p in files]
     folders = [p for p in inside if p.is_dir()]
-    groups = [[p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders]
-    if not groups or not all(groups):
-        bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
-        raise TrajectoryError(
-            f"{bare}: the folder has no .csv, .skyc, .mcap or log. Give a folder with one table a vehicle."
-        )
-    for group in groups:
+    groups = {x: [p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders}
+    for folder, group in groups.items() or [(path, [])]:
+        if not group:
+            why = "the folder has no .csv, .skyc, .mcap or log"
+            raise _error(folder, why, "Give a folder with one table a vehicle")
         numbers = zip(*(re.findall(r"\d+", p.stem) for p in group), strict=False)
         counts = [[int(x) for x in column] for column in numbers if len({*column}) > 1]
         whole = [[*range(first, first + len(group))] for first in (0, 1)]
         if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
-            raise TrajectoryError(
-                f"{group[0].parent}: {first_few([p.name for p in group])} are no sequence. Number the tables that a "
-                "vehicle flies one after the other from 0 or 1 on, and leave none out."
-            )
-    return groups
+            remedy = "Number the tables that a vehicle flies one after the other from 0 or 1 on, and leave none out"
+            raise _error(folder, f"{first_few([p.name for p in group])} are no sequence", remedy)
+    return [*groups.values()]
 
 
 def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
@@ -264,18 +268,15 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
         One of them may be a further vehicle.
     """
     read = {p for group in listed for p in group}
-    rest = [
-        p for p in sorted(path.rglob("*"), key=logs.natural_key) if p.is_file() and p not in read
-    ]
+    inside = sorted(path.rglob("*"), key=logs.natural_key)
+    rest = [p for p in inside if p.is_file() and p not in read]
     for p in rest:
         hidden = _is_read(p) and not _is_hidden(p)
         with suppress(TrajectoryError):
             hidden = hidden or bool(_read_file([p], _Options("linear", units_of(None, None))))
         if hidden:
-            raise TrajectoryError(
-                f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
-                "move it out of the folder."
-            )
+            why = f"may be a further vehicle, but is not read beside {listed[0][0].name}"
+            raise _error(p, why, "Give its path as well, or move it out of the folder")
     names = first_few([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
 
@@ -317,15 +318,13 @@ def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
         return _read_file(group, options)
     parts = [_read_file([path], options) for path in group]
     if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
-        raise TrajectoryError(
-            f"{group[0]}: only tables of polynomials follow each other. Give a folder with one table a vehicle."
-        )
+        why = "only tables of polynomials follow each other"
+        raise _error(group[0], why, "Give a folder with one table a vehicle")
     curve, *more = (part.curves[0] for part in parts)
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
         curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
-    name = group[0].parent.name
-    return Trajectories((name,), (curve,), parts[0].assumed, parts[0].notes, parts[0].read)
+    return parts[0]._replace(names=(group[0].parent.name,), curves=(curve,))
 
 
 def _read_file(parts: list[Path], options: _Options) -> Trajectories:
@@ -409,18 +408,14 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         steps, (first, last) = np.diff(curve.time), curve.time[[0, -1]]
         shares = steps / (np.median(steps) * (1.0 + _ROUNDING))
         if spans == "refuse" and max(first - begin, end - last) * shares[0] > steps[0]:
-            raise TrajectoryError(
-                f"{source}: {name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s. "
-                "Give all vehicles the same span of time, or say what it does before and after: `assess --spans stand` "
-                "or `--spans away`."
-            )
+            why = f"{name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s"
+            remedy = "Give all vehicles the same span of time, or say what it does before and after: `assess --spans "
+            raise _error(source, why, f"{remedy}stand` or `--spans away`")
         k = int(shares.argmax())
         if gaps == "refuse" and shares[k] > _LONGEST:
-            raise TrajectoryError(
-                f"{source}: {name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, "
-                f"{shares[k]:.0f} times its usual step. Give its samples, or let the curve bridge the gap: `assess "
-                "--gaps bridge`."
-            )
+            why = f"{name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, {shares[k]:.0f} times"
+            remedy = "Give its samples, or let the curve bridge the gap: `assess --gaps bridge`"
+            raise _error(source, f"{why} its usual step", remedy)
         holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
         moves = np.linalg.norm(np.diff(curve.pieces[:, :3, 0], axis=0), axis=1)
         moving = np.flatnonzero(moves > 1e-9)

@@ -74,9 +74,8 @@ _GLOBAL = _Fields("geodetic", "lat lon alt", spread=_EPH)
 _GPS = _Fields("geodetic", "latitude_deg longitude_deg altitude_msl_m", spread=_EPH)
 _ODOMETRY = _Fields("ned", "position[0] position[1] position[2]")
 _ODOMETRY = _ODOMETRY._replace(spread=_ODOMETRY.place.replace("position", "position_variance"))
-_FRAMED = _Fields(
-    "ned", "x y z", spread="pose_covariance[0] pose_covariance[6] pose_covariance[11]"
-)
+_COVARIANCES = "pose_covariance[0] pose_covariance[6] pose_covariance[11]"
+_FRAMED = _Fields("ned", "x y z", spread=_COVARIANCES)
 _FILTER = _Fields("ned", "PN PE PD", "VN VE VD", "Yaw", _VARIANCES, (1.0, 1.0, 1.0, 1.0, _DEGREE))
 _POSE = _Fields("enu", "x y z", "vx vy vz", "yaw", "var_x var_y var_z")
 #: Messages with places, those that are preferred first; one has two forms.
@@ -161,9 +160,9 @@ def read_log(path: Path) -> Log:
     """
     with path.open("rb") as file:
         head = file.read(8)
-    package, read = "pymavlink", _read_bin if head.startswith(BIN) else _read_tlog
-    if head.startswith(ULOG):
-        package, read = "pyulog", _read_ulog
+    readers = {ULOG: _read_ulog, BIN: _read_bin}
+    read = next((own for begin, own in readers.items() if head.startswith(begin)), _read_tlog)
+    package = "pyulog" if read is _read_ulog else "pymavlink"
     if find_spec(package) is None:
         raise fault(f"needs the package {package!r}", "Run: pip install rigidfleet[logs]")
     complaints = _Complaints()
@@ -223,7 +222,8 @@ def trajectories_of(
     ContentError
         A vehicle has no valid position.
     """
-    tracks, notes = {}, {note: [""] for note in log.notes}
+    tracks: dict[str, _Track] = {}
+    notes = {note: [""] for note in log.notes}
     alone &= len(log.vehicles) == 1
     for who in sorted(log.vehicles, key=natural_key):
         reasons: list[str] = []
@@ -242,38 +242,34 @@ def trajectories_of(
         for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
             notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
-    first = min(int(track.time[0]) for track in tracks.values())
+    every = tracks.values()
+    first, last = min(int(x.time[0]) for x in every), max(int(x.time[-1]) for x in every)
     zero = first if first > _DATES else 0
-    curves, measured = [], []
-    for track in tracks.values():
-        time = (track.time - first) / 1e9 + (first - zero) / 1e9  # whole numbers lose none
-        where = lambda k, topic=track.topic: f"{topic}: message {k + 1}"  # noqa: E731
-        curves.append(curve_through_samples(time, track.place, track.yaw, interpolation, where))
-        size = len(curves[-1].time), 3  # a single sample stays for a second
-        both = track.velocity, track.deviation
-        each = (None if x is None else np.resize(x, size) for x in both)
-        measured.append(LoggedStates(*each, track.resets))
+    seconds = lambda time: (time - first) / 1e9 + (first - zero) / 1e9  # noqa: E731  # whole numbers lose none
+    samples = [(seconds(x.time), x.place, x.yaw) for x in every]
+    curves = [curve_through_samples(*own, interpolation, str) for own in samples]
     if not topics and all(who == track.topic for who, track in tracks.items()):
         _refuse_twins([*tracks], curves)
-    frames = [*dict.fromkeys(track.frame for track in tracks.values())]
+    frames = [*dict.fromkeys(track.frame for track in every)]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
         notes[f"positions are in frames {words}: where one is in another is not known"] = [""]
     record: dict[str, Any] = {
-        "topics": [*dict.fromkeys(track.topic for track in tracks.values())][:20], "frame": frames[0],
+        "topics": [*dict.fromkeys(track.topic for track in every)][:20], "frame": frames[0],
         "clock": log.clock or "the vehicle's own, from its start", "since_1970_ns": zero or None,
-        "rows": sum(len(track.time) for track in tracks.values()),
+        "rows": sum(len(track.time) for track in every),
     }  # fmt: skip
-    if any(track.origin for track in tracks.values()):
+    if any(track.origin for track in every):
         record["origin"] = list(origin or ())
     if log.armed is not None:
         time, on = log.armed
         k = np.flatnonzero(np.diff(np.concatenate([[0], on != 0, [0]])))
-        spans = (np.append(time, time[-1:])[k].reshape(-1, 2) - zero) / 1e9
+        spans = seconds(np.append(time, max([last, *time[-1:]]))[k].reshape(-1, 2))
         record["armed"] = [f"{a:.6g} to {b:.6g} s" for a, b in spans[:_LISTED]] or "never"
-    lines = tuple(of_all(notes))
-    read = Trajectories(tuple(tracks), tuple(curves), ASSUMED[interpolation], lines, (record,))
-    return read._replace(measured=tuple(measured), own_clocks=not log.clock)
+    return Trajectories(
+        tuple(tracks), tuple(curves), ASSUMED[interpolation], tuple(of_all(notes)), (record,),
+        measured=tuple(track.measured for track in every), own_clocks=not log.clock,
+    )  # fmt: skip
 
 
 def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
@@ -302,18 +298,16 @@ def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
 
 
 class _Track(NamedTuple):
-    """Times (K,) [ns], places, velocities, deviations (K, 3) in east, north, up, yaws (K,), and resets of a vehicle."""
+    """Times (K,) [ns], places (K, 3) in east, north, up, and yaws (K,) of a vehicle, and what its log says beside."""
 
     topic: str
     frame: str
     time: Ints
     place: Floats
-    velocity: Floats | None
-    deviation: Floats | None
     yaw: Floats | None
+    measured: LoggedStates
     origin: Geodetic | None
     notes: list[str]
-    resets: Ints
 
 
 def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
@@ -336,12 +330,9 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     for name in _VALID.keys() & columns.keys():
         known &= columns[name] >= _VALID[name]
     if not known.any():
-        turned = "is_ned" in columns and not columns["is_ned"].any()
-        why = (
-            "positions are in a frame that is turned anyhow to north"
-            if turned
-            else "no position is valid"
-        )
+        why = "no position is valid"
+        if not columns.get("is_ned", known | True).any():
+            why = "positions are in a frame that is turned anyhow to north"
         raise fault(f"{channel.topic}: {why}")
     if not known.all():
         notes.append(f"{np.sum(~known):,} samples without a valid position are left out")
@@ -374,16 +365,15 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     resets = _resets(own, time / 1e9, place, velocity)
     if len(resets):
         far = np.linalg.norm(place[resets] - place[resets - 1], axis=1)
-        when = (time[resets] - time[0]) / 1e9
-        words = ", ".join(
-            f"{x:.3g} m at {t:.6g} s" for x, t in zip(far[:_LISTED], when, strict=False)
-        )
+        steps = zip(far[:_LISTED], (time[resets] - time[0]) / 1e9, strict=False)
+        words = ", ".join(f"{x:.3g} m at {t:.6g} s" for x, t in steps)
         words += f" from its first sample ({len(resets):,} times in all): no vehicle flew that"
         notes.append(f"the estimator moves its position by {words}")
     origin, frame = reference and (origin or reference), f"{frame} {channel.frame}".strip()
-    return _Track(
-        channel.topic, frame, time, place, velocity, deviation, yaw, origin, notes, resets
-    )
+    count = max(len(time), 2), 3  # a single sample stays for a second
+    beside = (None if x is None else np.resize(x, count) for x in (velocity, deviation))
+    states = LoggedStates(*beside, resets)
+    return _Track(channel.topic, frame, time, place, yaw, states, origin, notes)
 
 
 def _fields(columns: dict[str, Any], names: str) -> Floats:
@@ -440,12 +430,11 @@ def _read_ulog(path: Path) -> Log:
         if (known := data["time_utc_usec"] > 0).any():
             late = data["time_utc_usec"].astype(np.int64) - data["timestamp"].astype(np.int64)
             after = int(np.median((late - data.get("timestamp_time_relative", 0))[known]))
-    for name, number, data in ((x.name, x.multi_id, x.data) for x in log.data_list):
-        channel = channel_of_px4(f"{name}:{number}" if number else name, name, data, after)
-        if name == "actuator_armed":
-            armed = data["time"], data["armed"]
-        else:
-            channels.append(channel)
+    for x in log.data_list:
+        topic = f"{x.name}:{x.multi_id}" if x.multi_id else x.name
+        channels.append(channel_of_px4(topic, x.name, x.data, after))
+        if x.name == "actuator_armed":
+            armed = channels.pop().columns["time"], x.data["armed"]
     notes = [DAMAGED] * log.file_corruption
     if lost := [x.duration / 1e3 for x in log.dropouts]:
         words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"

@@ -14,10 +14,12 @@ import re
 import sqlite3
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -80,20 +82,12 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     unread: dict[str, str] = {}
     notes: list[str] = []
     try:
-        for topic, kind, definition, data, received in (
-            each for path in paths for each in _messages(path, unread)
-        ):
-            layout = _layout(definition, data[1:2] == b"\1") if definition else None
-            try:
-                for who, frame, stamp, numbers in _decode(kind, layout, data):
-                    new = _Rows(kind, layout, frame, array("q"), array("q"), array("d"))
-                    own = rows.setdefault(f"{topic}{who}", new)
-                    own.stamps.append(stamp)
-                    own.received.append(received)
-                    own.numbers.extend(numbers)
-            except struct.error:
-                where = f"{topic}: message {len(rows[topic].stamps) + 1 if topic in rows else 1}"
-                raise fault(f"{where}: is cut off", "Record again") from None
+        for each in chain.from_iterable(_places(path, unread) for path in paths):
+            topic, first, stamp, received, numbers = each
+            own = rows.setdefault(topic, _Rows(*first, array("q"), array("q"), array("d")))
+            own.stamps.append(stamp)
+            own.received.append(received)
+            own.numbers.extend(numbers)
     except ContentError:
         raise
     except ImportError as error:
@@ -128,11 +122,19 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     return Log({c.topic: [c] for c in chosen}, clock, None, tuple(notes))
 
 
-def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, str, bytes, int]]:
-    """Topic, kind, definition ("" but of PX4's), content and time of recording [ns] of each message with positions.
+def _places(
+    path: Path, unread: dict[str, str]
+) -> Iterator[tuple[str, Any, int, int, Sequence[float]]]:
+    """Topic and body, how `_Rows` begin, stamp, time of recording [ns] and numbers of each position in a file.
 
     Topics that seem to have some and cannot be read get a reason in ``unread``.
+
+    Raises
+    ------
+    ContentError
+        A message is encoded in another way, or cut off.
     """
+    count: Counter[str] = Counter()
     with path.open("rb") as stream:
         records = _records_of_sqlite if stream.read(16) == SQLITE else _records_of_mcap
     for topic, name, code, definition, data, received in records(path):
@@ -151,7 +153,14 @@ def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, st
                 from zstandard import ZstdDecompressor
 
                 data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
-            yield topic, kind, definition if own else "", data, received
+            layout = _layout(definition, data[1:2] == b"\1") if own else None
+            count[topic] += 1
+            try:
+                for who, frame, stamp, numbers in _decode(kind, layout, data):
+                    yield f"{topic}{who}", (kind, layout, frame), stamp, received, numbers
+            except struct.error:
+                where = f"{topic}: message {count[topic]}"
+                raise fault(f"{where}: is cut off", "Record again") from None
 
 
 def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, str, bytes, int]]:

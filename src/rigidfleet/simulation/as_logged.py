@@ -91,9 +91,8 @@ def judge_log(
         raise TrajectoryError(f"the plan {plan.mission.name!r} {words}. Give the log of each.")
     if read.own_clocks:
         if plan is None:
-            raise TrajectoryError(
-                "each vehicle has a clock of its own. Give a plan to compare them with."
-            )
+            words = "each vehicle has a clock of its own. Give a plan to compare them with."
+            raise TrajectoryError(words)
         doubts = doubts._replace(clock="own")
     flown, drawn, estimate, alignment = _likely_flight(read, plan, doubts, judged)
     deviations = None if drawn is None else DrawnWays(flown, drawn)
@@ -111,9 +110,8 @@ def _likely_flight(
     sizes = [x.deviation for x in read.measured if x.deviation is not None]
     known = len(sizes) == len(logs) and all((x > 0.0).all() for x in sizes)
     if doubts.noise == "log" and not known:
-        raise TrajectoryError(
-            f"{read.names[0]}: the log does not say its noise. State it: --noise."
-        )
+        words = "the log does not say its noise. State it: --noise."
+        raise TrajectoryError(f"{read.names[0]}: {words}")
     if doubts.noise in ("log", "") and known:
         # The least of a log is the unit.
         least = float(min(x.min() for x in sizes))
@@ -136,15 +134,13 @@ def _likely_flight(
     ends = np.array([log.time[[0, -1]] for log in logs])
     if planned is not None:
         ends += np.array([[-1.0, 1.0]]) * [[np.median(np.diff(log.time))] for log in logs]
-    whole = join(
-        [each.way.between(*end) for each, end in zip(smoothed, ends.tolist(), strict=True)]
-    )
+    each = zip(smoothed, ends.tolist(), strict=True)
+    whole = join([own.way.between(*end) for own, end in each])
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
-        flown = of_curve(
-            whole.beside(blank), WORDS, names=read.names, spans=spans, since=read.since, **judged
-        )
+        judged |= {"names": read.names, "spans": spans, "since": read.since}
+        flown = of_curve(whole.beside(blank), WORDS, **judged)
     else:
         flown = flight_of_plan(plan, planned, whole, spans)
     del whole, planned  # large
@@ -218,9 +214,8 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
         return np.zeros((2, 1))
     offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
-        raise TrajectoryError(
-            "the clock cannot be told: the plan hardly moves. Give logs of one clock, with --clock recorded."
-        )
+        why = "the clock cannot be told: the plan hardly moves"
+        raise TrajectoryError(f"{why}. Give logs of one clock, with --clock recorded.")
     return offsets
 
 
