@@ -158,21 +158,17 @@ def verdict_with_doubt(
     """
     checks, resets = [], facts.get("resets_s", [])
     for check in verdict.checks:
-        why = "" if deviations else "the noise is not told. State it: --noise"
-        if not shared and _is_of_pairs(check.check):
+        name, why = check.check, "" if deviations else "the noise is not told. State it: --noise"
+        if not shared and _is_of_pairs(name):
             why = "vehicles have no common clock"
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
-        if check.check in _UNSEEN:
-            continue
-        if check.check in _CERTAIN:
-            checks.append(check)
-        elif why or deviations is None:
-            words = f"{check.check.replace('_', ' ')} is not judged: {why}"
-            undecided = replace(check, passed=False, undecided=True, message=words)
-            checks.append(undecided if check.judged else check)
-        else:
+        if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
             check = _with_interval(check, deviations.of_check(check), facts["noise_m"])  # noqa: PLW2901
-            checks.append(_unless_reset(check, resets))
+            check = _unless_reset(check, resets)  # noqa: PLW2901
+        elif why and check.judged and name not in _CERTAIN:
+            words = f"{name.replace('_', ' ')} is not judged: {why}"
+            check = replace(check, passed=False, undecided=True, message=words)  # noqa: PLW2901
+        checks += [check] * (name not in _UNSEEN)
     return replace(verdict, checks=checks, doubt=facts, notes=[*doubt_notes(facts), *verdict.notes])
 
 
@@ -219,12 +215,9 @@ def facts_of(
     flown: Result, deviations: DrawnWays | None, estimate: NoiseEstimate, alignment: Alignment | None, clock: str
 ) -> dict[str, Any]:  # fmt: skip
     """What is told of noise, clock, set-up and, beside a plan, of vehicles: how far off their slots, and when."""
-    noise = estimate.noise
-    facts: dict[str, Any] = {
-        "noise_m": None if noise is None else noise.sigma,
-        "correlation_s": None if noise is None else noise.tau,
-        "source": estimate.source, "remark": estimate.words, "clock": clock,
-    }  # fmt: skip
+    sigma, tau = estimate.noise or (None, None)
+    facts: dict[str, Any] = {"noise_m": sigma, "correlation_s": tau, "source": estimate.source}
+    facts |= {"remark": estimate.words, "clock": clock}
     if resets := flown.statistics["resets"]:
         facts["resets_s"] = resets
     if alignment is None:

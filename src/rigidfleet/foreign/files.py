@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -52,16 +52,6 @@ _SUFFIXES = {".csv", ".skyc"} | _RECORDINGS | _LOGS
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
 #: Share of a number that is rounding, and the greatest number of things that a note lists.
 _ROUNDING, _LISTED = 1e-6, 5
-
-
-class _Options(NamedTuple):
-    """How files are read; see `read_trajectories`."""
-
-    interpolation: Interpolation
-    units: Units
-    topics: tuple[str, ...] = ()
-    origin: logs.Geodetic | None = None
-    alone: bool = True
 
 
 def read_trajectories(
@@ -117,14 +107,12 @@ def read_trajectories(
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
     topics, words = (topic,) if isinstance(topic, str) else tuple(topic), units_of(units, axes)
-    options = _Options(interpolation, words, topics, origin, alone=len(listed) == 1)
-    sources, parts = [group[0] for group in listed], []
+    sources, parts, several = [group[0] for group in listed], [], len(listed) > 1
     for group in listed:
-        parts.append(_read_sequence(group, options))
-        place = parts[-1].read[0].get("origin")
-        options = options._replace(origin=options.origin or (place and tuple(place)))
+        parts.append(_read_sequence(group, interpolation, words, topics, origin, several))
+        origin = origin or parts[-1].read[0].get("origin")
     parts = _put_on_one_clock(parts, sources)
-    assumed, several = parts[0].assumed, len(parts) > 1
+    assumed = parts[0].assumed
     for part, source in zip(parts, sources, strict=True):
         if part.assumed != assumed:
             remedy = "Give files of one kind for one flight"
@@ -273,7 +261,9 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
     for p in rest:
         hidden = _is_read(p) and not _is_hidden(p)
         with suppress(TrajectoryError):
-            hidden = hidden or bool(_read_file([p], _Options("linear", units_of(None, None))))
+            hidden = hidden or bool(
+                _read_file([p], "linear", units_of(None, None), (), None, False)
+            )
         if hidden:
             why = f"may be a further vehicle, but is not read beside {listed[0][0].name}"
             raise _error(p, why, "Give its path as well, or move it out of the folder")
@@ -312,11 +302,11 @@ def _is_hidden(path: Path) -> bool:
     return path.name.startswith((".", "__MACOSX"))
 
 
-def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
+def _read_sequence(group: list[Path], *options: Any) -> Trajectories:
     """What is in the file of a vehicle, in the parts of a recording, or in several files that follow each other."""
     if len(group) == 1 or group[0].suffix.lower() in _RECORDINGS:
-        return _read_file(group, options)
-    parts = [_read_file([path], options) for path in group]
+        return _read_file(group, *options)
+    parts = [_read_file([path], *options) for path in group]
     if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
         why = "only tables of polynomials follow each other"
         raise _error(group[0], why, "Give a folder with one table a vehicle")
@@ -327,9 +317,11 @@ def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
     return parts[0]._replace(names=(group[0].parent.name,), curves=(curve,))
 
 
-def _read_file(parts: list[Path], options: _Options) -> Trajectories:
-    """What is in one file, or in the parts of a recording, by its content."""
-    path, (interpolation, units, topics, origin, alone) = parts[0], options
+def _read_file(
+    parts: list[Path], interpolation: str, units: Units, topics: tuple[str, ...], origin: Any, several: bool
+) -> Trajectories:  # fmt: skip
+    """What is in one file of ``several``, or in the parts of a recording, by its content; see `read_trajectories`."""
+    path = parts[0]
     head, suffix, log = _head_of(path), path.suffix.lower(), None
     for begin, why in _REFUSED.items():
         if head.startswith(begin):
@@ -338,10 +330,9 @@ def _read_file(parts: list[Path], options: _Options) -> Trajectories:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
             log = poses.read_recording(parts, topics)
         elif head.startswith((logs.ULOG, logs.BIN)) or suffix in _LOGS:
-            log = logs.read_log(path)
+            log = logs.read_log(path, head)
         if log is not None:
-            stem = path.stem
-            read = logs.trajectories_of(log, stem, interpolation, topics, origin, alone=alone)
+            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin, several)
         elif topics:
             raise fault("has no topics", "Remove --topic")
         elif head.startswith(_ZIP) or suffix == ".skyc":
@@ -454,11 +445,9 @@ def _note_on_spans(read: Trajectories) -> list[str]:
     """A note if vehicles begin or end at different times."""
     starts, ends = np.array([curve.time[[0, -1]] for curve in read.curves]).T
     begin, end = starts.min(), ends.max()
-    part = [
-        f"{name!r} from {a:.9g} to {b:.9g} s"
-        for name, a, b in zip(read.names, starts, ends, strict=True)
-        if max(a - begin, end - b) > 1e-6
-    ]
+    every = zip(read.names, starts, ends, strict=True)
+    short = [each for each in every if max(each[1] - begin, end - each[2]) > 1e-6]
+    part = [f"{name!r} from {a:.9g} to {b:.9g} s" for name, a, b in short]
     if not part:
         return []
     if not read.away:

@@ -78,26 +78,21 @@ _COVARIANCES = "pose_covariance[0] pose_covariance[6] pose_covariance[11]"
 _FRAMED = _Fields("ned", "x y z", spread=_COVARIANCES)
 _FILTER = _Fields("ned", "PN PE PD", "VN VE VD", "Yaw", _VARIANCES, (1.0, 1.0, 1.0, 1.0, _DEGREE))
 _POSE = _Fields("enu", "x y z", "vx vy vz", "yaw", "var_x var_y var_z")
-#: Messages with places, those that are preferred first; one has two forms.
-_MESSAGES = [
-    ("vehicle_local_position", _LOCAL), ("vehicle_odometry", _ODOMETRY), ("vehicle_odometry", _FRAMED),
-    ("vehicle_global_position", _GLOBAL),
-    *[(name, form) for name in ("vehicle_gps_position", "sensor_gps")
-      for form in (_GPS, _GLOBAL._replace(units=_INTEGERS))],
-    ("vehicle_mocap_odometry", _ODOMETRY), ("vehicle_visual_odometry", _ODOMETRY), ("estimator_odometry", _ODOMETRY),
-    ("estimator_local_position", _LOCAL), ("estimator_global_position", _GLOBAL),
-    ("vehicle_local_position_groundtruth", _LOCAL), ("vehicle_global_position_groundtruth", _GLOBAL),
-    ("LOCAL_POSITION_NED", _Fields("ned", "x y z", "vx vy vz")),
-    ("GLOBAL_POSITION_INT", _Fields("geodetic", "lat lon alt", "vx vy vz", "hdg", "", _INTEGERS)),
-    ("ODOMETRY", _FRAMED), ("ATT_POS_MOCAP", _Fields("ned", "x y z")),
-    ("GPS_RAW_INT", _Fields("geodetic", "lat lon alt", units=_INTEGERS)),
-    ("XKF1", _FILTER), ("NKF1", _FILTER), ("EKF1", _FILTER),
-    *[(name, _Fields("geodetic", "Lat Lng Alt")) for name in ("POS", "GPS", "SIM")],
-    *[(name, _POSE) for name in ("PoseStamped", "NamedPoseArray", "Odometry", "PoseWithCovarianceStamped",
-                                 "TransformStamped", "TFMessage")],
-    ("NavSatFix", _GLOBAL._replace(spread="")),
-]  # fmt: skip
-RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
+#: What messages with places may have, those that are preferred first.
+FORMS: dict[str, list[_Fields]] = {name: forms for *forms, names in (
+    (_LOCAL, "vehicle_local_position"), (_ODOMETRY, _FRAMED, "vehicle_odometry"), (_GLOBAL, "vehicle_global_position"),
+    (_GPS, _GLOBAL._replace(units=_INTEGERS), "vehicle_gps_position sensor_gps"),
+    (_ODOMETRY, "vehicle_mocap_odometry vehicle_visual_odometry estimator_odometry"),
+    (_LOCAL, "estimator_local_position"), (_GLOBAL, "estimator_global_position"),
+    (_LOCAL, "vehicle_local_position_groundtruth"), (_GLOBAL, "vehicle_global_position_groundtruth"),
+    (_Fields("ned", "x y z", "vx vy vz"), "LOCAL_POSITION_NED"),
+    (_Fields("geodetic", "lat lon alt", "vx vy vz", "hdg", "", _INTEGERS), "GLOBAL_POSITION_INT"),
+    (_FRAMED, "ODOMETRY"), (_Fields("ned", "x y z"), "ATT_POS_MOCAP"),
+    (_Fields("geodetic", "lat lon alt", units=_INTEGERS), "GPS_RAW_INT"),
+    (_FILTER, "XKF1 NKF1 EKF1"), (_Fields("geodetic", "Lat Lng Alt"), "POS GPS SIM"),
+    (_POSE, "PoseStamped NamedPoseArray Odometry PoseWithCovarianceStamped TransformStamped TFMessage"),
+    (_GLOBAL._replace(spread=""), "NavSatFix"),
+) for name in names.split()}  # fmt: skip
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
 _BESIDE = {
     "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
@@ -105,7 +100,7 @@ _BESIDE = {
 }  # fmt: skip
 #: What fields are at least where a place is valid (a fix of GNSS in three dimensions is 3), and those that count how
 #: often an estimator set it anew.
-_VALID = {name: 1 for name in ("xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned")}
+_VALID = dict.fromkeys(("xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"), 1)
 _VALID |= {"fix_type": 3, "Status": 3}
 _RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
 #: What MAVLink writes for a heading that is not known [0.01 deg], and who is no autopilot.
@@ -131,12 +126,6 @@ class Channel(NamedTuple):
     frame: str = ""
     reference: Geodetic | None = None
 
-    @property
-    def is_about_unknown_origin(self) -> bool:
-        """Whether positions are about an origin that the log of an autopilot does not tell."""
-        form = next(form for name, form in _MESSAGES if name == self.message)
-        return form.frame == "ned" and self.reference is None
-
 
 class Log(NamedTuple):
     """Channels of each vehicle ("" if it is the only one), whose clock they have, when it was armed, and notes.
@@ -150,16 +139,14 @@ class Log(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read_log(path: Path) -> Log:
-    """The log of an autopilot, by its content.
+def read_log(path: Path, head: bytes) -> Log:
+    """The log of an autopilot, by how it begins.
 
     Raises
     ------
     ContentError
         A package is missing, or the log is damaged.
     """
-    with path.open("rb") as file:
-        head = file.read(8)
     readers = {ULOG: _read_ulog, BIN: _read_bin}
     read = next((own for begin, own in readers.items() if head.startswith(begin)), _read_tlog)
     package = "pyulog" if read is _read_ulog else "pymavlink"
@@ -200,7 +187,7 @@ def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
         words = f" {' or '.join(topics)}" if topics else ""
         every = ", ".join(sorted(c.topic for c in channels)[:20]) or "none"
         raise fault(f"has no topic{words} with positions", f"Topics with positions are: {every}")
-    return sorted(chosen, key=lambda c: RANK[c.message])
+    return sorted(chosen, key=lambda c: [*FORMS].index(c.message))
 
 
 def natural_key(name: object) -> list[tuple[int, str]]:
@@ -210,12 +197,12 @@ def natural_key(name: object) -> list[tuple[int, str]]:
 
 
 def trajectories_of(
-    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None, *, alone: bool
+    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None, several: bool
 ) -> Trajectories:  # fmt: skip
     """Curves through the places of a log, in east, north, up about an origin; vehicles in the order of their names.
 
-    Without one, places are about the origin of the first vehicle's estimator, or its first place. Unless a vehicle is
-    ``alone``, places about an origin that the log does not tell come last: those of two have nothing in common.
+    Without one, places are about the origin of the first vehicle's estimator, or its first place. Of ``several``
+    vehicles, places about an origin that the log does not tell come last: those of two have nothing in common.
 
     Raises
     ------
@@ -224,11 +211,12 @@ def trajectories_of(
     """
     tracks: dict[str, _Track] = {}
     notes = {note: [""] for note in log.notes}
-    alone &= len(log.vehicles) == 1
+    several |= len(log.vehicles) > 1
     for who in sorted(log.vehicles, key=natural_key):
         reasons: list[str] = []
         channels = choose(log.vehicles[who], topics)
-        for channel in sorted(channels, key=lambda c: not alone and c.is_about_unknown_origin):
+        unlike = lambda c: several and FORMS[c.message][0].frame == "ned" and c.reference is None  # noqa: E731
+        for channel in sorted(channels, key=unlike):
             try:
                 track = _track_of(channel, origin)
                 break
@@ -319,7 +307,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         It has no valid one.
     """
     columns, notes, reference = channel.columns, [], channel.reference
-    forms = [form for name, form in _MESSAGES if name == channel.message]
+    forms = FORMS[channel.message]
     form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
@@ -361,7 +349,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     for name in {*form.yaw.split()} & own.keys():
         yaw = own[name].astype(np.float64) * form.units[4]
         yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
-        yaw = yaw if np.isfinite(yaw).all() else None
+        yaw = yaw if np.isfinite(yaw).all() and (own[name] != _UNKNOWN).all() else None
     resets = _resets(own, time / 1e9, place, velocity)
     if len(resets):
         far = np.linalg.norm(place[resets] - place[resets - 1], axis=1)
@@ -423,7 +411,7 @@ def _read_ulog(path: Path) -> Log:
     from pyulog import ULog
 
     with path.open("rb") as file:
-        log = ULog(file, ["actuator_armed", *RANK])
+        log = ULog(file, ["actuator_armed", *FORMS])
     channels, armed, after = [], None, 0
     dated = 1000 * log.start_timestamp > _DATES
     for data in (x.data for x in log.data_list if "time_utc_usec" in x.data and not dated):
@@ -460,9 +448,8 @@ def _collect(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
     ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log.
     """
     names = {name: own.split() for name, own in _BESIDE.items()}
-    for name, form in _MESSAGES:
-        every = f"{form.place} {form.velocity} {form.yaw} {form.spread}"
-        names[name] = [*every.split(), "frame_id", *_RESETS, *_VALID]
+    for name, ((_, *own, _), *_) in FORMS.items():
+        names[name] = [*" ".join(own).split(), "frame_id", *_RESETS, *_VALID]
     rows: dict[tuple[int, str, int], array[float]] = defaultdict(lambda: array("d"))
     while (message := log.recv_match(type=[*names])) is not None:
         kind, received = message.get_type(), message._timestamp
@@ -487,8 +474,6 @@ def _collect(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
 def _number_of(message: Any, field: str, index: str = "") -> float:
     """A field of a message, or the one with an index such as "0]" in it; NaN if there is none."""
     value: Any = getattr(message, field, math.nan)
-    if field == "hdg" and value == _UNKNOWN:
-        return math.nan
     return value[int(index[:-1])] if index else value
 
 
@@ -516,8 +501,8 @@ def _read_bin(path: Path) -> Log:
         del columns["received"]
         main = lane == (int(np.median(own["PI"])) if own and kind[1:] == "KF1" else 0)
         if main and kind[1:] == "KF1" and (own := beside.get(f"{kind[0]}KV1")):
-            for name in _VARIANCES.split():
-                columns[name] = np.interp(columns["time"], own["time"], own[name])
+            at = columns["time"], own["time"]
+            columns |= {name: np.interp(*at, own[name]) for name in _VARIANCES.split()}
         made = Channel(f"{kind}:{lane}" if lane else kind, kind, columns, "", place)
         channels.insert(0 if main else len(channels), made)
     armed = (own["time"], own["ArmState"]) if (own := beside.get("ARM")) else None

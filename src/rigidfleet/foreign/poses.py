@@ -28,7 +28,7 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import DAMAGED, RANK, Channel, Log, channel_of_px4, choose
+from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4, choose
 
 #: How recordings begin, and what Zstandard packed.
 MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -47,6 +47,8 @@ _NUMBERS = {
 }  # fmt: skip
 
 
+#: Topic and body, how their `_Rows` begin, stamp and time of recording [ns], and numbers of a position.
+_Place = tuple[str, Any, int, int, Sequence[float]]
 #: What is no log of places, and what to give instead.
 _PATH = "is a path that is planned, not a log: give poses, odometry or transforms of what flew"
 _UNDEFINED = (
@@ -112,8 +114,7 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         # What moves in a body is a part of it, and what a robot moves in is no robot.
         moving = [c for c in chosen if c.topic.partition(":")[2] not in _FRAMES]
         chosen = [c for c in moving or chosen if c.frame not in bodies]
-        others = sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]
-        if others:
+        if others := sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]:
             notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")
     clock = "that of the stamps in messages"
     if any("received" in c.columns for c in chosen):
@@ -122,10 +123,8 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     return Log({c.topic: [c] for c in chosen}, clock, None, tuple(notes))
 
 
-def _places(
-    path: Path, unread: dict[str, str]
-) -> Iterator[tuple[str, Any, int, int, Sequence[float]]]:
-    """Topic and body, how `_Rows` begin, stamp, time of recording [ns] and numbers of each position in a file.
+def _places(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
+    """Each position in a file.
 
     Topics that seem to have some and cannot be read get a reason in ``unread``.
 
@@ -144,9 +143,9 @@ def _places(
             kind = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind).lower()  # as PX4's logs name it
         if name == "nav_msgs/msg/Path":
             unread[topic] = _PATH
-        elif own and kind in RANK and not definition:
+        elif own and kind in FORMS and not definition:
             unread[topic] = _UNDEFINED
-        elif kind in (RANK if own else _NUMBERS) and topic != "/tf_static":
+        elif kind in (FORMS if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
                 raise fault(f"{topic}: is encoded as {code!r}, not as CDR")
             if data.startswith(ZSTANDARD):  # recorded with --compression-mode message

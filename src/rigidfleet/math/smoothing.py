@@ -224,15 +224,18 @@ class NoiseEstimate(NamedTuple):
 def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) -> NoiseEstimate:
     """The noise of some vehicles alike: of a stated standard deviation [m], or else of one that they show themselves.
 
-    The correlation time is the likeliest. Without a stated size it must stand out from white noise, and from noise so
-    slow that it cannot be told from motion; and what remains must be white.
+    Knots are a ``step`` [s] apart, or as rare as samples. The correlation time is the likeliest. Without a stated size
+    it must stand out from white noise, and from noise so slow that it cannot be told from motion; and what remains must
+    be white.
     """
     some = []
     for own in sorted(vehicles, key=lambda own: -len(own.time))[:_SOME]:
         first = max(0, (len(own.time) - _ENOUGH) // 2)  # the middle of the samples
         some.append(Positions(*(x[first : first + _ENOUGH] for x in own)))
-    knots = [knots_over(own.time, 0.0, step) for own in some]
-    usual = float(np.median([np.median(np.diff(own.time)) for own in some]))
+    steps = [float(np.median(np.diff(own.time))) for own in some]
+    both = zip(some, steps, strict=True)
+    knots = [knots_over(own.time, 0.0, max(step, each)) for own, each in both]
+    usual = float(np.median(steps))
     size = np.nan if sigma is None else sigma
     calm = [smooth(own, PositionNoise(size), k).calm for own, k in zip(some, knots, strict=True)]
 
