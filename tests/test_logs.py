@@ -399,6 +399,16 @@ def test_local_positions_of_px4_are_turned_and_timed(tmp_path):
     assert read.read[0]["origin"] == pytest.approx([47.4, 8.55, 488.0])
 
 
+def test_a_vehicle_is_armed_until_it_is_not(tmp_path):
+    """The last message of arming holds to the end of the log."""
+    pytest.importorskip("pyulog")
+    fields = [("uint64_t", "timestamp"), ("bool", "armed")]
+    topics = [("vehicle_local_position", 0, LOCAL, list(local_rows())),
+              ("actuator_armed", 0, fields, [(5_000_000, False), (5_400_000, True)])]  # fmt: skip
+    read = read_trajectories(ulog(tmp_path / "one.ulg", topics))
+    assert read.read[0]["armed"] == ["5.4 to 6.9792 s"]
+
+
 def test_a_reset_is_no_flight(tmp_path):
     """A step that the estimator counts as its own fails no limit: it is undecided; the same step of a vehicle fails."""
     pytest.importorskip("pyulog")
