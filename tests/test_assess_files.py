@@ -6,13 +6,14 @@ import json
 import re
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import rigidfleet as rf
 from rigidfleet.cli.app import BAD_INPUT, FAILED, PASSED, main
-from rigidfleet.foreign import texts
+from rigidfleet.foreign import shows, texts
 from rigidfleet.foreign.files import read_trajectories
 from rigidfleet.simulation.trajectories import of_curves
 
@@ -356,13 +357,27 @@ def test_bad_shows_are_refused(kind, tmp_path, capsys):
 
 def test_a_zip_bomb_is_refused_unopened(tmp_path, monkeypatch):
     """An archive that says it unpacks to more than the greatest size is not unpacked."""
-    from rigidfleet.foreign import shows
-
     monkeypatch.setattr(shows, "_BYTES", 1 << 20)
     path = tmp_path / "bomb.skyc"
     path.write_bytes(zipped({"show.json": " " * (2 << 20)}))
     assert path.stat().st_size < 10_000
     with pytest.raises(rf.RigidfleetError, match="unpacks to 2 MiB"):
+        read_trajectories(path)
+
+
+def test_an_entry_that_all_drones_refer_to_is_not_read_without_end(tmp_path, monkeypatch):
+    """An entry counts as often as it is read; drones that fly the same way share what was read once."""
+    way = '{"points": [[0, [0, 0, 1], []], [1, [1, 0, 1], []]]' + " " * 1000 + "}"
+    drones: Any = [{"settings": {"trajectory": {"$ref": "./way.json#"}}} for _ in range(100)]
+    show = {"swarm": {"drones": drones}}
+    path = tmp_path / "show.skyc"
+    monkeypatch.setattr(shows._Archive, "room", 20_000)
+    path.write_bytes(zipped({"show.json": json.dumps(show), "way.json": way}))
+    assert len(read_trajectories(path).curves) == 100
+    for k, drone in enumerate(drones):
+        drone["settings"] |= {"yawControl": {"setpoints": [[0, k]]}}
+    path.write_bytes(zipped({"show.json": json.dumps(show), "way.json": way}))
+    with pytest.raises(rf.RigidfleetError, match=r"way\.json: drones refer to it too often"):
         read_trajectories(path)
 
 

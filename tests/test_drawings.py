@@ -58,6 +58,13 @@ SHOWN = {
     '<a href="#"><rect width="4" height="3"/></a><metadata><rect width="99" height="99"/></metadata>': (0, 4, 0, 3),
     "<style>@media print{.a{display:none}} .b{display:none}</style>"
     '<rect class="a" width="4" height="3"/><rect class="b" width="99" height="99"/>': (0, 4, 0, 3),
+    '<svg width="100" height="50"><rect width="50%" height="50%"/><circle cx="50%" cy="50%" r="1"/></svg>':
+        (0, 51, 0, 26),
+    '<rect x="1em" width="12pt" height="1pc"/>': (16, 32, 0, 16),
+    '<rect width="99" height="99" fill="#00000000"/><rect width="99" height="99" fill="rgba(0,0,0,0)"/>'
+    '<rect width="4" height="3"/>': (0, 4, 0, 3),
+    '<switch><rect systemLanguage="xx" width="99" height="99"/><rect width="4" height="3"/><rect width="99"/></switch>':
+        (0, 4, 0, 3),
     '<use href="#p"/>': None,
 }  # fmt: skip
 VIEW = """<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="0 0 200 200"

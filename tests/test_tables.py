@@ -119,8 +119,23 @@ SAME = {
             "time [ms],agent,x [mm],y [mm],z [mm]",
             "Time (Milliseconds),Agent,X (Millimeters),Y (millimetres),Z (MM)",
             "timeMs,agent,posX_mm,posY_mm,posZ_mm",
+            "ms,agent,x mm,y mm,z mm",
+            "time in ms,agent,x in mm,y in mm,z in mm",
+            "time/ms,agent,x/mm,y/mm,z/mm",
+            'time_boot_ms,agent,"x, mm","y, mm","z, mm"',
+            "milliseconds,agent,x-mm,y.mm,z{mm}",
+            "t_ms,agent,mm_x,mm_y,mm_z",
         )
     },
+    "units between axes and vehicles": "t,x1 mm,y1 mm,z1 mm,x_mm_cf2,y_mm_cf2,z_mm_cf2\n"
+    + alone(lambda t, i, x, y, z: f"{t},{1e3 * x},{1e3 * y},{1e3 * z},{1e3 * x},4500,2500"),
+    "names with numbers": "t,UAV 1 X,UAV 1 Y,UAV 1 Z,UAV 2 X,UAV 2 Y,UAV 2 Z\n"
+    + alone(lambda t, i, x, y, z: f"{t},{x},{y},{z},{x},4.5,2.5"),
+    "a preamble with numbers": "Version,1.23,Rate,10.0,Frames,21,Space,Global\n\n,ID,1,1,1\n"
+    "Frame,agent,Time (Seconds),X,Y,Z,\n"
+    + lines(lambda t, i, x, y, z: f"{int(2 * t)},{i},{t},{x},{y},{z},"),
+    "names behind !": "! t agent x y z\n" + parted(" ").split("\n", 1)[1],
+    "names behind //": "// t agent x y z\n" + parted(" ").split("\n", 1)[1],
     **{
         f"names {head}": f"{head}\n{lines(plain)}"
         for head in (
@@ -130,6 +145,9 @@ SAME = {
             "secs,uav,tx,ty,tz",
             "t,agent,east,north,up",
             "t,agent,e,n,u",
+            "t,agent,easting,northing,elevation",
+            "t,agent,x,y,altitude",
+            "t,agent,pos_e,pos_n,pos_u",
         )
     },
     **{
@@ -142,6 +160,9 @@ SAME = {
             "local_ned.x,local_ned.y,local_ned.z",
             "x (NED),y (NED),z (NED)",
             "x_ned [m],y_ned [m],z_ned [m]",
+            "pos_n,pos_e,pos_d",
+            "x_north,y_east,z_down",
+            "posN_m,posE_m,posD_m",
         )
     },
     **{
@@ -251,6 +272,17 @@ NOTED = {
         "rows count whatever it says",
     ),
     "units before the names": ("# units: mm\n" + HEAD + lines(plain), "does it say units"),
+    "units in words": ("# position in millimetres\n" + HEAD + lines(plain), "does it say units"),
+    "units below the names": (HEAD + "# all in cm\n" + lines(plain), "does it say units"),
+    "units at the end": (HEAD + lines(plain) + "# scale 0.001\n", "does it say units"),
+    "another axis up": ("# Y-up\n" + HEAD + lines(plain), "does it say units or axes"),
+    **{
+        f"no place: {word}": (
+            HEAD + lines(plain) + f"2.5,0,{word},{word},{word}\n2.5,1,{word},1,1\n",
+            "2 rows without a position are left out",
+        )
+        for word in ("NA", "null", "None", "#N/A", "-nan(ind)")
+    },
     "wanted places": (
         HEAD.strip() + ",x_ref,y_ref,z_ref\n" + lines(lambda *v: plain(*v) + ",0,0,0"),
         "x_ref, y_ref, z_ref are not read",
@@ -314,6 +346,29 @@ REFUSED = {
     "another vehicle": (
         "t,x,y,z,x2,y2,z2\n0,0,0,1,0,1,1\n1,1,0,1,1,1,1\n",
         "x2, y2, z2 may be places of another vehicle",
+    ),
+    "a bone of two": (
+        "t,X,Y,Z,X,Y,Z\n0,0,0,1,0,1,1\n1,1,0,1,1,1,1\n",
+        "or name those of several vehicles x1, y1, z1",
+    ),
+    "rows before the names": (
+        "0,0,0,1\nt,x,y,z\n1,1,0,1\n2,2,0,1\n",
+        "line 1: has a row before its",
+    ),
+    "TUM between commas": (
+        "".join(f"{t},{t},0,1,1,0,0,0\n" for t in range(3)),
+        "no 8 numbers between blanks",
+    ),
+    "polynomials of two": (
+        "id,duration,"
+        + ",".join(f"{a}^{k}" for a in ("x", "y", "z", "yaw") for k in range(8))
+        + "".join(f"\n{i},1" + ",1" * 32 for i in ("a", "b"))
+        + "\n",
+        "polynomials of several vehicles in the column 'id'",
+    ),
+    "a log on the globe": (
+        "t,OSD.latitude,OSD.longitude,OSD.height [ft]\n0,47.4,8.5,48\n1,47.4,8.5,49\n",
+        "has latitude and longitude",
     ),
     "two that differ": ("t,x,x,y,z\n0,0,1,0,1\n1,1,2,0,1\n", "two columns for x"),
     "commas for all": (parted(",", ","), "fields, and the names in line 1 are 5"),
@@ -417,6 +472,7 @@ def test_words_that_contradict_are_refused(said, cause, tmp_path):
         (0.1, 0.001, ""),
         (1, 15, ""),
         (1, 50, ""),
+        (0.1, 100, "1e+03"),
     ],
 )
 def test_units_are_in_doubt_where_nothing_moves(step, way, note, tmp_path):
@@ -508,6 +564,15 @@ def test_a_trajectory_without_names_is_tum(tmp_path):
         (tmp_path / "t.txt").write_text(rows.replace(" 0 0 0 1", other))
         with pytest.raises(rf.RigidfleetError, match="no names of columns"):
             read_trajectories(tmp_path / "t.txt")
+
+
+def test_attitudes_in_another_order_are_not_read(tmp_path):
+    """Quaternions that begin with w would turn a level vehicle upside down: its yaw is not taken from them."""
+    rows = "".join(f"{t} {t} 0 2 0.99 0 0 0.141\n" for t in range(4))
+    (tmp_path / "t.txt").write_text(rows)
+    read = read_trajectories(tmp_path / "t.txt")
+    assert any("upside down" in note for note in read.notes)
+    assert np.isnan(read.curves[0].at(np.array([1.0]))[0, 3])
 
 
 def test_files_have_one_clock(tmp_path):
@@ -682,6 +747,17 @@ POINTS = {
         None,
     ),
     "CR": (corner(lambda x, y, z, h: f"{x},{y},{z}").replace("\n", "\r"), None),
+    "heights": ("x,y,altitude\n" + corner(lambda x, y, z, h: f"{x},{y},{z}"), None),
+    "up": ("x,y,up\n" + corner(lambda x, y, z, h: f"{x},{y},{z}"), None),
+    **{
+        head: (f"{head}\n" + corner(lambda x, y, z, h: f"{y},{x},{-z}"), None)
+        for head in ("north,east,down", "x_ned,y_ned,z_ned", "N,E,D")
+    },
+    "a frame": ("x_enu,y_enu,z_enu\n" + corner(lambda x, y, z, h: f"{x},{y},{z}"), None),
+    "a unit behind blanks": (
+        "x mm,y mm,z mm\n" + corner(lambda x, y, z, h: f"{1e3 * x},{1e3 * y},{1e3 * z}"),
+        None,
+    ),
 }
 
 
@@ -693,6 +769,40 @@ def test_points_are_read_as_trajectories_are(kind, tmp_path):
     points = read_points(tmp_path / "p.csv")
     np.testing.assert_allclose(points.slots, CORNER)
     assert points.colours == hues
+
+
+@pytest.mark.parametrize(
+    ("text", "note"),
+    [
+        ("x,y,depth\n0,0,5\n3,0,5\n", "the columns 'depth' are not read"),
+        ("formation,x,y,z\na,0,0,5\nb,3,0,5\n", "the columns 'formation' are not read"),
+        ("# all in mm\nx,y,z\n0,0,5\n3,0,5\n", "'# all in mm' is not read"),
+        ("1,5,2,5,3,0\n4,5,2,5,3,0\n", "six numbers are read as x, y, z, red, green, blue"),
+        ("0,0,5,0.0,0.0,1.0\n3,0,5,0.0,0.0,1.0\n", "six numbers are read as x, y, z, red"),
+    ],
+)
+def test_what_is_left_out_of_points_is_noted(text, note, tmp_path):
+    """Columns, units in comments, and numbers without names that may be no colours."""
+    (tmp_path / "p.csv").write_text(text)
+    assert any(note in x for x in read_points(tmp_path / "p.csv").notes)
+
+
+@pytest.mark.parametrize(
+    "elements",
+    ["camera 99999999999\nproperty float a", "face 3000000000\nproperty list uchar int v"],
+)
+def test_files_that_claim_more_than_they_have_are_refused(elements, tmp_path):
+    """At once, and without the memory that they claim."""
+    head = f"ply\nformat binary_little_endian 1.0\nelement {elements}\nelement vertex 1\n"
+    head += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    (tmp_path / "p.ply").write_bytes(head.encode() + bytes(100))
+    with pytest.raises(rf.RigidfleetError, match="ends before its vertices"):
+        read_points(tmp_path / "p.ply")
+    claim = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000000, 3), }\n"
+    data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(claim)) + claim + bytes(48)
+    (tmp_path / "p.npy").write_bytes(data)
+    with pytest.raises(rf.RigidfleetError, match="is no whole NPY file"):
+        read_points(tmp_path / "p.npy")
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 #: Units by dimension and factor to s, m and rad.
 _UNITS = {
-    "time": {1.0: "s sec secs second", 1e-3: "ms msec millisecond", 1e-6: "us usec microsecond",
-             1e-9: "ns nsec nsecs nanosec nanosecond", 60.0: "min", 3600.0: "h"},
+    "time": {1.0: "s sec secs second", 1e-3: "ms msec millis millisecond", 1e-6: "us usec microsecond",
+             1e-9: "ns nsec nsecs nanosec nanosecond", 60.0: "min", 3600.0: "h hour"},
     "length": {1.0: "m metre meter", 1e-3: "mm millimetre millimeter", 1e-2: "cm centimetre centimeter", 1e3: "km",
-               0.3048: "ft feet", 0.0254: "in inch"},
+               1e-6: "um micron", 0.3048: "ft feet", 0.9144: "yd yard", 0.0254: "in inch"},
     "angle": {1.0: "rad radian", math.radians(1.0): "deg degree"},
 }  # fmt: skip
 _UNIT = {
@@ -38,14 +38,14 @@ _WORDS = {
             "gyro mag torque force thrust gyr ang euler rpy bias w b",
     "wanted": "ref reference setpoint sp target desired des cmd command goal",
     "time": "t time timestamp stamp sec secs second seconds elapsed datetime nsec nsecs nanosec clock",
-    "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world",
+    "time too": "header sim field ros utc unix epoch date since start relative rel log of posix world in boot",
     "agent": "agent drone vehicle uav uas robot cf crazyflie quad quadrotor quadcopter copter aircraft plane body "
              "rigid track sysid mav uri callsign tail craft bot ship rover",
     "thing": "id name uid uuid object marker label ns namespace child entity node tag target device model actor "
              "player serial instance hostname key",
     "thing too": "no nr num number system frame index idx subject",
-    "yaw": "yaw psi", "colour": "color colour rgb hex", "latitude": "lat latitude",
-    "longitude": "lon lng long longitude",
+    "yaw": "yaw psi", "colour": "color colour rgb hex led", "height": "alt altitude height elevation",
+    "latitude": "lat latitude", "longitude": "lon lng long longitude",
 }  # fmt: skip
 #: Frames by their names, and where x, y and z point; forward, left, up and forward, right, down are not turned.
 _FRAMES = {"enu": "enu", "ned": "ned", "nwu": "nwu", "neu": "neu", "flu": "enu", "frd": "esd"}
@@ -83,7 +83,7 @@ class ColumnMeaning(NamedTuple):
         if place := re.fullmatch(r"([vaj]?)[xyz]", self.kind):
             return _DIMENSIONS[place[1]]
         special = {"time": "time", "duration": "time", "yaw": "angle", "yaw_rate": "angle/time"}
-        return "length" if self.kind in DIRECTIONS else special.get(self.kind, "")
+        return "length" if self.kind in (*DIRECTIONS, "height") else special.get(self.kind, "")
 
 
 def unit_of(text: str) -> tuple[str, float] | None:
@@ -122,12 +122,16 @@ def _meaning_without_unit(name: str) -> ColumnMeaning:
     plain = name.strip().lower().replace(" ", "")
     words = [word.lower() for word in _WORD.findall(name)]
     every = {*words}
-    if re.fullmatch(r"duration|(x|y|z|yaw)\^[0-7]", plain) or plain in DIRECTIONS:
+    if re.fullmatch(r"duration|(x|y|z|yaw)\^[0-7]", plain):
         return ColumnMeaning(plain)
-    if re.fullmatch(r"p?[neud]", plain):
-        return ColumnMeaning(next(way for way in DIRECTIONS if way[0] == plain[-1]))
-    units = [word for word in words if _UNIT.get(word, ("",))[0] == "time"]
-    if every & _IS["time"] and every <= _IS["time"] | _IS["time too"] | {*units}:
+    bare = [word.removesuffix("ing") for word in words if word not in _IS[""]]
+    for way in DIRECTIONS:
+        letters = ([way[0]], ["p" + way[0]]) if way[0] in "neud" else ()
+        if bare in letters or (way in bare and {*bare} <= {way, *"xyz"}):
+            return ColumnMeaning(way)
+    units = [word for word in words if (unit_of(word) or ("",))[0] == "time"]
+    alone = len(words) == len(units) == 1 and len(plain) > 1 and plain not in ("min", "ns", "us")
+    if (every & _IS["time"] or alone) and every <= _IS["time"] | _IS["time too"] | {*units}:
         return ColumnMeaning("time", units[-1] if units else "")
     if (
         every & (_IS["agent"] | _IS["thing"])
@@ -136,8 +140,8 @@ def _meaning_without_unit(name: str) -> ColumnMeaning:
         return ColumnMeaning("agent" if every & _IS["agent"] else "thing")
     if hue := _HUE.fullmatch(plain):
         return ColumnMeaning(_HUES[hue[1]])
-    for kind in ("colour", "latitude", "longitude"):
-        if words and every <= _IS[kind]:
+    for kind in ("colour", "latitude", "longitude", "height"):
+        if words and (every <= _IS[kind] or (words[-1] == kind and kind != "height")):
             return ColumnMeaning(kind)
     frames = [_FRAMES[word] for word in words if word in _FRAMES]
     words = [word for word in words if word not in _FRAMES]
@@ -145,8 +149,8 @@ def _meaning_without_unit(name: str) -> ColumnMeaning:
         rest = words[:k] + words[k + 1 :]
         beside = {*rest}
         if words[k] in _IS["yaw"]:
-            who = "".join(word for word in rest if word not in _IS["q"] | _IS[""])
-            return ColumnMeaning("yaw_rate") if who == "rate" else ColumnMeaning("yaw", who=who)
+            unit, who = _unit_and_vehicle(rest, "angle", _IS["q"])
+            return ColumnMeaning("yaw_rate") if who == "rate" else ColumnMeaning("yaw", unit, who)
         axis = _AXIS.fullmatch(words[k])
         if axis is None or beside & _IS["none"]:
             continue
@@ -154,12 +158,19 @@ def _meaning_without_unit(name: str) -> ColumnMeaning:
         kinds = [x for x in "vajq" if beside & _IS[x] - _IS[""]] if kind is None else [kind]
         kind = kinds[0] if kinds else ""
         if axis[2] != "w" or kind == "q":
-            who = "".join(w for w in rest if w not in _IS[kind] | _IS[""])
+            unit, who = _unit_and_vehicle(rest, "length" if kind == "" else kind, _IS[kind])
             if frames and kind == "":
                 letter = frames[0]["xyz".index(axis[2])]
-                return ColumnMeaning(next(d for d in DIRECTIONS if d[0] == letter), who=who)
-            return ColumnMeaning(kind + axis[2], who=who)
+                return ColumnMeaning(next(d for d in DIRECTIONS if d[0] == letter), unit, who)
+            return ColumnMeaning(kind + axis[2], unit, who)
     return ColumnMeaning("")
+
+
+def _unit_and_vehicle(rest: list[str], dimension: str, beside: frozenset[str]) -> tuple[str, str]:
+    """The unit of more than a letter and the vehicle among words beside an axis (`x in mm`, `x_mm_cf1`)."""
+    units = [w for w in rest if len(w) > 1 and w != "in" and (unit_of(w) or ("",))[0] == dimension]
+    who = (w for w in rest if w not in beside | _IS[""] | {*units} | ({"in"} if units else set()))
+    return units[-1] if units else "", "".join(who)
 
 
 def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
@@ -197,7 +208,9 @@ def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
             if (vehicles and not kind) or (short and (vehicles or lost or lone)):
                 for k, axis in zip(own, "xyz", strict=True):
                     kinds[k] = ColumnMeaning(axis, unit, word)
-    return kinds
+    flat, high = {"x", "y"} <= known and not known & {"z", "down"}, known & {"z", "up", "down"}
+    up = {"height": "z" if flat else "" if high else "up", "up": "z" if flat else "up"}
+    return [q._replace(kind=up.get(q.kind, q.kind)) for q in kinds]
 
 
 def count_understood(names: Sequence[str]) -> int:

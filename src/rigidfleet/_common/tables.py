@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import count_understood, meanings_of, unit_of
+from rigidfleet._common.names import AXES, DIRECTIONS, count_understood, meanings_of, unit_of
 from rigidfleet.typing import Floats, Ints
 
 #: Separators in the order in which they are tried, with their names.
@@ -26,6 +26,12 @@ _REMARK = re.compile(r"\s+#(?![0-9a-fA-F]{6}\b).*")
 _COMMA = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?")
 _THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _TEXT = np.dtypes.StringDType()
+#: Words for units and axes in lines that are not read, and for numbers that are not there.
+_UNSAID = re.compile(
+    r"(?i)\b(units?|scale|[mc]m|ft|feet|inch(es)?|ms|us|ns|deg(rees)?|ned|down\w*|[xy][- _]?up"
+    r"|(milli|centi|micro|nano)(met|sec)\w+)\b"
+)
+_BLANK = {"", "nan", "na", "n/a", "null", "none", "#n/a", "-nan(ind)"}
 #: Lines among which names are sought, and by which a separator is chosen; rows read together; characters of a line.
 _HEAD, _SAMPLE, _TOGETHER, _LONGEST = 200, 20, 1 << 14, 100_000
 
@@ -69,6 +75,7 @@ class TextTable:
     texts : all lines of the file
     places : number of the column of each quantity, by kind and vehicle
     units : of each dimension of columns that were read the word, and where it is from: "" if it is assumed
+    unread : a line beside names and rows that speaks of units or axes; "" without one
 
     Parameters
     ----------
@@ -103,8 +110,14 @@ class TextTable:
                 continue
             first = self.places.setdefault((kind, who), k)
             if self.names[first] != self.names[k] or (self.columns[first] != self.columns[k]).any():
-                names = f"{self.names[first]!r}, {self.names[k]!r}"
-                raise fault(f"has two columns for {kind}: {names}", "Keep one")
+                why = f"has two columns for {kind}: {self.names[first]!r}, {self.names[k]!r}"
+                several = ", or name those of several vehicles x1, y1, z1 and x2, y2, z2"
+                raise fault(why, "Keep one" + several * (kind in "xyz"))
+        rows = self.lines[[0, -1]].tolist() if len(self.lines) else [0, len(self.texts)]
+        beside = [*self.texts[: max(0, rows[0] - 1)], *self.texts[rows[1] :]]
+        if self.named:
+            del beside[self.line - 1 : None if any(below) else self.line]
+        self.unread = next((x.strip() for x in beside if _UNSAID.search(x)), "")
 
     def factor(self, k: int) -> float:
         """The factor of the unit of a column, which a row below the names may say.
@@ -136,6 +149,24 @@ class TextTable:
         """Columns of some quantities; empty unless all are there."""
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
+
+    def position(self, axes: str = "", who: str = "") -> tuple[list[int], str]:
+        """Columns of a position, x, y and z or named by directions, and where they point: ``axes``, or ``"enu"``.
+
+        Raises
+        ------
+        ContentError
+            Names of directions contradict the axes.
+        """
+        if place := self.place(*"xyz", who=who):
+            return place, axes or "enu"
+        ways = [kind for kind, own in self.places if kind in DIRECTIONS and own == who]
+        named = "".join(DIRECTIONS[way] for way in ways)
+        if not are_axes(named):
+            return [], axes or "enu"
+        if sorted(axes or named) != sorted(named):
+            raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
+        return self.place(*ways, who=who), named
 
     def missing(self, *kinds: str) -> ContentError:
         """The error of a table without some quantities."""
@@ -177,7 +208,7 @@ class TextTable:
                 if is_number(plain) and "," not in plain and math.isfinite(float(plain)):
                     values[row, i] = float(plain)
                     continue
-                if which[i] in blank and field.strip().lower() in ("", "nan"):
+                if which[i] in blank and field.strip().lower() in _BLANK:
                     values[row, i] = np.nan
                     continue
                 line, name = int(self.lines[row]), self.names[which[i]]
@@ -198,6 +229,19 @@ def _put_numbers(fields: np.ndarray, values: Floats) -> bool:
         return False
     # Python alone groups digits by "_".
     return bool(np.isfinite(values).all()) and not (np.strings.find(fields, "_") >= 0).any()
+
+
+def are_axes(axes: str) -> bool:
+    """Whether three letters are directions of axes."""
+    return sorted(AXES.get(letter, (9,))[0] for letter in axes) == [0, 1, 2]
+
+
+def turn_of_axes(axes: str) -> Floats:
+    """The matrix (3, 3) from places along three directions to east, north, up."""
+    turn = np.zeros((3, 3))
+    for k, letter in enumerate(axes):
+        turn[AXES[letter][0], k] = AXES[letter][1]
+    return turn
 
 
 def is_number(field: str) -> bool:
@@ -241,7 +285,7 @@ def _lines(data: bytes) -> list[str]:
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if odd := _CONTROL.search(text):
         line = text.count("\n", 0, odd.start()) + 1
-        raise fault(f"has the control character U+{ord(odd[0]):04X}", "Remove it", line)
+        raise fault(f"has the control character U+{ord(odd[0]):04X}", "Save a table as text", line)
     return text.split("\n")
 
 
@@ -250,11 +294,11 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
         raise fault("has no names of columns that are understood", "Give shorter lines", long)
-    bare = [texts[k].lstrip("#") for k in head]
-    most = [max(sum(map(is_number, split_fields(line, s))) for s in SEPARATORS) for line in bare]
-    rows = [k for k, count in zip(head, most, strict=True) if count > 1]
-    first = next((k for k in rows if texts[k][0] != "#"), len(texts))
-    start, names, own = _names(texts, [k for k in head if k < first], first)
+    split = {k: [split_fields(texts[k].lstrip("#"), s) for s in SEPARATORS] for k in head}
+    most = {k: max((sum(map(is_number, x)), len(x)) for x in fields) for k, fields in split.items()}
+    rows = {k: count for k, (count, _) in most.items() if count > 1}
+    plain = [k for k in rows if texts[k][0] != "#"]
+    start, names, own = _names(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
         start = min(rows, default=len(texts))
@@ -268,19 +312,27 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     if names and len(row) == width and sum(unit_of(x) is not None for x in row) > 1:
         units, start = [x if unit_of(x) else "" for x in row], texts.index(below[0], start) + 1
     above = [k for k in head if not names and k < start and texts[k][0] != "#"]
-    for k in [k for k in above if width in (0, len(split_fields(texts[k], separator)))]:
+    if above := [k for k in above if width in (0, len(split_fields(texts[k], separator)))]:
+        k = above[-1 if width else 0]
         why = f"has no names of columns that are understood: {texts[k][:60]}"
         raise fault(why, "Name columns such as time_s,x_m,y_m,z_m", k + 1)
+    least = min((rows[k] for k in plain if k >= start), default=width)
+    for k in plain if names else ():
+        if k < line - 1 and rows[k] >= least and len(split_fields(texts[k], separator)) == width:
+            raise fault(f"has a row before its names, which are in line {line}", "", k + 1)
     return line, start, names, units, separator, width
 
 
-def _names(texts: list[str], head: list[int], first: int) -> tuple[int, list[str], str]:
-    """Line, from 1, names and separator: of all lines, the one that is understood best."""
-    counts = {len(split_fields(line, s)) for line in texts[first : first + 1] for s in SEPARATORS}
+def _names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
+    """Line, from 1, names and separator: of the lines before the first row below names, the one understood best."""
     best, names = (False, 0.0), (0, [], "")
     for k in head:
+        if names[0] and any(names[0] <= row <= k for row in rows):
+            break
+        first = next((row for row in rows if row > k), len(texts))
+        counts = {len(split_fields(x, s)) for x in texts[first : first + 1] for s in SEPARATORS}
         for separator in reversed(SEPARATORS):
-            line = texts[k].lstrip("#% \t")
+            line = texts[k].lstrip("#%!/ \t")
             fields, whole = split_fields(line, separator), split_fields(f"{line}.", separator)
             if len(whole) > len(fields) and len(whole) in counts:
                 fields.append("")  # a last column without a name

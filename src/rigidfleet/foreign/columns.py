@@ -10,8 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.names import AXES, DIRECTIONS, ROLES, meaning_of, unit_of
-from rigidfleet._common.tables import DEFAULT, SEPARATORS, TextTable, fault, is_number
+from rigidfleet._common.names import DIRECTIONS, ROLES, meaning_of, unit_of
+from rigidfleet._common.tables import (
+    DEFAULT,
+    SEPARATORS,
+    TextTable,
+    are_axes,
+    fault,
+    is_number,
+    turn_of_axes,
+)
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.typing import Floats, Ints
 
@@ -19,8 +27,8 @@ from rigidfleet.typing import Floats, Ints
 _TUM = ["timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 #: Seconds since 1970 of stamps that are dates: 2001 to 2096; and units in which they are counted without saying so.
 _DATES, _TICKS = (10**9, 4 * 10**9), ("s", "ms", "us", "ns")
-#: Greatest speed of a flight that is doubted, if steps are so long [m/s, s].
-_SLOW, _LONG = 0.1, 1.0
+#: Greatest speed of a flight that is doubted, if steps are so long [m/s, s]; and one that is doubted anyway.
+_SLOW, _LONG, _FAST = 0.1, 1.0, 100.0
 #: Rows are of several vehicles if their ways are so much shorter than that of one: a share.
 _SHORTER = 0.5
 #: Rows of a part, on average, from which on its way is no shorter because it is a part (that of a heading, a battery);
@@ -28,9 +36,8 @@ _SHORTER = 0.5
 _ROWS, _CONTINUES = 3, 5.0
 #: Numbers of vehicles that may take turns, and rows by which this is seen.
 _TURNS, _FIRST = range(2, 17), 1000
-#: Words for what a row may say of itself; for units in a line.
+#: Words for what a row may say of itself.
 _FLAGS = re.compile(r"(?i)valid|status|flag|ok|quality|lost|track|visible|occluded|fix|health")
-_UNSAID = re.compile(r"(?i)\b(units?|mm|cm|ft|feet|inch(es)?|ms|us|ns|deg(rees)?|ned|down)\b")
 
 
 class Doubt(str):
@@ -82,15 +89,11 @@ def units_of(units: str | None, axes: str | None) -> Units:
             )
         words[dimension] = word
     axes = (axes or "").lower()
-    if axes and not _are_axes(axes):
+    if axes and not are_axes(axes):
         raise TrajectoryError(
             f"axes: {axes!r}: say where x, y and z point, such as enu (east, north, up) or ned."
         )
     return Units(words, axes)
-
-
-def _are_axes(axes: str) -> bool:
-    return sorted(AXES.get(letter, (9,))[0] for letter in axes) == [0, 1, 2]
 
 
 def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
@@ -107,14 +110,21 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
         why = "has no names of columns that are understood" if bare else "is empty"
         raise fault(why, "Give a table with a line of names such as time_s,x_m,y_m,z_m")
     if not table.named:
-        turned = np.linalg.norm(table.numbers(range(4, 8)), axis=1)
-        if (np.abs(turned - 1.0) > 0.01).any():
+        turned = table.numbers(range(4, 8))
+        unit = (np.abs(np.linalg.norm(turned, axis=1) - 1.0) < 0.01).all()
+        if table.separator not in " \t" or not unit:
             remedy = "Begin with a line such as time_s,x_m,y_m,z_m"
-            raise fault("has no names of columns", remedy, 1)
+            raise fault(
+                "has no names of columns, and no 8 numbers between blanks as TUM's", remedy, 1
+            )
         notes.append(f"8 numbers a line without names are read as TUM's: {' '.join(_TUM)}")
-    before = [line.strip() for line in table.texts[: table.line - 1] if _UNSAID.search(line)]
-    if before and words == ({}, ""):
-        doubt = f"{before[0][:60]!r} is not read: does it say units or axes? Say --units or --axes"
+        if (np.linalg.norm(turned[:, :2], axis=1) > np.sqrt(0.5)).any():
+            del table.places["qw", ""]
+            notes.append("attitudes are upside down, and not read: is their order another one?")
+    if table.unread and words == ({}, ""):
+        doubt = (
+            f"{table.unread[:60]!r} is not read: does it say units or axes? Say --units or --axes"
+        )
         notes.append(Doubt(doubt))
     return table, notes
 
@@ -235,12 +245,7 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
     sets: dict[str, _Places] = {}
     loose: dict[str, dict[str, int]] = {}
     for who in dict.fromkeys(who for _, who in table.places):
-        ways = [kind for kind, own in table.places if kind in DIRECTIONS and own == who]
-        place, turned = table.place(*"xyz", who=who), axes or "enu"
-        if not place and _are_axes("".join(DIRECTIONS[way] for way in ways)):
-            place, turned = table.place(*ways, who=who), "".join(DIRECTIONS[way] for way in ways)
-            if sorted(axes or turned) != sorted(turned):
-                raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
+        place, turned = table.position(axes, who)
         kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
             sets[who] = _Places(turned, place, *(table.place(*kind, who=who) for kind in kinds))
@@ -287,7 +292,7 @@ def _rows_of_vehicles(
     for k in sorted(coded, key=lambda k: kinds[k] != "agent"):
         (code, labels), thing = coded[k], kinds[k] == "thing"
         # What numbers the rows, or words for parts of a flight, are no names of vehicles.
-        counts = np.ptp(time) > 0.0 and _are_row_numbers(labels, n)
+        counts = np.ptp(time) > 0.0 and are_row_numbers(labels, n)
         if (
             kinds[k] in ("agent", "thing")
             and not counts
@@ -358,7 +363,7 @@ def _length_of_ways(place: Floats, part: Ints) -> float:
     return float(step[np.diff(part[order]) == 0].sum())
 
 
-def _are_row_numbers(labels: list[str], rows: int) -> bool:
+def are_row_numbers(labels: list[str], rows: int) -> bool:
     """Whether labels only number the rows."""
     whole = [int(label) for label in labels if re.fullmatch(r"-?\d{1,15}", label)]
     return rows > 1 and len(whole) == rows and np.ptp(np.diff(whole)) == 0
@@ -384,9 +389,7 @@ def _turn_to_enu(
     """Places, velocities (K, 3) and yaws (K,) in east, north, up; yaw turns from the first axis to the second."""
     if axes == "enu":
         return place, velocity, yaw
-    turn = np.zeros((3, 3))
-    for k, letter in enumerate(axes):
-        turn[AXES[letter][0], k] = AXES[letter][1]
+    turn = turn_of_axes(axes)
     if yaw is not None:
         x, y, up = turn[:, :2] @ np.stack([np.cos(yaw), np.sin(yaw)])
         yaw = None if up.any() else np.arctan2(y, x)
@@ -441,7 +444,7 @@ def _doubts(table: TextTable, tracks: list[Track], *, axes: bool) -> Iterator[st
     steps = np.concatenate([np.diff(track.time) for track in tracks])
     fastest = float((np.concatenate(ways) / np.where(steps > 0.0, steps, np.inf)).max(initial=0.0))
     moves = max(map(np.sum, ways)) > _SLOW and float(np.median(steps)) >= _LONG
-    if moves and fastest < _SLOW and not table.units["time"][1]:
+    if fastest > _FAST or (moves and fastest < _SLOW and not table.units["time"][1]):
         remedy = "Name columns such as time_ms and x_mm, or say --units ms or s, mm or m"
         note = Doubt(f"{note}, so that speeds reach {fastest:.3g} m/s. {remedy}")
     yield note

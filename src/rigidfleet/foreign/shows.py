@@ -34,6 +34,12 @@ _COEFFICIENTS = 1 << 25
 _AGAIN = "Export the show again"
 
 
+class _Archive(zipfile.ZipFile):
+    """The archive of a show, of whose entries `room` bytes are read, however often drones refer to them."""
+
+    room = _BYTES
+
+
 def read_show(data: bytes) -> Trajectories:
     """The drones of a show, in the show's time and axes.
 
@@ -43,7 +49,7 @@ def read_show(data: bytes) -> Trajectories:
         The archive is damaged, too large or refers to files outside of it, or an entry is missing or not a number.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        with _Archive(io.BytesIO(data)) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
             if size > _BYTES:
                 more = f"unpacks to {size >> 20:,} MiB, more than {_BYTES >> 20}"
@@ -55,13 +61,14 @@ def read_show(data: bytes) -> Trajectories:
         raise fault(f"is not a complete zip archive ({error})", _AGAIN) from None
 
 
-def _read_drones(archive: zipfile.ZipFile) -> Trajectories:
+def _read_drones(archive: _Archive) -> Trajectories:
     show = _read_json(archive, "show.json")
     drones = _value_at(show, "swarm.drones", list, "show.json")
     if not drones:
         raise fault("show.json: has no drones")
     names: list[str] = []
     curves: list[Piecewise] = []
+    known: dict[str, Piecewise] = {}
     room = _COEFFICIENTS
     for k, drone in enumerate(drones, 1):
         where = f"show.json: drone {k}"
@@ -69,10 +76,14 @@ def _read_drones(archive: zipfile.ZipFile) -> Trajectories:
         who = settings.get("name")
         is_name = isinstance(who, str) and who.strip() and who.isprintable()
         names.append(who if is_name else f"drone {k}")
-        trajectory = _dereference(archive, settings.get("trajectory"), f"{where}: trajectory")
-        yaw = settings.get("yawControl")
-        turned = None if yaw is None else _dereference(archive, yaw, f"{where}: yawControl")
-        curves.append(_curve(trajectory, turned, names[-1]))
+        trajectory, yaw = settings.get("trajectory"), settings.get("yawControl")
+        shared = isinstance(trajectory, dict) and "$ref" in trajectory
+        key = repr((trajectory, yaw)) if shared else str(k)
+        if key not in known:
+            way = _dereference(archive, trajectory, f"{where}: trajectory")
+            turned = None if yaw is None else _dereference(archive, yaw, f"{where}: yawControl")
+            known[key] = _curve(way, turned, names[-1])
+        curves.append(known[key])
         room -= curves[-1].pieces.size
         if room < 0:
             raise fault(f"{where}: is too much beside those before", "Give fewer points")
@@ -81,11 +92,14 @@ def _read_drones(archive: zipfile.ZipFile) -> Trajectories:
     return Trajectories(tuple(names), tuple(curves), BEZIER)
 
 
-def _read_json(archive: zipfile.ZipFile, entry: str) -> Any:
+def _read_json(archive: _Archive, entry: str) -> Any:
     try:
         size = archive.getinfo(entry).file_size
     except KeyError:
         raise fault(f"has no {entry}", "Is it a show of Skybrush?") from None
+    archive.room -= size
+    if archive.room < 0:
+        raise fault(f"{entry}: drones refer to it too often", "Give each an entry of its own")
     try:
         data = archive.read(entry) if size <= _ENTRY else b""
         memory = sum(data.count(x) * each for x, each in _BECOMES.items())
@@ -110,7 +124,7 @@ def _value_at(value: Any, path: str, kind: type, where: str) -> Any:
     return value
 
 
-def _dereference(archive: zipfile.ZipFile, value: Any, where: str) -> dict[str, Any]:
+def _dereference(archive: _Archive, value: Any, where: str) -> dict[str, Any]:
     """An object of a show, or the one in the entry that it refers to."""
     if not isinstance(value, dict):
         raise fault(f"{where}: is missing", _AGAIN)

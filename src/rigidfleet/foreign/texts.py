@@ -6,7 +6,7 @@ import numpy as np
 
 from rigidfleet._common.names import CRAZYFLIE
 from rigidfleet._common.tables import TextTable, fault
-from rigidfleet.foreign.columns import Units, parse_table, read_tracks
+from rigidfleet.foreign.columns import Units, are_row_numbers, parse_table, read_tracks
 from rigidfleet.foreign.curves import NAMES, Trajectories, curve_through_states, rows_to_curve
 from rigidfleet.foreign.samples import ASSUMED, curve_through_samples
 from rigidfleet.math.piecewise import Piecewise
@@ -28,6 +28,13 @@ def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Traje
     """
     table, notes = parse_table(data, units)
     if table.place("duration", "x^0"):
+        for k, q in enumerate(table.kinds):
+            labels = table.codes(k)[1] if q.kind in ("agent", "thing") else []
+            if len(labels) > 1 and (
+                q.kind == "agent" or not are_row_numbers(labels, len(table.lines))
+            ):
+                why = f"has polynomials of several vehicles in the column {table.names[k]!r}"
+                raise fault(why, "Give each vehicle a table")
         curve = _curve_of_coefficients(table)
         record = {"columns": table.names, "rows": len(curve.pieces)}
         return Trajectories((stem,), (curve,), POLYNOMIALS, tuple(notes), (record,))

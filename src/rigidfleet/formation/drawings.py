@@ -18,11 +18,16 @@ _SPACE, _LINK = "{http://www.w3.org/2000/svg}", "{http://www.w3.org/1999/xlink}h
 #: Elements that are drawn, or hold such; all others are drawn where something refers to them, if at all.
 _DRAWN = r"svg|g|a|switch|use|path|rect|circle|ellipse|line|polyline|polygon|text|tspan|image"
 #: Properties that change what is seen of a shape, and are not followed.
-_IGNORED = r"\b(clip-path|mask|filter|marker[-a-z]*)\s*[:=]\s*[\"']?\s*(?!none)\w"
+_IGNORED = (
+    r"\b(clip-path|mask|filter|marker[-a-z]*|transform-(?:origin|box))\s*[:=]\s*[\"']?\s*(?!none)\w"
+)
 #: An own style without opacity.
 _UNSEEN = r"(?<![-\w])opacity\s*:\s*[0.]+%?\s*(;|!|$)"
-#: Where a view is: keys, their defaults, axes.
-_VIEW = (("x", "0", 0), ("y", "0", 1), ("width", "100%", 0), ("height", "100%", 1))
+#: Lengths, and of which side of the view around (2: its diagonal) they may be shares.
+_SIDES = {key: side for side, keys in enumerate(("x cx x1 x2 rx width", "y cy y1 y2 ry height", "r"))
+          for key in keys.split()}  # fmt: skip
+#: Attributes that ask for more than a browser may have.
+_ASKS = {"systemLanguage", "requiredExtensions", "requiredFeatures"}
 #: Rules of a style sheet that hold for some media alone, and selectors that depend on more than the element.
 _BLOCKS = r"@[^{};]*(?:;|\{(?:[^{}]|\{[^{}]*\})*\})"
 _SELECTORS = r"[^\s{},][^{},]*[\s>+~:\[][^\s{},][^{},]*(?=[,{][^{}]*[{}])"
@@ -80,7 +85,13 @@ class Drawing:
         tag, own = _tag(element), element.attrib
         if _is_zero(own.get("opacity")) or re.search(_UNSEEN, own.get("style", "")):
             own["style"] = f"{own.get('style', '')};display:none"  # whatever those inside say
-        element.tag = _SPACE + ("g" if tag in ("svg", "use") else tag)
+        whole = (*size, np.hypot(*size) / np.sqrt(2.0))
+        for key in _SIDES.keys() & own.keys():
+            own[key] = str(_length(own[key], whole[_SIDES[key]]))
+        if tag == "switch":  # a browser takes the first that it supports
+            fits = [x for x in element if re.fullmatch(_DRAWN, _tag(x)) and not _ASKS & {*x.keys()}]
+            element[:] = fits[:1]
+        element.tag = _SPACE + ("g" if tag in ("svg", "use", "switch") else tag)
         if tag == "use":
             link = own.pop("href", own.pop(_LINK, ""))
             if (target := copy.deepcopy(self._ids.get(link[1:]))) is None:
@@ -91,7 +102,10 @@ class Drawing:
                     target.tag = _SPACE + "svg"
                     target.attrib.update({k: own[k] for k in ("width", "height") if k in own})
         if tag in ("svg", "use"):
-            x, y, w, h = (_length(own.pop(key, usual), size[k]) for key, usual, k in _VIEW)
+            x, y = (float(own.pop(key, 0)) for key in "xy")
+            w, h = (
+                float(own.pop(key, x)) for key, x in zip(("width", "height"), size, strict=True)
+            )
             move = f"translate({x},{y})"
             if tag == "svg":
                 box = _numbers(own.pop("viewBox", f"0 0 {w} {h}"))
@@ -114,7 +128,9 @@ class Drawing:
             self.notes[f"{style['tag']} {words!r} is not drawn: convert it to paths"] += 1
             return
         filled, stroked = (
-            style[key] not in ("none", "transparent") and not _is_zero(style.get(f"{key}-opacity"))
+            style[key] != "none"
+            and svg.Color(style[key]).alpha != 0
+            and not _is_zero(style.get(f"{key}-opacity"))
             for key in ("fill", "stroke")
         )
         filled &= style["tag"] != "line"

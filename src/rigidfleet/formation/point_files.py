@@ -5,13 +5,15 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rigidfleet._common.names import meaning_of
-from rigidfleet._common.tables import ContentError, Fault, TextTable, fault
+from rigidfleet._common.tables import ContentError, Fault, TextTable, fault, turn_of_axes
+from rigidfleet._common.text import first_few
 from rigidfleet.errors import Finding, MissionError
 from rigidfleet.typing import Floats, Ints
 
@@ -25,6 +27,7 @@ _TYPES = {
 }  # fmt: skip
 _AXES, _HUES = ["x", "y", "z"], ["red", "green", "blue"]
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_ENDS: dict[str, Any] = {"<": "little", ">": "big"}
 
 
 class Points(NamedTuple):
@@ -128,14 +131,15 @@ def _findings(faults: Sequence[Fault], name: str, place: str = "line") -> list[F
     return findings
 
 
-def _hexadecimal(colours: Floats, *, shares: bool) -> tuple[str, ...]:
-    """Colours of rows (N, 3) from 0 to 255, or of shares from 0 to 1.
+def _hexadecimal(colours: Floats, *, real: bool) -> tuple[str, ...]:
+    """Colours of rows (N, 3) from 0 to 255; of shares from 0 to 1, if they are real numbers and none is larger.
 
     Raises
     ------
     ValueError
         They are no colours.
     """
+    shares = real and colours.max(initial=0.0) <= 1.0
     colours = np.round(255.0 * colours) if shares else colours
     bad = ~((colours >= 0) & (colours <= 255) & (colours == np.round(colours))).all(axis=1)
     if bad.any():
@@ -164,29 +168,34 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
     if bare and re.search(rb"(^|,)\s*-?0\d", data, re.MULTILINE):
         remedy = "if commas are decimal marks, separate numbers by semicolons"
         raise fault("has numbers such as 00", remedy)
-    if not table.place("x", "y"):
+    columns, axes = table.position()
+    if not (columns := columns or table.place("x", "y")):
         raise table.missing("x", "y")
     if (time := table.place("time")) and len(table.codes(time[0])[1]) > 1:
         remedy = "keep the rows of one, or fly it as a trajectory"
         raise fault("has points of several times", remedy)
-    axes = [axis for axis in _AXES if table.place(axis)]
-    hues = table.place(*_HUES) if not table.place("colour") else []
-    values = table.numbers(table.place(*axes) + hues)
+    written, n = table.place("colour"), len(columns)
+    hues = table.place(*_HUES) if not written else []
+    values = table.numbers(columns + hues)
     if table.decimal == "," and not table.named:
         notes.append("commas are read as decimal marks")
-    points, colours = np.zeros((len(table.lines), 3)), None
-    points[:, [_AXES.index(axis) for axis in axes]] = values[:, : len(axes)]
-    if written := table.place("colour"):
+    points, colours = values[:, :n] @ turn_of_axes(axes)[:, :n].T, None
+    known = {*columns, *hues, *written, *time}
+    unread = [repr(name) for k, name in enumerate(table.names) if name and k not in known
+              and table.kinds[k].kind not in ("agent", "thing")]  # fmt: skip
+    notes += [f"the columns {first_few(unread)} are not read"] * bool(unread)
+    notes += [f"{table.unread[:60]!r} is not read: does it say units or axes?"] * bool(table.unread)
+    if written:
         colours = tuple(f"#{x.lstrip('#').lower()}" for x in table.columns[written[0]].tolist())
         if odd := next((x for x in colours if not re.fullmatch(r"#[0-9a-f]{6}", x)), None):
             raise fault(f"has the colour {odd[1:]!r}", "write colours as #rrggbb")
     elif hues:
-        shares = values[:, len(axes) :].max(initial=0.0) <= 1.0
-        decimal = shares and any("." in x for k in hues for x in table.columns[k].tolist())
-        if shares and not decimal and values[:, len(axes) :].any():
+        lights, real = values[:, n:], any("." in x for k in hues for x in table.columns[k].tolist())
+        if not real and lights.any() and lights.max() <= 1.0:
             remedy = "write shares from 0 to 1 with a point (1.0)"
             notes.append(f"colours are at most 1 of 255; {remedy}")
-        colours = _hexadecimal(values[:, len(axes) :], shares=decimal)
+        notes += ["six numbers are read as x, y, z, red, green, blue"] * (not table.named)
+        colours = _hexadecimal(lights, real=real)
     return table.lines, points, colours, tuple(notes)
 
 
@@ -194,7 +203,7 @@ def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     """Points (N, 3), colours and notes of an NPY file."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
+    except (ValueError, EOFError, OSError, MemoryError) as error:
         raise ValueError(f"is no whole NPY file: {error}") from None
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
         raise ValueError("is no array of numbers")
@@ -204,9 +213,7 @@ def _read_npy(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     points[:, : array.shape[1]] = array[:, :3]
     if array.shape[1] < 6:
         return points, None, ()
-    hues = array[:, 3:].astype(np.float64)
-    shares = hues.max(initial=0.0) <= 1.0 and bool((hues % 1.0).any())
-    return points, _hexadecimal(hues, shares=shares), ()
+    return points, _hexadecimal(array[:, 3:].astype(np.float64), real=array.dtype.kind == "f"), ()
 
 
 def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, ...]]:
@@ -254,11 +261,12 @@ def _read_ply(data: bytes) -> tuple[Floats, tuple[str, ...] | None, tuple[str, .
     if len(names) == 3:
         return values, None, ()
     types = {columns[name] for name in names[3:]}
-    colours, shares = values[:, 3:] / (65535.0 if types == {"u2"} else 1.0), types == {"u2"}
-    if types <= {"f4", "f8"}:
-        shares = colours.max(initial=0.0) <= 1.0
-        colours = colours if shares else np.round(colours)
-    return values[:, :3].copy(), _hexadecimal(colours, shares=shares), ()
+    colours, real = (
+        values[:, 3:] / (65535.0 if types == {"u2"} else 1.0),
+        types <= {"u2", "f4", "f8"},
+    )
+    colours = colours if colours.max(initial=0.0) <= 1.0 else np.round(colours)
+    return values[:, :3].copy(), _hexadecimal(colours, real=real), ()
 
 
 def _bytes_before_vertices(
@@ -267,14 +275,15 @@ def _bytes_before_vertices(
     """Number of bytes of the elements before the vertices."""
     start = 0
     for _, count, properties in elements:
-        for words in properties * count:
+        for words in chain.from_iterable(repeat(properties, count if properties else 0)):
             size = np.dtype(_TYPES[words[-2]]).itemsize
             if words[0] == "list":
                 number = np.dtype(order + _TYPES[words[1]])
-                if len(body) < start + number.itemsize:
-                    raise ValueError("ends before its vertices")
-                size = number.itemsize + size * int(np.frombuffer(body, number, 1, start)[0])
+                length = int.from_bytes(body[start : start + number.itemsize], _ENDS[order])
+                size = number.itemsize + size * length
             start += size
+            if len(body) < start:
+                raise ValueError("ends before its vertices")
     return start
 
 
