@@ -63,8 +63,10 @@ class Packed(NamedTuple):
 _buffer = (ctypes.c_char * 0).from_buffer
 
 
-def _flatten(x: Any, kinds: list[Any], words: list[Any]) -> None:
-    """Append the words of a named tuple, and the kinds of its numbers and arrays."""
+def _flat(x: Any) -> tuple[Any, list[Any], list[Any]]:
+    """A named tuple, the kinds of its numbers and arrays, and its words."""
+    kinds: list[Any] = []
+    words: list[Any] = []
     for value in x:
         if isinstance(value, np.ndarray):
             try:
@@ -85,13 +87,6 @@ def _flatten(x: Any, kinds: list[Any], words: list[Any]) -> None:
         else:
             words.append(int(value))
             kinds.append(int)
-
-
-def _flat(x: Any) -> tuple[Any, list[Any], list[Any]]:
-    """A named tuple, the kinds of its numbers and arrays, and its words."""
-    kinds: list[Any] = []
-    words: list[Any] = []
-    _flatten(x, kinds, words)
     return x, kinds, words
 
 
