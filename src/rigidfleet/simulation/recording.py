@@ -400,11 +400,8 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     if not samples:
         return None
     joined = _together(samples)
-    return joined._replace(
-        attitude=np.stack(
-            [att.unwrap_quaternion(q) for q in joined.attitude.swapaxes(0, 1)], axis=1
-        )
-    )
+    attitude = att.unwrap_quaternion(joined.attitude.swapaxes(0, 1)).swapaxes(0, 1)
+    return joined._replace(attitude=np.ascontiguousarray(attitude))
 
 
 def _together(pieces: Sequence[Samples]) -> Samples:
