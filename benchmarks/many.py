@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rigidfleet.assessment import assess
-from rigidfleet.assessment.fits import Fit
+from rigidfleet.assessment.fits import fits_of
 from rigidfleet.formation import distance_geometry, shapes
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.mission import Mission, load_mission
@@ -221,6 +221,7 @@ def fly(kind: str, n: int) -> Flown:
         result = simulate(flown, force=force, max_step=DURATION)
         times.append((time.perf_counter() - wall, time.process_time() - processor))
     last = result.position[-1]
+    fit = next(fits_of(last[None], slots, np.arange(n), float))
     error = np.abs(distance_geometry.distances(last, edges) - flown.formation_distances("f")).max()
     thickness = np.linalg.svd(rigid_body.centred(last), full_matrices=False)[2][2]
     off = rigid_body.centred(last) @ thickness
@@ -228,7 +229,7 @@ def fly(kind: str, n: int) -> Flown:
         kind, n, len(edges), ", ".join(result.statistics["solvers"]) or "dense",
         *(median(column) for column in zip(*times, strict=True)), [wall for wall, _ in times],
         result.statistics["steps"], resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
-        float(error), Fit(last, slots).error, float(np.abs(off).max()) if sheet else None, result.ending,
+        float(error), fit.error, float(np.abs(off).max()) if sheet else None, result.ending,
     )  # fmt: skip
 
 

@@ -1,13 +1,17 @@
 """Steady offsets from slots, foreseen and flown, and the limits that they break."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from rigidfleet.assessment import assess
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.preflight.check import check
-from rigidfleet.preflight.offsets import offsets
+from rigidfleet.preflight.offsets import exponential, offsets
 from rigidfleet.simulation.flight import simulate
 
 SQUARE = np.array([[2.0, 2, 0], [-2, 2, 0], [-2, -2, 0], [2, -2, 0]])
@@ -232,3 +236,20 @@ def test_a_tolerance_of_a_formation_is_that_of_its_check(tolerance):
             disturbances={"mass_error": errors},
         )
         assert check(tilted, search=False).passed == passes == assess(simulate(tilted)).passed
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1.0, 30.0])
+def test_exponentials_are_those_of_scipy(size):
+    """Of several matrices at once, of any size."""
+    A = size * np.random.default_rng(1).normal(size=(5, 4, 4))
+    want = expm(A)
+    np.testing.assert_allclose(exponential(A), want, rtol=1e-11, atol=1e-12 * np.abs(want).max())
+
+
+def test_a_check_of_steady_wind_loads_no_scipy():
+    """It would take longer to load than all that the check computes."""
+    code = (
+        "import sys, rigidfleet as rf; rf.check(rf.load_mission('windy-passage')); "
+        "assert not [name for name in sys.modules if name.split('.')[0] == 'scipy']"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from itertools import repeat
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,47 +34,58 @@ _ROUNDING = 1e-12
 _JUDGED = 200
 
 
-class Fit:
+class Fit(NamedTuple):
     """A formation as flown at one sample, compared with its slots.
 
     Attributes
     ----------
-    dimension, axis, shortest : of the slots: dimension; direction of a line or normal of a plane, in their axes;
-        shortest distance [m]
-    error, pair, flown, intended : the greatest error of a distance [m], of which agents, and the two distances [m]
+    dimension, axis : of the slots: dimension; direction of a line or normal of a plane, in their axes
     limit : the greatest error that the formation allows [m]
+    error, pair, flown, intended : the greatest error of a distance [m], of which agents, and the two distances [m]
+    is_mirrored : whether a spatial shape is the mirror image of its slots
+    points : where the best-fitting rotation turns the axis in the world: a unit vector (3,)
+    in_order : whether the agents of a line are in order; None for other shapes, and for two agents
     """
 
+    dimension: int
+    axis: Floats
     limit: float
+    error: float
+    pair: tuple[int, int]
+    flown: float
+    intended: float
+    is_mirrored: bool
+    points: list[float]
+    in_order: bool | None
 
-    def __init__(self, p: Floats, slots: Floats) -> None:
-        """Compare agents p (N, 3) with slots (N, 3)."""
-        self._p, centred = rigid_body.centred(p), rigid_body.centred(slots)
-        self.dimension, self.axis, self._order, self.shortest = _shape(slots.tobytes())
-        #: The decomposition of the sum of p slot^T over the agents.
-        self._across = np.linalg.svd(self._p.T @ centred)
-        off = length(self._p - centred @ (self._across[0] @ self._across[2]).T)
-        self.error, self.pair, self.flown, self.intended = _worst_pair(p, slots, off)
 
-    @property
-    def is_mirrored(self) -> bool:
-        """Whether a spatial shape is the mirror image of its slots."""
-        u, _, vt = self._across
-        return self.dimension == 3 and bool(np.linalg.det(u @ vt) < 0.0)
+def fits_of(
+    p: Floats, slots: Floats, who: Ints, greatest_error: Callable[[float], float]
+) -> Iterator[Fit]:
+    """Compare a formation as flown at G samples with its slots (N, 3): agents ``who`` (N,) at p (G, N, 3).
 
-    @cached_property
-    def points(self) -> list[float]:
-        """Where the best-fitting rotation turns the axis in the world: a unit vector (3,)."""
-        return (rigid_body.best_rotation(*self._across)[0] @ self.axis).tolist()
-
-    @property
-    def in_order(self) -> bool | None:
-        """Whether the agents of a line are in order; None for other shapes, and for two agents."""
-        if self.dimension != 1 or len(self._order) < 3:
-            return None
+    ``greatest_error``: the one that is allowed [m], of the shortest distance of two slots [m].
+    """
+    dimension, axis, order, shortest = _shape(slots.tobytes())
+    own, centred = p - p.mean(axis=1, keepdims=True), rigid_body.centred(slots)
+    # The decompositions of the sums of p slot^T over the agents.
+    u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ centred)
+    turn, proper = rigid_body.best_rotation(u, s, vt)
+    if len(slots) <= _FEW:
+        worst = _worst_pairs_of_few(p, slots)
+    else:
+        worst = map(_worst_pair, p, repeat(slots), length(own - centred @ (u @ vt).swapaxes(1, 2)))
+    in_order: list[bool | None] = [None] * len(p)
+    if len(order) > 2:
         # They follow each other where they extend most.
-        along = np.linalg.eigh(self._p.T @ self._p)[1][:, -1]
-        return (self._p @ along).argsort().tolist() in (self._order, self._order[::-1])
+        along = np.linalg.eigh(own.swapaxes(1, 2) @ own)[1][..., -1:]
+        flown = (own @ along)[..., 0].argsort(axis=1).tolist()
+        in_order = [x in (order, order[::-1]) for x in flown]
+    points, limit = (turn @ axis).tolist(), greatest_error(shortest)
+    for wrong, right, place, ordered in zip(worst, proper.tolist(), points, in_order, strict=True):
+        error, i, j, apart, intended = wrong
+        pair, mirrored = (who.item(i), who.item(j)), dimension == 3 and not right
+        yield Fit(dimension, axis, limit, error, pair, apart, intended, mirrored, place, ordered)
 
 
 @lru_cache(16)
@@ -87,24 +100,31 @@ def _shape(slots: bytes) -> tuple[int, Floats, list[int], float]:
     return dimension, axis, order, float(proximity.nearest(points).min())
 
 
-def _worst_pair(
-    p: Floats, slots: Floats, off: Floats
-) -> tuple[float, tuple[int, int], float, float]:
-    """Worst error of a distance among all pairs: error, pair, flown, intended [m]; of equal errors of few the first.
+#: Error of a distance [m], of which two, the distances flown and intended [m].
+_Worst = tuple[float, int, int, float, float]
 
-    Of many agents, few pairs have to be computed: the error of a pair is at most the sum of both agents' distances
-    ``off`` (N,) from their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
+
+def _worst_pairs_of_few(p: Floats, slots: Floats) -> Iterator[_Worst]:
+    """Worst errors of a distance at samples p (G, N, 3), among all pairs; of equal errors the first."""
+    i, j = proximity.all_pairs(len(slots))
+    flown, intended = (length(x.take(i, axis=-2) - x.take(j, axis=-2)) for x in (p, slots))
+    error = np.abs(flown - intended)
+    least = error.max(axis=1, keepdims=True) - _ROUNDING * intended.max()
+    k, at = (error >= least).argmax(axis=1), np.arange(len(p))
+    columns = error[at, k], i[k], j[k], flown[at, k], intended[k]
+    return zip(*(x.tolist() for x in columns), strict=True)
+
+
+def _worst_pair(p: Floats, slots: Floats, off: Floats) -> _Worst:
+    """Worst error of a distance of many agents p (N, 3), among all pairs.
+
+    Few pairs have to be computed: the error of a pair is at most the sum of both agents' distances ``off`` (N,) from
+    their slots, for any fit of the slots, mirrored or not. Improvements below rounding are ignored.
     """
     both = np.array([p, slots])
-    if len(p) <= _FEW:
-        i, j = proximity.all_pairs(len(p))
-        flown, intended = length(both.take(i, axis=1) - both.take(j, axis=1))
-        error = np.abs(flown - intended)
-        k = int((error >= error.max() - _ROUNDING * intended.max()).argmax())
-        return error.item(k), (i.item(k), j.item(k)), flown.item(k), intended.item(k)
     order = np.argsort(-off, kind="stable")
     ranked, rounding = -off[order], _ROUNDING * float(np.ptp(slots, axis=0).max())
-    worst = (-1.0, (0, 0), 0.0, 0.0)
+    worst = (-1.0, 0, 0, 0.0, 0.0)
     for first, i in enumerate(order[:-1].tolist(), start=1):
         last = bisect_left(ranked, off[i] - worst[0] - rounding)
         if last <= first:
@@ -115,7 +135,7 @@ def _worst_pair(
         at = int(error.argmax())
         if (most := float(error[at])) > worst[0]:
             j = int(others[at])
-            worst = (most, (min(i, j), max(i, j)), float(flown[at]), float(intended[at]))
+            worst = (most, min(i, j), max(i, j), float(flown[at]), float(intended[at]))
     return worst
 
 

@@ -7,12 +7,11 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, Quantity, quantity
-from rigidfleet.assessment.fits import Fit, angle_between
+from rigidfleet.assessment.fits import Fit, angle_between, fits_of
 from rigidfleet.assessment.outcome import Extreme, PhaseVerdict, Waypoint, value
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
@@ -21,6 +20,7 @@ from rigidfleet.result.quantities import (
     SAMPLED,
     Samples,
     closeness,
+    length,
     owner_name,
     samples,
     without_lost,
@@ -34,6 +34,9 @@ _SLACK = {"separation": 0.0, "clearance": 0.0, "speed": 1e-9}
 
 #: Quantities of which a phase between samples has a worst value.
 _DUE = ("speed", "lowest", "highest", "thrust", "separation", "clearance", "geofence")
+
+#: What a phase is judged by at its end.
+_ENDS = ("target", "stay")
 
 #: What a verdict on a phase repeats of its record.
 _OF_RECORD = ("name", "kind", "control", "formation", "t_start", "t_end", "settled")
@@ -64,9 +67,15 @@ class Measurements:
         """Values at samples of each quantity of which a phase has a worst value."""
         return {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
 
-    def rank(self, name: str, index: int) -> float:
-        """Greatest rank of a quantity at the samples of a phase; -infinity of a phase without samples."""
-        return float(self.of_phases[name].rank[self.parts[index]].max(initial=-np.inf))
+    @cached_property
+    def ranks(self) -> dict[tuple[str, int], float]:
+        """Greatest rank of each of these quantities at the samples of each phase that has samples."""
+        starts, ranks = np.array([self.parts[k].start for k in self.flown]), {}
+        for name, sampled in self.of_phases.items():
+            if places := sampled.rank.shape[1]:
+                most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
+                ranks |= {(name, k): rank for k, rank in zip(self.flown, most, strict=True)}
+        return ranks
 
     def first_time(self, broken: Bools) -> float:
         """Time [s] of the first sample at which ``broken`` holds; infinity if it never does."""
@@ -106,8 +115,11 @@ class Measurements:
 
     def worst(self, name: str) -> Extreme | None:
         """The worst value of a flight, at its samples or between them; None if it is not known."""
-        known = quantity(name).by_phase or name in SAMPLED
-        return self.worst_among(name, self.samples_of(name) if known else None)
+        q = quantity(name)
+        if q.by_phase:
+            every = [worst[name] for worst in self.worst_by_phase if name in worst]
+            return max(every, key=lambda e: q.rank(e.value), default=None)
+        return self.worst_among(name, self.samples_of(name) if name in SAMPLED else None)
 
     def worst_among(self, name: str, values: Samples | None) -> Extreme | None:
         """The worst value of a flight among some ``values`` at samples, or between them."""
@@ -126,15 +138,12 @@ class Measurements:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
         for name, sampled in self.of_phases.items():
-            rank, alone = sampled.quantity.rank, name not in self.names_recorded
+            q, alone = sampled.quantity, name not in self.names_recorded
             for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
-                e, x = (
-                    self.worst_sample(sampled, self.parts[k], alone=alone),
-                    phase.extremes.get(name),
-                )
-                if x is not None and (e is None or rank(e.value) < rank(x.value)):
-                    e = self.extreme_of(name, x, phase.name)
-                if e is not None:
+                x, rank = phase.extremes.get(name), self.ranks.get((name, k), -math.inf)
+                if x is not None and rank < q.rank(_size(q, x)):
+                    worst[name] = self.extreme_of(name, x, phase.name)
+                elif e := self.worst_sample(sampled, self.parts[k], alone=alone):
                     worst[name] = e
         return every
 
@@ -219,7 +228,7 @@ class Measurements:
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
             for name, share in _SLACK.items():
-                x, rank = extremes.get(name), self.rank(name, index)
+                x, rank = extremes.get(name), self.ranks.get((name, index), -math.inf)
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
@@ -239,7 +248,7 @@ class Measurements:
         if name == "geofence":
             return self.mission.limits.geofence is not None
         if name != "clearance":
-            return self.rank(name, index) > -math.inf
+            return self.ranks.get((name, index), -math.inf) > -math.inf
         # An obstacle that is there at the start or the end of a phase alone is not in it.
         phase = self.result.phases[index]
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
@@ -247,32 +256,34 @@ class Measurements:
 
     def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
-        result, flown = self.result, index in self.flown
-        finished = flown and (result.complete or index < len(result.phases) - 1)
-        finished = finished and not record.abandoned
-        fit = self.fits.get(index)
+        result, fit, waypoints = self.result, self.fits.get(index), self.waypoints
+        finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
         return PhaseVerdict(
             **{key: getattr(record, key) for key in _OF_RECORD},
-            finished=finished,
-            constraint=_greatest(result.constraint[self.parts[index].stop - 1]) if flown else None,
-            distances=self.edge_error(index),
+            finished=finished and not record.abandoned,
+            constraint=self.constraints.get(index),
+            distances=self.shapes[0].get(index),
             shape=None if fit is None else fit.error,
             handedness=None if fit is None or fit.dimension < 3 else not fit.is_mirrored,
-            flip=self.flip(index),
+            flip=self.flips.get(index),
             order=None if fit is None else fit.in_order,
-            waypoint=self.miss(index, record.target) if finished else None,
-            stay=self.miss(index, record.stay) if finished else None,
-            through=tuple(self.misses_on_way(index)),
+            waypoint=waypoints.get((index, "target")),
+            stay=waypoints.get((index, "stay")),
+            through=tuple(
+                w for (k, what), w in waypoints.items() if k == index and what not in _ENDS
+            ),
             worst=self.worst_by_phase[index],
         )
 
-    def edge_error(self, index: int) -> float | None:
-        """Greatest error [m] of an edge against its formation at the end of a phase; None if it has none."""
-        name, k = self.result.phases[index].formation, self.parts[index].stop - 1
-        if name is None or index not in self.flown:
-            return None
-        edges, intended = self.edges(name, k)
-        return _greatest(proximity.lengths(self.result.position[k : k + 1], edges)[:, 0] - intended)
+    @cached_property
+    def last(self) -> list[int]:
+        """The last sample of each phase flown."""
+        return [self.parts[k].stop - 1 for k in self.flown]
+
+    @cached_property
+    def constraints(self) -> dict[int, float | None]:
+        """Greatest constraint error [m] of an edge at the end of each phase flown."""
+        return dict(zip(self.flown, _greatest(self.result.constraint[self.last]), strict=True))
 
     def edges(self, formation: str, k: int) -> tuple[Ints, Floats]:
         """Edges (m, 2) of a formation that are not lost at sample k, and their lengths (m,) [m]."""
@@ -283,35 +294,52 @@ class Measurements:
         return edges[kept], intended[kept]
 
     @cached_property
+    def shapes(self) -> tuple[dict[int, float | None], dict[int, Fit]]:
+        """Greatest errors [m] of edges against the formation at the end of each phase that has one, and its fits."""
+        result, mission, errors, fits, groups = self.result, self.mission, {}, {}, {}
+        links = (mission.links_lost[1] < result.time[self.last, None]).sum(axis=1).tolist()
+        whole = np.isfinite(result.position[self.last].sum(axis=(1, 2))).tolist()
+        for index, k, *state in zip(self.flown, self.last, links, whole, strict=True):
+            if (name := result.phases[index].formation) is not None:
+                # Ends of one formation are measured together, while nobody and no link is lost.
+                groups.setdefault((name, self.left[k].tobytes(), *state), []).append((index, k))
+        for (name, *_, finite), ends in groups.items():
+            phases, samples = zip(*ends, strict=True)
+            r, left = result.position[[*samples]], np.flatnonzero(self.left[samples[0]])
+            edges, intended = self.edges(name, samples[0])
+            off = proximity.lengths(r, edges).T - intended
+            errors.update(zip(phases, _greatest(off), strict=True))
+            slots = mission.formation_slots(name)
+            if slots is not None and len(left) > 1 and finite:
+                most = mission.formations[name].greatest_error
+                every = fits_of(r[:, left], slots[left], left, most)
+                fits.update(zip(phases, every, strict=True))
+        return errors, fits
+
+    @property
     def fits(self) -> dict[int, Fit]:
         """Fits of the formations at the end of each phase."""
-        fits = {}
-        for index in self.flown:
-            name, k = self.result.phases[index].formation, self.parts[index].stop - 1
-            slots = None if name is None else self.mission.formation_slots(name)
-            end, left = self.result.position[k], np.flatnonzero(self.left[k])
-            if name is None or slots is None or len(left) < 2 or not np.isfinite(end).all():
-                continue
-            fits[index] = fit = Fit(end[left], slots[left])
-            fit.pair = left.item(fit.pair[0]), left.item(fit.pair[1])
-            fit.limit = self.mission.formations[name].greatest_error(fit.shortest)
-        return fits
+        return self.shapes[1]
 
-    def flip(self, index: int) -> float | None:
-        """Angle [deg] of a line or plane from its intended direction at the end of a phase that has one."""
-        fit, k = self.fits.get(index), self.parts[index].stop - 1
-        if fit is None or fit.dimension > 2:
-            return None
+    @cached_property
+    def flips(self) -> dict[int, float | None]:
+        """Angle [deg] of a line or plane from its intended direction at the end of each phase that has one."""
+        flat = {index: fit for index, fit in self.fits.items() if fit.dimension < 3}
+        if not flat:
+            return {}
+        samples = [self.parts[k].stop - 1 for k in flat]
+        axes, flips = np.array([fit.axis for fit in flat.values()]), {}
         # A commanded attitude decides; without one, the integrated frame says how a plane should lie.
-        aims = [self.result.attitude_reference[k], self.result.frame[k]]
-        if fit.dimension == 1:
-            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
-            aims = aims[: self.result.phases[index].control == "tracking"]
-        angles = (
-            angle_between(fit.points, (att.dcm_from_quaternion(q).T @ fit.axis).tolist())
-            for q in aims
+        wanted = (
+            np.einsum("kij,ki->kj", att.dcm_from_quaternion(q[samples]), axes).tolist()
+            for q in (self.result.attitude_reference, self.result.frame)
         )
-        return next(filter(math.isfinite, angles), None)
+        for index, fit, *ways in zip(flat, flat.values(), *wanted, strict=True):
+            # Only tracked slots steer a line; otherwise its direction follows from the shape before.
+            steers = 2 if fit.dimension == 2 else self.result.phases[index].control == "tracking"
+            angles = (angle_between(fit.points, aim) for aim in ways[:steers])
+            flips[index] = next(filter(math.isfinite, angles), None)
+        return flips
 
     def nearest_sample(self, t: float, index: int) -> int:
         """The sample of a phase flown that is nearest to a time [s]; of two equally near the first."""
@@ -320,47 +348,42 @@ class Measurements:
         before = max(after - 1, part.start)
         return after if abs(time[after] - t) < abs(time[before] - t) else before
 
-    def miss(self, index: int, target: dict[str, Any] | None) -> Waypoint | None:
-        """Miss of the target of a phase, or of its place to stay at its end; None if it has none.
+    @cached_property
+    def waypoints(self) -> dict[tuple[int, str], Waypoint]:
+        """Misses of the "target" of each phase, of its place to "stay", and of the points to pass on the way.
 
-        A target is due at its time, or at the end of a phase that settles earlier. Where no formation is held, each
-        vehicle has a place of its own: the vehicle furthest from it counts.
+        A target is due at its time, or at the end of a phase that settles earlier; of the others, those that the
+        flight came to. Where no formation is held, each vehicle has a place of its own: the vehicle furthest from it
+        counts.
         """
-        if target is None:
-            return None
-        result, k = self.result, self.nearest_sample(target["time"], index)
-        miss: dict[str, float] = {}
+        result, due = self.result, []
+        for index, k in zip(self.flown, self.last, strict=True):
+            record = result.phases[index]
+            if (result.complete or index < len(result.phases) - 1) and not record.abandoned:
+                ends = ((what, getattr(record, what)) for what in _ENDS)
+                due += [(index, what, x) for what, x in ends if x is not None]
+            points = enumerate((record.target or {}).get("through", ()))
+            due += [(index, str(n), x) for n, x in points if x["time"] <= result.time[k]]
+        at, rows = [self.nearest_sample(x["time"], index) for index, _, x in due], []
         for name, values in (
             ("position", result.cm), ("velocity", result.cm_velocity), ("attitude", result.attitude),
             ("rates", result.rates),
         ):  # fmt: skip
-            row, wanted = values[k].tolist(), target.get(name)
-            # Where the quantity is asked for, and known.
-            if wanted is not None and all(map(math.isfinite, row)):
-                turned = name == "attitude"
-                miss[name] = (
-                    float(att.angle_between(row, wanted)) if turned else math.dist(row, wanted)
-                )
-        if "position" in miss and result.phases[index].formation is None:
-            own = float(np.fmax.reduce(self.samples_of("tracking_error").values[k]))
-            # With a vehicle lost, the centre of those left says nothing of their places.
-            miss["position"] = max(miss["position"], own) if self.left[k].all() else own
-        for name in {"attitude", "rates"} & miss.keys():
-            miss[name] = math.degrees(miss[name])
-        return Waypoint(
-            result.time.item(k), *map(miss.get, ("position", "velocity", "attitude", "rates"))
-        )
-
-    def misses_on_way(self, index: int) -> Iterator[Waypoint]:
-        """Misses of the points on the way of a phase that the flight came to."""
-        result, part = self.result, self.parts[index]
-        for point in (result.phases[index].target or {}).get("through", ()):
-            if part.stop == part.start or result.time[part.stop - 1] < point["time"]:
-                continue
-            k = self.nearest_sample(point["time"], index)
-            miss, v = math.dist(result.cm[k].tolist(), point["position"]), point.get("velocity")
-            off = None if v is None else math.dist(result.cm_velocity[k].tolist(), v)
-            yield Waypoint(float(result.time[k]), miss, off, None, None)
+            unknown = [math.nan] * values.shape[1]
+            aims = [unknown if (aim := x.get(name)) is None else aim for *_, x in due]
+            aims = np.reshape(aims, (-1, values.shape[1]))
+            turned = name == "attitude"
+            off = att.angle_between(values[at], aims) if turned else length(values[at] - aims)
+            rows.append(np.degrees(off) if turned or name == "rates" else off)
+        misses: dict[tuple[int, str], Waypoint] = {}
+        for (index, what, _), k, row in zip(due, at, np.transpose(rows).tolist(), strict=True):
+            miss = [x if math.isfinite(x) else None for x in row]
+            if miss[0] is not None and what in _ENDS and result.phases[index].formation is None:
+                own = float(np.fmax.reduce(self.samples_of("tracking_error").values[k]))
+                # With a vehicle lost, the centre of those left says nothing of their places.
+                miss[0] = max(miss[0], own) if self.left[k].all() else own
+            misses[index, what] = Waypoint(result.time.item(k), *miss)
+        return misses
 
 
 def _size(q: Quantity, x: Extremum) -> float:
@@ -368,7 +391,7 @@ def _size(q: Quantity, x: Extremum) -> float:
     return abs(x.value) if q.name == "constraint" else q.scale * x.value
 
 
-def _greatest(values: Floats) -> float | None:
-    """Greatest finite size of values (m,); None if there is none."""
-    sizes = np.abs(values[np.isfinite(values)])
-    return float(sizes.max()) if sizes.size else None
+def _greatest(values: Floats) -> list[float | None]:
+    """Greatest finite size in each row of values (K, m); None if there is none."""
+    sizes = np.where(np.isfinite(values), np.abs(values), -1.0).max(axis=1, initial=-1.0)
+    return [None if size < 0.0 else size for size in sizes.tolist()]

@@ -454,12 +454,14 @@ class Mission(Contents, Shown):
         if name is None or slots is None:
             return _DAMPING[1]
         edges = self.formation_edges(name)
-        left = np.ones(self.n_agents, dtype=np.bool_) if lost is None else ~lost
-        edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
-        if not len(edges) or min(len(edges), 3 * int(left.sum())) > _DENSE:
+        masses = self.fleet.mass
+        if lost is not None and lost.any():
+            left = ~lost
+            edges = (np.cumsum(left) - 1)[edges[left[edges].all(axis=1)]]
+            slots, masses = slots[left], masses[left]
+        if not len(edges) or min(len(edges), 3 * len(masses)) > _DENSE:
             return _DAMPING[1]
-        of_left = slots[left], edges, self.fleet.mass[left]
-        return _damping(*(x.tobytes() for x in of_left))
+        return _damping(slots.tobytes(), edges.tobytes(), masses.tobytes())
 
     @property
     def latest_end(self) -> float:
@@ -510,9 +512,8 @@ class Mission(Contents, Shown):
 
     def landings_in_words(self, end: Floats) -> str:
         """Which vehicles land where which other one stood, of those at ``end`` (N, 3) [m]; "" if none does."""
-        start = self.fleet.position
-        stand = self.standing(end)
-        if len(end) < 2 or not (self.standing(start) & stand).any():
+        start, stand = self.fleet.position, self.standing(end)
+        if len(end) < 2 or not stand.any() or not (self.standing(start) & stand).any():
             return ""
         from scipy.spatial import KDTree
 

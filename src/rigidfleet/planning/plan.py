@@ -248,7 +248,7 @@ def plan_phase(
         body_formulation=mission.formulation == "body",
         has_frame=leg.frame is not None,
         vehicles=_vehicles(
-            masses, mission.fleet.thrust_limit, mission.agents.saturate, mission.gravity
+            masses.tobytes(), mission.fleet.thrust_limit.tobytes(), mission.agents.saturate, mission.gravity
         ),
         graph=_graph(edges.tobytes(), masses.tobytes(), large=method != "dense"),
         law=_law(
@@ -317,10 +317,11 @@ def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
         )
 
 
-def _vehicles(masses: Floats, limit: Floats, saturate: bool, gravity: float) -> Vehicles:
-    return Vehicles(
-        masses.copy(), 1.0 / masses, float(masses.sum()), float(masses.mean()), limit.copy(), saturate, gravity
-    )  # fmt: skip
+@lru_cache(64)
+def _vehicles(masses: bytes, limit: bytes, saturate: bool, gravity: float) -> Vehicles:
+    """The vehicles, cached because they are the same in all phases."""
+    m, most = (np.frombuffer(x).copy() for x in (masses, limit))
+    return Vehicles(m, 1.0 / m, float(m.sum()), float(m.mean()), most, saturate, gravity)
 
 
 @lru_cache(64)
@@ -339,15 +340,17 @@ def _formation_in_shape(mission: Mission, name: str | None, now: PhaseState) -> 
     slots, r = slots[left], now.r[left]
     if len(slots) < 2:
         return None
-    pairs, wanted, most = _pair_lengths(slots)
+    pairs, wanted, most = _pair_lengths(slots.tobytes())
     off = np.abs(distance_geometry.distances(r, pairs) - wanted)
     return name if (off <= most).all() else None
 
 
-def _pair_lengths(slots: Floats) -> tuple[Ints, Floats, float]:
-    """All pairs of slots, their distances [m], and the greatest error [m] at which they count as held."""
-    pairs = graphs.complete_graph(len(slots))
-    wanted = distance_geometry.distances(slots, pairs)
+@lru_cache(16)
+def _pair_lengths(slots: bytes) -> tuple[Ints, Floats, float]:
+    """All pairs of slots (N, 3), their distances [m], and the greatest error [m] at which they count as held."""
+    places = np.frombuffer(slots).reshape(-1, 3)
+    pairs = graphs.complete_graph(len(places))
+    wanted = distance_geometry.distances(places, pairs)
     return pairs, wanted, _NEAR * float(wanted.min())
 
 

@@ -7,6 +7,7 @@ constraint law. Gusts and noise are left out: they have no mean.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -46,9 +47,7 @@ def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
         for planned, one in zip(way, tracked, strict=True)
     ]
     if not any(pushed.any() for pushed in pushes):
-        return pushes  # nothing pushes: SciPy, which takes long to load, is not needed
-    from scipy.linalg import expm
-
+        return pushes
     law = feedback(mission, None, None)
     laws = np.zeros((2, 4, 4))  # of the integral, the offset, its rate and a held force
     laws[:, 0, 1] = laws[:, 1, 2] = laws[:, 2, 3] = 1.0
@@ -60,13 +59,28 @@ def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
             now = np.zeros_like(now)
             by_phase.append(pushed)
             continue
-        flat, steps = pushed.reshape(len(pushed), -1), expm(laws * np.diff(planned.time[:2])[0])
+        flat, steps = (
+            pushed.reshape(len(pushed), -1),
+            exponential(laws * np.diff(planned.time[:2])[0]),
+        )
         answers = np.empty((len(flat), 2, flat.shape[1]))
         for k, push in enumerate(flat):
             answers[k] = now[:, 1]
             now = steps[:, :3, :3] @ now + steps[:, :3, 3:] * push
         by_phase.append(_offsets_with_edges(mission, planned, pushed, answers))
     return by_phase
+
+
+def exponential(A: Floats) -> Floats:
+    """Exponentials of matrices A (..., n, n), by scaling and squaring: to load SciPy takes longer than the check."""
+    halvings = max(0, math.frexp(float(np.abs(A).sum(axis=-1).max()))[1])
+    whole = term = np.eye(A.shape[-1])
+    for k in range(1, 19):  # the next term is below rounding
+        term = term @ A / (k * 2.0**halvings)
+        whole = whole + term
+    for _ in range(halvings):
+        whole = whole @ whole
+    return whole
 
 
 def _unknown_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:

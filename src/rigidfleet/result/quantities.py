@@ -134,10 +134,9 @@ def _boundary(result: Result, name: str) -> tuple[Any, ...]:
 
 def _tilt(result: Result) -> tuple[Floats, ...]:
     """Tilt (K, N) [deg] of each vehicle; of points, of the thrust that the slots they track need."""
-    q, wanted = result.vehicle_attitude, result.slot_acceleration
-    if q is not None:
-        up = att.dcm_from_quaternion(q)[..., 2, 2]
-    elif wanted is not None:
+    if result.vehicle_attitude is not None:
+        up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
+    elif (wanted := result.slot_acceleration) is not None:
         force = wanted + np.array([0.0, 0.0, result.mission.gravity])
         up = force[..., 2] / np.maximum(length(force), 1e-300)
     else:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native
-from rigidfleet.kernel.problem import OPEN, TRACKING, Problem
+from rigidfleet.kernel.problem import OPEN, TRACKING, Problem, Workspace
 from rigidfleet.kernel.records import IntegratorState, Record
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Settle
@@ -123,10 +123,11 @@ class ActivePhase:
         sampler: Sampler,
         pieces: list[Piece],
         pause: Callable[[float], None],
+        workspaces: Callable[..., Workspace],
     ) -> None:
         self.index, self.plan = index, plan
         self.extremes, self.external, self.sampler = extremes, external, sampler
-        self.pieces, self.pause = pieces, pause
+        self.pieces, self.pause, self.workspaces = pieces, pause, workspaces
         self.lost = np.zeros(len(plan.masses), dtype=np.bool_)
         if plan.before.lost is not None:
             self.lost = plan.before.lost
@@ -146,7 +147,7 @@ class ActivePhase:
 
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
-        self.workspace, self.solver = equip(self.plan)
+        self.workspace, self.solver = equip(self.plan, self.workspaces)
         self.stepper.begin(y, t)
 
     @property

@@ -158,7 +158,10 @@ class CurveWatch:
         """Evaluate the paths alone of the steps in a trail from ``first`` on, not the forces."""
         steps = int(state.count[records.TRAILED])
         self._take_solids(problem, state, first, steps)
-        self._take_boundaries(problem, state, first, steps)
+        if self.boundaries.every:
+            rows = _rows(state, np.arange(first, steps))
+            clock, points = state.trail.clock[rows], state.trail.points[rows]
+            self.boundaries.take(*in_world(clock, points, problem), self.left)
         if self.n > _FEW:
             for step in range(first, steps):
                 self._step(problem, work, state, step)
@@ -212,15 +215,6 @@ class CurveWatch:
         """Take the clearances of some steps in the trail to obstacles that the monitor itself does not take."""
         if self.solids is not None:
             self.monitor.clearances(problem, state, first, end, self.solids)
-
-    def _take_boundaries(
-        self, problem: Problem, state: records.IntegratorState, first: int, end: int
-    ) -> None:
-        """Take some steps in the trail beside fences and people."""
-        if self.boundaries.every:
-            rows = _rows(state, np.arange(first, end))
-            clock, points = state.trail.clock[rows], state.trail.points[rows]
-            self.boundaries.take(*in_world(clock, points, problem), self.left)
 
     def so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""

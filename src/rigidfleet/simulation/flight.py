@@ -7,7 +7,7 @@ import time as clock
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
 from rigidfleet.kernel.avoidance import among
-from rigidfleet.kernel.problem import TRACKING, External, Motion
+from rigidfleet.kernel.problem import TRACKING, External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
@@ -269,6 +269,7 @@ class Flight:
         # Vehicles meet their disturbances in their own equations of motion.
         self._disturbance = disturbance(mission) if self._vehicles is None else None
         self._extremes = Extremes(mission)
+        self._workspaces = cache(workspace)  # phases of one size fly in the same memory
         self._active: ActivePhase | None = None
         self._ended: ActivePhase | None = (
             None  # the phase before, if its last state is not known yet
@@ -387,6 +388,7 @@ class Flight:
             self._active = ActivePhase(
                 len(self.phases), plan, stepper, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
+                workspaces=self._workspaces,
             )  # fmt: skip
         except MissionError as error:
             # Only where a flight leaves it open can a phase of the mission be impossible: the rest are errors.

@@ -79,7 +79,6 @@ class LayerSamples(NamedTuple):
 
 
 Samples = TypeVar("Samples", VehicleSamples, LayerSamples)
-Array = TypeVar("Array", Floats, Ints)
 
 
 class Unevaluated(NamedTuple):
@@ -191,7 +190,7 @@ def assemble(
     been evaluated at the samples.
     """
     pieces = [p for p in pieces if len(p.time)]
-    time = _join([p.time for p in pieces])
+    time = np.concatenate([p.time for p in pieces])
     flown = _of_vehicles(pieces)
     tau = flown.tau if flown is not None and flown.tau.size else None
     avoided = [piece.layers for piece in pieces if piece.layers is not None]
@@ -199,52 +198,28 @@ def assemble(
     d = mission.disturbances
     noisy = d is not None and d.noise is not None
     airy = flown is not None or (d is not None and bool(mission.drag.any()))
-    worst = [
-        {
-            name: phase.extremes[name]
-            for name in ("separation", "clearance")
-            if name in phase.extremes
-        }
-        for phase in phases
-    ]
-    # Of the pieces, what is left to do keeps no more than it needs: positions, or states that begin with them.
-    motion = [
-        p.source.motion if isinstance(p.source, Unevaluated) else (p.source.r, p.source.v)
-        for p in pieces
-    ]
-    places = Places(
-        [
-            p.source.y
-            if isinstance(p.source, Unevaluated) and not p.source.problem.body_formulation
-            else r
-            for p, (r, _) in zip(pieces, motion, strict=True)
-        ],
-        mission.n_agents,
-    )
-    later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = [
-        (
-            (*RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())),
-            partial(_forces_and_references, mission, pieces, time, flown),
-        ),
-        (CLOSE, partial(distances, mission, worst, places, time)),
+    worst = [phase.extremes for phase in phases]
+    names = *RECORDED, *(("disturbance_force",) if airy else ()), *(SEEN if noisy else ())
+    recorded = partial(_forces_and_references, mission, pieces, time, flown)
+    states = [p.source.motion for p in pieces if isinstance(p.source, Unevaluated)]
+    later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = []
+    if len(states) == len(pieces):
+        r, v = (np.concatenate(parts) for parts in zip(*states, strict=True))
+        now = {"position": r, "velocity": v}
+        later = [(names, recorded), (CLOSE, partial(distances, mission, worst, r, time))]
+    else:
+        made = recorded()
+        r, now = made["position"], {name: made[name] for name in (*_STATES, *names)}
+        now |= distances(mission, worst, r, time)
+    counts = [len(p.time) for p in pieces]
+    later += [
         (LATER, partial(_references, mission, [(p.time, p.followed) for p in pieces], tau)),
-        (("singular_value",), partial(_singular_values, places, [p.edges for p in pieces])),
+        (("singular_value",), partial(_singular_values, r, counts, [p.edges for p in pieces])),
         (("mission_text",), partial(text_of, mission)),
     ]
-    now: dict[str, Any] = {}
-    if all(isinstance(p.source, Unevaluated) for p in pieces):
-        now["position"], now["velocity"] = (
-            _join(parts) if len(parts) > 1 else np.ascontiguousarray(parts[0])
-            for parts in zip(*motion, strict=True)
-        )
-    else:
-        for names, make in later[:2]:
-            made = make()
-            now |= {name: made[name] for name in (*_STATES, *names) if name in made}
-        del later[:2]
     return Result(
         time=time,
-        phase=np.array([p.phase for p in pieces]).repeat([len(p.time) for p in pieces]),
+        phase=np.array([p.phase for p in pieces]).repeat(counts),
         edges=mission.edges,
         vehicle_attitude=None if flown is None else flown.attitude,
         vehicle_rates=None if flown is None else flown.rates,
@@ -336,20 +311,18 @@ def _left(mission: Mission, time: Floats) -> Bools | None:
 def distances(
     mission: Mission,
     worst: Sequence[dict[str, Extremum]],
-    places: Places,
+    r: Floats,
     time: Floats,
     left: Bools | None = None,
 ) -> dict[str, Any]:
-    """Distances at samples; the one after an extreme of a phase, ``worst``, has the extreme.
+    """Distances at samples r (K, N, 3); the one after an extreme of a phase, ``worst``, has the extreme.
 
     Vehicles count that are not lost, or those ``left`` (K, N).
     """
     left = _left(mission, time) if left is None else left
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
-    close = proximity.closeness(
-        places.positions, mission.agents.radius, mission.obstacles, time, left
-    )
+    close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
     _put(worst, time, close)
     arrays = close.separation, close.pair, close.clearance, close.agent, close.obstacle
     return dict(zip(CLOSE, arrays, strict=True))
@@ -401,7 +374,7 @@ def _references(
             angles.append(yaws)
             last, until = yaws[-1, 0], time[-1]
     state, angle = np.concatenate(states), np.concatenate(angles)
-    left = _left(mission, _join([times for times, _ in pieces]))
+    left = _left(mission, np.concatenate([times for times, _ in pieces]))
     if left is not None:
         state[~left[:, None].repeat(3, axis=1)] = np.nan
         angle[~left[:, None].repeat(2, axis=1)] = np.nan
@@ -427,11 +400,8 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     if not samples:
         return None
     joined = _together(samples)
-    return joined._replace(
-        attitude=np.stack(
-            [att.unwrap_quaternion(q) for q in joined.attitude.swapaxes(0, 1)], axis=1
-        )
-    )
+    attitude = att.unwrap_quaternion(joined.attitude.swapaxes(0, 1)).swapaxes(0, 1)
+    return joined._replace(attitude=np.ascontiguousarray(attitude))
 
 
 def _together(pieces: Sequence[Samples]) -> Samples:
@@ -453,11 +423,6 @@ def _put(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Cl
                     close.agent[k], close.obstacle[k] = x.who, x.other
 
 
-def _join(parts: Sequence[Array]) -> Array:
-    """Parts of a flight, one after the other."""
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
 def _measure(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Record) -> Measured:
     """Attitude, rates, wrench, thrust and distances at all samples, by the kernel.
 
@@ -472,7 +437,7 @@ def _measure(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Re
         mass=mission.fleet.mass, lost_at=mission.lost_at,
         limit=mission.fleet.thrust_limit if agents.saturate else np.full(n, np.inf), edges=mission.edges,
         r=record.r, v=record.v, f_u=record.f_u, f_C=record.f_C, p=record.p, T_ref=record.T_ref,
-        frame=_join([p.frame for p in pieces]),
+        frame=np.concatenate([p.frame for p in pieces]),
     )  # fmt: skip
     native.measure(measured)
     return measured
@@ -501,15 +466,12 @@ def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) ->
 
 def _constraint_integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
     """Integrals of the constraint errors (K, m); NaN while an edge is not active."""
-    columns = [_columns(p.edges, edges) for p in pieces]
-    if all(isinstance(places, slice) for places in columns):
-        return _join([p.integral for p in pieces])
     rows = []
-    for piece, places in zip(pieces, columns, strict=True):
+    for piece in pieces:
         full = np.full((len(piece.time), len(edges)), np.nan)
-        full[:, places] = piece.integral
+        full[:, _columns(piece.edges, edges)] = piece.integral
         rows.append(full)
-    return _join(rows)
+    return np.concatenate(rows)
 
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
@@ -522,27 +484,13 @@ def _columns(some: Ints, edges: Ints) -> Ints | slice:
     return order[np.searchsorted(keys[order], some[:, 0] * key + some[:, 1])]
 
 
-class Places:
-    """Positions of a flight, from ``parts`` (K, N, 3), or (K, ...) if they are states that begin with positions."""
-
-    def __init__(self, parts: Sequence[Floats], n: int) -> None:
-        self.parts, self.n = parts, n
-
-    @cached_property
-    def positions(self) -> Floats:
-        """Positions (K, N, 3) at all samples."""
-        width = 3 * self.n
-        rows = [x.reshape(len(x), -1)[:, :width] for x in self.parts]
-        return np.concatenate(rows).reshape(-1, self.n, 3)
-
-
-def _singular_values(places: Places, edges: Sequence[Ints]) -> dict[str, Floats]:
+def _singular_values(r: Floats, counts: Sequence[int], edges: Sequence[Ints]) -> dict[str, Floats]:
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
-    ``edges`` are those of each piece. In formations of some tens of agents it is computed at some samples of each
-    phase, and linear in between.
+    ``counts`` and ``edges`` are those of each piece. In formations of some tens of agents it is computed at some
+    samples of each phase, and linear in between.
     """
-    ends = np.cumsum([len(x) for x in places.parts]).tolist()
+    ends = np.cumsum(counts).tolist()
     spans: list[tuple[list[int], Ints]] = []  # pieces with the same edges, one after the other
     for end, some in zip(ends, edges, strict=True):
         if spans and same(spans[-1][1], some):
@@ -551,9 +499,8 @@ def _singular_values(places: Places, edges: Sequence[Ints]) -> dict[str, Floats]
             spans.append(([end], some))
     values, begin = [], 0
     for parts, some in spans:
-        r = places.positions[begin : parts[-1]]
         within = [end - begin for end in parts[:-1]]
-        values += _singular(r, within, some)
+        values += _singular(r[begin : parts[-1]], within, some)
         begin = parts[-1]
     return {"singular_value": np.concatenate(values)}
 

@@ -19,10 +19,15 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import LargeSolver, Setup
 
 
-def equip(plan: PhasePlan) -> tuple[Workspace, LargeSolver | None]:
-    """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them."""
+def equip(plan: PhasePlan, make: Callable[..., Workspace]) -> tuple[Workspace, LargeSolver | None]:
+    """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them.
+
+    ``make`` makes a workspace, or returns one that the phase before has used.
+    """
     if not plan.large:
-        return workspace_of(plan.problem), None
+        work = workspace_of(plan.problem, make=make)
+        work.T[:] = work.T_ref[:] = np.eye(3)
+        return work, None
     from rigidfleet.kernel.large import ordering
     from rigidfleet.kernel.large.solver import Setup
 

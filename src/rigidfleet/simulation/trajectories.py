@@ -38,7 +38,7 @@ from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
 from rigidfleet.setpoints import intervals
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.recording import Places, distances, text_of
+from rigidfleet.simulation.recording import distances, text_of
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
@@ -515,7 +515,7 @@ def result_of(
         **known, **unknown, **dict.fromkeys(CLOSE), phases=records, mission_text="",
         statistics=statistics, **ending,
         later=[
-            (CLOSE, partial(distances, mission, worst, Places([r], n), time, left)),
+            (CLOSE, partial(distances, mission, worst, r, time, left)),
             (("mission_text",), partial(text_of, mission)),
         ],
     )  # fmt: skip

@@ -6,6 +6,7 @@ import ctypes
 import struct
 import threading
 from collections import namedtuple
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -62,8 +63,10 @@ class Packed(NamedTuple):
 _buffer = (ctypes.c_char * 0).from_buffer
 
 
-def _flatten(x: Any, kinds: list[Any], words: list[Any]) -> None:
-    """Append the words of a named tuple, and the kinds of its numbers and arrays."""
+def _flat(x: Any) -> tuple[Any, list[Any], list[Any]]:
+    """A named tuple, the kinds of its numbers and arrays, and its words."""
+    kinds: list[Any] = []
+    words: list[Any] = []
     for value in x:
         if isinstance(value, np.ndarray):
             try:
@@ -78,10 +81,13 @@ def _flatten(x: Any, kinds: list[Any], words: list[Any]) -> None:
             words.append(value)
             kinds.append(float)
         elif isinstance(value, tuple):
-            _flatten(value, kinds, words)
+            _, own, inside = _keep(_flat, value)
+            kinds += own
+            words += inside
         else:
             words.append(int(value))
             kinds.append(int)
+    return x, kinds, words
 
 
 def pack_anew(x: Any) -> Packed:
@@ -92,9 +98,7 @@ def pack_anew(x: Any) -> Packed:
     TypeError
         Numbers or arrays are not of the types that the kernel is compiled for.
     """
-    kinds: list[Any] = []
-    values: list[Any] = []
-    _flatten(x, kinds, values)
+    _, kinds, values = _flat(x)
     expected, code = _layout(type(x))
     if kinds != expected:
         raise TypeError(
@@ -108,24 +112,29 @@ class _Last(threading.local):
     """The tuples that a thread used last, by identity: flights call the kernel with the same ones repeatedly."""
 
     def __init__(self) -> None:
-        self.packed: dict[int, Packed] = {}
+        self.packed: dict[tuple[Any, int], Any] = {}
 
 
 _last = _Last()
-#: How many of them are kept: those of eight flights side by side.
-_KEPT = 32
+#: How many of them are kept: those of eight flights side by side, and the tuples in them.
+_KEPT = 128
+
+
+def _keep(make: Callable[[Any], Any], x: Any) -> Any:
+    """What ``make`` makes of a named tuple, unless it is among the last ones that the thread has used."""
+    kept, key = _last.packed, (make, id(x))
+    last = kept.pop(key, None)
+    if last is None or last[0] is not x:
+        last = make(x)
+        if len(kept) >= _KEPT:
+            del kept[next(iter(kept))]
+    kept[key] = last
+    return last
 
 
 def pack(x: Any) -> Packed:
     """`pack_anew`, unless the named tuple is among the last ones that the thread has used."""
-    kept = _last.packed
-    last = kept.pop(id(x), None)
-    if last is None or last.of is not x:
-        last = pack_anew(x)
-        if len(kept) >= _KEPT:
-            del kept[next(iter(kept))]
-    kept[id(x)] = last
-    return last
+    return _keep(pack_anew, x)
 
 
 def forget() -> None:
@@ -136,9 +145,7 @@ def forget() -> None:
 @cache
 def _layout(kind: type) -> tuple[list[Any], struct.Struct]:
     """Kinds of the numbers and arrays of a type of named tuple, and how its words are stored."""
-    kinds: list[Any] = []
-    words: list[Any] = []
-    _flatten(example_of(kind), kinds, words)
+    _, kinds, words = _flat(example_of(kind))
     return kinds, struct.Struct("=" + "".join("d" if type(x) is float else "q" for x in words))
 
 
