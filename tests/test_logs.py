@@ -1003,6 +1003,11 @@ def test_logs_of_cfclient_are_in_milliseconds_and_degrees(tmp_path):
         at_samples(read_trajectories(tmp_path / "millimetres.csv"))[1], place, atol=1e-12
     )
     assert read_trajectories(tmp_path).own_clocks
+    own = variables.replace("Timestamp", "time")
+    rows = "".join(f"{0.01 * k},{0.01 * k},0.5,1.0,{90 + k},0.1\n" for k in range(20))
+    (tmp_path / "own.csv").write_text(own + rows)
+    time = at_samples(read_trajectories(tmp_path / "own.csv"))[0]
+    np.testing.assert_allclose(time, 0.01 * np.arange(20), err_msg="a time of the user's own")
 
 
 def test_records_of_crazyswarm2_are_in_seconds(tmp_path):
