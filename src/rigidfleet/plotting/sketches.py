@@ -69,14 +69,13 @@ def tiled_figure(
 
 
 @st.in_style
+@st.needs(lambda result: result.mission.formations, "the mission has no formation")
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)
-    legend = len(result.edges) > curves.SINGLE and bool(names)
+    legend = len(result.edges) > curves.SINGLE
     fig, rects = tiled_figure(len(names), 3.5, 0.5, (0.45, 0.7 * legend))
     st.draw_head(fig, result, "Formations with their body axes")
-    if not names:
-        fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
     for rect, name in zip(rects, names, strict=True):
         _draw_formation(fig, rect, result, name)
     if legend:
