@@ -275,7 +275,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
         return
     ax.set_ylabel("thrust [N]")
     panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
-    panel.draw_below(distinct_limits(result.mission.fleet.thrust_limit), always=False)
+    panel.draw(distinct_limits(result.mission.fleet.thrust_limit), always=False)
 
 
 @st.in_style
@@ -306,7 +306,7 @@ def constraint_force(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel("constraint force [N]")
-    if Panel(above, result, force, "N", result.extreme("constraint_force")).draw_from_zero():
+    if Panel(above, result, force, "N", result.extreme("constraint_force")).draw():
         st.draw_agents_legend(above, result.n_agents)
     below.set_ylabel("tension [N]")
     name = lambda k: f"edge {result.edge_labels[k]}"  # noqa: E731
@@ -329,7 +329,7 @@ def disturbance(result: Result) -> Figure:
     above.set_ylabel("aerodynamic force [N]")
     assert result.disturbance_force is not None
     force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-    if Panel(above, result, force, "N").draw_from_zero():
+    if Panel(above, result, force, "N").draw():
         st.draw_agents_legend(above, result.n_agents)
     quadrotors.draw_off_slot(below, result)
     return fig

@@ -29,7 +29,7 @@ def messages(result: Result) -> Figure:
     net = result.mission.network
     assert net is not None
     age = oldest_messages(result)
-    Panel(above, result, age, "s").draw_from_zero()
+    Panel(above, result, age, "s").draw()
     st.draw_agents_legend(above, result.n_agents)
     if net.silence < 2.0 * np.nanmax(age, initial=0.0):
         st.draw_limit(above, net.silence, f"an edge is let go: {net.silence:g} s")

@@ -81,7 +81,7 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
         force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
         ax.set_ylabel("share of the rotor limit [%]")
     between = None if between is None else between._replace(other=-1)
-    Panel(ax, result, force, unit, between).draw_below(shown)
+    Panel(ax, result, force, unit, between).draw(shown)
 
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
@@ -140,10 +140,8 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
     limit, unit = q.limit_of(result.mission), display_unit(q.unit)
-    if Panel(ax, result, values, unit, between).draw_from_zero() and limit is not None:
-        top = max(ax.get_ylim()[1], 1.2 * limit)
-        ax.set_ylim(-0.04 * top, top)
-        st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
+    limits = [] if limit is None else [(limit, f"limit {limit:g} {unit}", st.ALERT)]
+    Panel(ax, result, values, unit, between).draw(limits)
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:

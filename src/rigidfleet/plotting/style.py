@@ -399,11 +399,11 @@ def is_still(values: Floats) -> bool:
     return not len(known) or float(np.ptp(known)) <= STILL
 
 
-def halo() -> list[Any]:
-    """A white outline of text that stands on lines."""
+def halo(colour: str = "white") -> list[Any]:
+    """An outline, in the colour of the background, of text that stands on lines."""
     from matplotlib.patheffects import withStroke
 
-    return [withStroke(linewidth=2.5, foreground="white")]
+    return [withStroke(linewidth=2.5, foreground=colour)]
 
 
 def write_note(ax: Axes, words: str) -> None:
