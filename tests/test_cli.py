@@ -507,7 +507,8 @@ def test_design_keeps_files(capsys):
     ("arguments", "message"),
     [
         (["cube", "--range", "3"], "5.65685 m is enough"),
-        (["cube", "--extra", "some"], "'some' is not a number"),
+        (["cube", "--extra", "some"], "cube: --extra: 'some' is not a number"),
+        (["cub"], "cub: is neither a shape nor a file: did you mean 'cube'?\n"),
         (["cube", "--extra", "-1"], "extra must be >= 0"),
         (["cube", "--extra", "inf"], "'inf' is not a whole number"),
         (["cube", "--extra", "1.5"], "'1.5' is not a whole number"),

@@ -179,12 +179,12 @@ def assess(
     console.show_verdict(verdict, json=json)
     if made is not None:
         from rigidfleet.cli.report import write_report
-        from rigidfleet.cli.run import of_formats, write_figures, write_replay
+        from rigidfleet.cli.run import DRAWN, write_figures, write_replay
 
         made.save(result, verdict)
         write_report([result], [verdict], made.report, quiet=json)
         write_replay(result, made.replay)
-        write_figures(result, of_formats(made.figures, figures, None), quiet=json)
+        write_figures(result, made.figures(figures, DRAWN), quiet=json)
         if not json:
             made.show()
     return {"passed": PASSED, "failed": FAILED, "undecided": UNDECIDED}[verdict.word]

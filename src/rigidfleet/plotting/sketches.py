@@ -87,10 +87,8 @@ def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     of_edge = [colours[i, j] for i, j in edges]
     drawn = sketch(ax, mission, name, of_edge, words, most=curves.SINGLE)
     if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
-        size = np.linalg.norm(drawn.p, axis=1)
-        reach, taken = float(size.max()), bool(size.min() < 0.1 * size.max())
-        length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)] * reach
-        _draw_axes(ax, drawn.turn.T, length, taken=taken)
+        share = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)]
+        _draw_axes(ax, drawn.turn.T, share * float(np.linalg.norm(drawn.p, axis=1).max()))
 
 
 class Sketch(NamedTuple):
@@ -215,31 +213,22 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Seque
     ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 
 
-def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
+def _draw_axes(ax: Axes, axes: Floats, length: float) -> None:
     """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
 
-    An axis that points to the viewer is drawn as a ring with a dot, beside the centre if an agent has `taken` it.
+    One that points to the viewer is a ring with a dot, beside the centre, where an agent may be.
     """
-    tips = length * axes
-    for tip, label in zip(tips, "xyz", strict=True):
-        if np.hypot(*tip[:2]) < 1e-6 * length:
-            words = f"⊙ {label}" if taken else label
-            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
-            place["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
-            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", zorder=7, **place)
-            if not taken:
-                ring: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": st.INK}
-                ax.plot(0, 0, "o", markersize=9, zorder=7, **ring)
-                ax.plot(0, 0, "o", markersize=2.5, color=st.INK, zorder=8)
+    look: dict[str, Any] = {
+        "ha": "center", "va": "center", "zorder": 7, "fontsize": 9.5, "gid": "body-axis",
+        "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
+    }  # fmt: skip
+    for (x, y, _), label in zip(length * axes, "xyz", strict=True):
+        if np.hypot(x, y) < 1e-6 * length:
+            ax.annotate(f"⊙ {label}", (0, 0), (-16, -14), textcoords="offset points", **look)
             continue
-        ax.annotate(
-            "", tip[:2], (0, 0), zorder=4,
-            arrowprops={"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0},
-        )  # fmt: skip
-        ax.annotate(
-            label, 1.1 * tip[:2], ha="center", va="center", zorder=7, fontsize=9.5, gid="body-axis",
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
-        )  # fmt: skip
+        arrow = {"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", (x, y), (0, 0), zorder=4, arrowprops=arrow)
+        ax.annotate(label, (1.1 * x, 1.1 * y), **look)
 
 
 def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:
