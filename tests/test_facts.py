@@ -18,6 +18,7 @@ from test_sweep import everything
 import rigidfleet as rf
 from rigidfleet import plotting
 from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, value, worst_values
+from rigidfleet._common.text import all_hold
 from rigidfleet.cli import app, console
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import mission_names
@@ -374,6 +375,15 @@ def test_what_applies_to_no_row_is_not_shown():
 def test_numbers_have_three_digits(x, text):
     """Numbers have three digits; whole ones below 100,000 all of theirs; others a power of ten."""
     assert value(x) == text
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(1, "the only check holds"), (2, "both checks hold"), (3, "all 3 checks hold")],
+)
+def test_checks_that_hold_are_counted_in_words(count, words):
+    """One, two and more checks are told as one says them."""
+    assert all_hold(count) == words
 
 
 # -- width ---------------------------------------------------------------------------------------------
