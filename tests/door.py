@@ -396,7 +396,8 @@ def judge(files: dict[str, bytes], target: Sequence[str], options: Sequence[str]
 
 #: Notes that each flight of others has.
 USUAL = (
-    r"^(others made this flight|the least distance centre to centre|agents from 1 on are|the velocities of the table).*"
+    r"^(others made this flight|the least distance centre to centre|agents? (from 1 on are|1 is)|the velocities of the"
+    r" table).*"
     r"|A table may name other units.*"
 )
 #: What doubts a unit or an axis, in notes that an original without units has, too.

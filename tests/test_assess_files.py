@@ -544,3 +544,26 @@ def test_no_table_of_an_earlier_flight_stays_beside_a_result(tmp_path):
     assert main([*options, "--force"]) == PASSED
     assert (out / "flight.nc").exists()
     assert not (out / "flight.csv").exists()
+
+
+@pytest.mark.parametrize("mission", ["narrow-passage", "mine.toml"])
+def test_a_mission_is_no_flight(mission, tmp_path, monkeypatch, capsys):
+    """A mission in place of a result is refused with what flies it; a file that is not there, as that."""
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text(rf.load_mission("two-agents").text)
+    assert main(["assess", mission]) == BAD_INPUT
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {mission}: is a mission")
+    assert f"`rigidfleet run {mission}`" in error
+    assert main(["assess", "yours.toml"]) == BAD_INPUT
+    assert "yours.toml: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [(["a"], "agent 1 is a"), (["a", "b"], "agents from 1 on are a, b")]
+)
+def test_a_note_names_the_vehicles_of_a_file(names, words, tmp_path):
+    """Names of one vehicle and of several stand in a sentence that fits their number."""
+    rows = [[t, 3.0 * k, t, 2.0, name] for k, name in enumerate(names) for t in (0.0, 1.0, 2.0)]
+    verdict, _ = judged(table(tmp_path / "of.csv", rows, f"{HEAD},agent"), separation=0.5)
+    assert words in verdict.notes

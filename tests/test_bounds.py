@@ -224,7 +224,7 @@ def test_a_check_of_many_formations_says_what_it_passed_over():
     topics, words = checked(text)
     assert topics == {"formation"}
     assert "skipped, rigidity not checked" in words
-    assert re.search(r"of 40 random starts", words)
+    assert re.search(r"random starts 40, this shape \d+", words)
 
 
 def test_a_check_of_many_obstacles_tells_of_the_nearest():

@@ -18,6 +18,7 @@ from test_sweep import everything
 import rigidfleet as rf
 from rigidfleet import plotting
 from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, value, worst_values
+from rigidfleet._common.text import all_hold
 from rigidfleet.cli import app, console
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import mission_names
@@ -238,13 +239,49 @@ def test_a_check_shows_what_its_json_holds(name):
         assert all(near(x, y) for x, y in zip(shown[key], values, strict=True)), key
 
 
+#: Kinds of shapes in JSON, in the order of their columns.
+KINDS = ("same", "mirror image", "folded", "coincident")
+
+
+@pytest.mark.parametrize(
+    "name", ["narrow-passage", "cube-passage", "hexagon", "pyramid", "square", "drift"]
+)
+def test_words_on_a_graph_are_those_of_json(name):
+    """Redundant edges and free motions, how many and the first of them, and the solver are those of JSON."""
+    ahead = check(name)
+    data = json.loads(json.dumps(ahead.data()))["formations"]
+    table = next(
+        x for x in ahead.facts().shown if isinstance(x, FactTable) and x.heads[0] == "graph"
+    )
+    names = [column for column, *_ in table.columns]
+    rows = {row[0]: dict(zip(names, row, strict=True)) for row in table.texts}
+    for form, judged in data.items():
+        r, row = judged["rigidity"], rows.get(form, {})
+        edges, flexes = (
+            re.match(r"(\d+) \((.*)\)", row.get(x) or "0 ()")
+            for x in ("redundant edges", "free motions")
+        )
+        assert edges
+        assert flexes
+        assert [int(edges[1]), int(flexes[1])] == [len(r["redundant"]), len(r["flexes"])]
+        shown = re.findall(r"(\d+)-(\d+)", edges[2])
+        assert [[int(i), int(j)] for i, j in shown] == r["redundant"][:6]
+        who = [[int(x) for x in re.findall(r"\d+", part)] for part in flexes[2].split("; ")]
+        agents = [flex["agents"] for flex in r["flexes"]]
+        assert who[:2] == (agents[:2] or [[]])
+        assert bool(row.get("solved by")) == (judged["solve"] != "dense")
+
+
 def numbers_shown(ahead: Any) -> dict[tuple[str, str], list[str]]:
     """Numbers in the tables of a check but for worst values: by table and row, in the order of the columns."""
     shown = {}
     for table in ahead.facts().shown[1:]:
         if isinstance(table, FactTable) and not table.bare and table.heads[0] != "planned":
+            graph = table.heads[0] == "graph"  # of whose words there is a test
             for row, *cells in table.texts:
-                numbers = re.findall(r"(?<![\w.])[-\d.][\d.e+-]*", " ".join(cells))
+                rest = zip(cells, table.columns[1:], strict=True)
+                text = " ".join(cell for cell, (*_, words) in rest if not (graph and words))
+                numbers = re.findall(r"(?<![\w.])[-\d.][\d.e+-]*", text)
                 shown[table.heads[0], row] = numbers
     return shown
 
@@ -257,6 +294,13 @@ def numbers_wanted(data: Any, show: bool) -> dict[tuple[str, str], list[float]]:
         wanted["formation", form] = [r[k] for k in ("edges", "rank", "needed", "index", "w")] + [
             1 / r["index"]
         ]
+        numbers = [] if r["reachable"] == r["needed"] else [r["reachable"]]
+        if (others := judged["realisations"]) is not None:
+            kinds = [[x for x in others["found"] if x["kind"] == kind] for kind in KINDS]
+            counts = [sum(x["found"] for x in shapes) for shapes in kinds]
+            bent = sum(x["found"] for x in others["found"] if x["bends"])
+            numbers += [others["starts"], counts[0], *filter(None, (*counts[1:], bent))]
+        wanted |= {("graph", form): numbers} if numbers else {}
     if not show:
         force = max(gains["force_per_error_n_m"].values()) / 100
         numbers = [gains["margin"], gains["settling_time_s"], 100 * gains["overshoot"], force]
@@ -331,6 +375,15 @@ def test_what_applies_to_no_row_is_not_shown():
 def test_numbers_have_three_digits(x, text):
     """Numbers have three digits; whole ones below 100,000 all of theirs; others a power of ten."""
     assert value(x) == text
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(1, "the only check holds"), (2, "both checks hold"), (3, "all 3 checks hold")],
+)
+def test_checks_that_hold_are_counted_in_words(count, words):
+    """One, two and more checks are told as one says them."""
+    assert all_hold(count) == words
 
 
 # -- width ---------------------------------------------------------------------------------------------

@@ -1233,3 +1233,14 @@ def test_only_flights_with_rotors_have_their_figures(triangle):
     own = {"rotors", "vehicles"}
     assert not own & set(plotting.figure_names(triangle))
     assert own <= set(plotting.figure_names(by_quadrotors(["paper"] * 3)))
+
+
+def test_one_vehicle_beside_people_has_their_distance():
+    """The clearance of a single vehicle without obstacles shows its falls to people, and is no empty figure."""
+    people = [{"polygon": [[40.0, 40.0], [50.0, 40.0], [50.0, 50.0]]}]
+    mission = {"obstacles": [], "limits": {}, "people": people}
+    alone = a_flight(n=1, formation=None, mission=mission, velocity=np.zeros((181, 1, 3)))
+    assert "clearance" in plotting.figure_names(alone)
+    (ax,) = plotting.clearance(alone).axes
+    assert ax.get_ylabel() == "falls, to people [m]"
+    assert not any(text.get_text() == "no people" for text in ax.texts)

@@ -20,8 +20,9 @@ def first_few(things: Sequence[object], most: int = 5, between: str = ", ") -> s
 
 
 def all_hold(count: int) -> str:
-    """That all checks hold: "all 4 checks hold", "the only check holds"."""
-    return "the only check holds" if count == 1 else f"all {count} checks hold"
+    """That all checks hold: "all 4 checks hold", "both checks hold", "the only check holds"."""
+    few = {1: "the only check holds", 2: "both checks hold"}
+    return few.get(count, f"all {count} checks hold")
 
 
 def percent(share: float) -> str:

@@ -95,7 +95,8 @@ def _foreign_flight_notes(measured: Measurements) -> Iterator[str]:
     yield from result.statistics.get("notes", [])
     names = result.statistics.get("names", [])
     if [name.removeprefix("agent ") for name in names] != [f"{k + 1}" for k in range(len(names))]:
-        yield f"agents from 1 on are {first_few(names, _NAMED)}"
+        who = "agent 1 is" if len(names) == 1 else "agents from 1 on are"
+        yield f"{who} {first_few(names, _NAMED)}"
 
 
 def _abandonment_notes(measured: Measurements) -> Iterator[str]:

@@ -26,8 +26,8 @@ def check_workers(workers: int | None) -> None:
         raise RigidfleetError(f"--workers = {workers}: must be at least 1.")
 
 
-def parse_number(text: str) -> float:
-    """Convert text to a number.
+def parse_number(text: str, what: str = "") -> float:
+    """Convert text to a number; messages begin with ``what``.
 
     Raises
     ------
@@ -37,11 +37,11 @@ def parse_number(text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"'{text}' is not a number.") from None
+        raise ValueError(f"{what}'{text}' is not a number.") from None
 
 
-def parse_whole(text: str) -> int:
-    """Convert text to a whole number, without rounding.
+def parse_whole(text: str, what: str = "") -> int:
+    """Convert text to a whole number, without rounding; messages begin with ``what``.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def parse_whole(text: str) -> int:
     try:
         return int(text)  # keeps every digit of a large number
     except ValueError:
-        number = parse_number(text)
+        number = parse_number(text, what)
     if not (math.isfinite(number) and number == round(number)):
-        raise ValueError(f"'{text}' is not a whole number.")
+        raise ValueError(f"{what}'{text}' is not a whole number.")
     return int(number)

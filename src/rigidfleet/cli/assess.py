@@ -112,6 +112,7 @@ def assess(
         Print the verdict as JSON.
     """
     from rigidfleet.assessment import assess as judge
+    from rigidfleet.mission import as_mission
 
     if not files:
         raise RigidfleetError("no file was given; give a result or trajectories to judge")
@@ -121,8 +122,15 @@ def assess(
         "units": units, "axes": axes, "topic": topic, "origin": origin, "noise": noise, "clock": clock,
     }  # fmt: skip
     chosen = [key for key, value in options.items() if value is not None]
-    plan = len(files) > 1 and _is_plan(files[0])
-    if len(files) == 1 and files[0].suffix == ".nc":
+    plan = _is_plan(files[0])
+    alone = plan and len(files) == 1
+    if alone and files[0].suffix != ".nc":
+        as_mission(str(files[0]))  # what is wrong with it comes first
+        raise RigidfleetError(
+            f"{files[0]}: is a mission, and no flight. Fly and judge it by `rigidfleet run {files[0]}`, or give logs of"
+            " its flight behind it"
+        )
+    if alone:
         from rigidfleet.result import Result
 
         if chosen:
@@ -132,7 +140,6 @@ def assess(
         verdict = judge(result)
     else:
         from rigidfleet.foreign.files import read_trajectories
-        from rigidfleet.mission import as_mission
 
         own = [key for key in _OWN if key in chosen]
         if (mission is not None or plan) and own:
@@ -172,12 +179,12 @@ def assess(
     console.show_verdict(verdict, json=json)
     if made is not None:
         from rigidfleet.cli.report import write_report
-        from rigidfleet.cli.run import of_formats, write_figures, write_replay
+        from rigidfleet.cli.run import DRAWN, write_figures, write_replay
 
         made.save(result, verdict)
         write_report([result], [verdict], made.report, quiet=json)
         write_replay(result, made.replay)
-        write_figures(result, of_formats(made.figures, figures, None), quiet=json)
+        write_figures(result, made.figures(figures, DRAWN), quiet=json)
         if not json:
             made.show()
     return {"passed": PASSED, "failed": FAILED, "undecided": UNDECIDED}[verdict.word]

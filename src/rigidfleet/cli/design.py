@@ -87,7 +87,7 @@ def design(
         kinds: dict[str, Any] = {}
         _refuse_options_that_clash(edges, reach, extra, sensing_range)
         if edges is None:
-            more = extra if extra == "complete" else parse_whole(extra)
+            more = extra if extra == "complete" else parse_whole(extra, "--extra: ")
             kinds = {"designed": designs.design(slots, extra=more, sensing_range=sensing_range)}
             if shape == "cube":
                 kinds["the paper's 18"] = CUBE_EDGES
@@ -102,7 +102,8 @@ def design(
             text += f"colour = {dumps(colours)}\n"
         judged = {what: compare_graph(slots, graph) for what, graph in kinds.items()}
     except ValueError as error:
-        raise RigidfleetError(f"{shape}: {str(error).rstrip('.')}.") from None
+        words = str(error).rstrip(".")
+        raise RigidfleetError(f"{shape}: {words}{'' if words.endswith('?') else '.'}") from None
     limits = designs.limits(slots)
     for note in notes:
         console.err().print(f"Note: {shape}: {note}.")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from rigidfleet._common.files import make_folder, unwritable, write_file
 from rigidfleet.cli import console
@@ -14,6 +15,10 @@ from rigidfleet.errors import ResultError
 if TYPE_CHECKING:
     from rigidfleet.assessment import Verdict
     from rigidfleet.result import Result
+
+
+#: Figures that are drawn unless all are wanted.
+FEW = ("summary", "trajectory")
 
 
 class Files:
@@ -31,21 +36,20 @@ class Files:
         self.verdict = folder / "verdict.json"
         self.report, self.replay = folder / "report.html", folder / "replay.html"
 
-    @property
-    def figures(self) -> list[Path]:
-        """All possible figures."""
+    def figures(
+        self, which: Literal["few", "all"] = "all", formats: Iterable[str] | None = None
+    ) -> list[Path]:
+        """All possible figures, or the few that are looked at after a flight; by default in all formats."""
         from rigidfleet.plotting import FORMATS, figure_names
 
-        return [
-            self.folder / "figures" / f"{name}.{kind}"
-            for name in figure_names()
-            for kind in FORMATS
-        ]
+        names = figure_names() if which == "all" else FEW
+        kinds = FORMATS if formats is None else formats
+        return [self.folder / "figures" / f"{name}.{kind}" for name in names for kind in kinds]
 
     @property
     def beside_result(self) -> list[Path]:
         """All files that are derived from the result."""
-        return [self.verdict, self.table, self.report, self.replay, *self.figures]
+        return [self.verdict, self.table, self.report, self.replay, *self.figures()]
 
     def claim(self, *, replace: bool) -> None:
         """Check before a flight that its files can be written.
@@ -128,7 +132,7 @@ class Files:
             if path.exists():
                 how = " (open it in a browser)" if path.suffix == ".html" else ""
                 console.out().print(f"{what:8} {path}{how}", soft_wrap=True)
-        if drawn := [path for path in self.figures if path.exists()]:
+        if drawn := [path for path in self.figures() if path.exists()]:
             text = f"Figures  {drawn[0].parent}{os.sep} ({console.count(len(drawn), 'file')})"
             console.out().print(text, soft_wrap=True)
 

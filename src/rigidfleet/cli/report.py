@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import FAILED, PASSED
 from rigidfleet.cli.outputs import Files, keep_existing
-from rigidfleet.cli.run import Format, check_width, of_formats, write_figures, write_replay
+from rigidfleet.cli.run import DRAWN, Format, check_width, write_figures, write_replay
 from rigidfleet.errors import ResultError, RigidfleetError
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def report(
             console.out().print(f"\nReport   {page}", soft_wrap=True)
     else:
         console.show_verdict(verdicts[0], quiet=json or quiet)
-        drawn = [] if no_figures else of_formats(files.figures, figures, format)
+        drawn = [] if no_figures else files.figures(figures, format or DRAWN)
         made = [files.verdict, files.report, *drawn]
         kept = [] if force else [path for path in made if path.exists()]
         if files.verdict not in kept:

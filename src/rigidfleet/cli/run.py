@@ -23,8 +23,6 @@ from rigidfleet.cli.codes import FAILED, INTERRUPTED, PASSED
 Format = Literal["png", "svg", "pdf"]
 #: Default formats of figures.
 DRAWN: tuple[Format, ...] = ("png",)
-#: Figures that are drawn unless all are wanted: those that are looked at after a flight.
-FEW = ("summary", "trajectory")
 
 
 def run(
@@ -112,7 +110,7 @@ def run(
             if replay:
                 write_replay(result, files.replay)
             if not no_figures:
-                paths = of_formats(files.figures, figures, format)
+                paths = files.figures(figures, format or DRAWN)
                 write_figures(result, paths, quiet=quiet, titles=not no_titles, width=width)
         except KeyboardInterrupt:
             interrupted = True
@@ -215,14 +213,6 @@ def check_width(width: float | None) -> None:
 
     if width is not None and not WIDTHS[0] <= width <= WIDTHS[1]:
         raise RigidfleetError("--width must be {:g} to {:g} [mm], not {:g}.".format(*WIDTHS, width))
-
-
-def of_formats(
-    paths: Iterable[Path], which: Literal["few", "all"], formats: Iterable[Format] | None
-) -> list[Path]:
-    """Paths of figures, `FEW` or all, that have one of the formats, by default `DRAWN`."""
-    kinds = {f".{kind}" for kind in formats or DRAWN}
-    return [p for p in paths if p.suffix in kinds and (which == "all" or p.stem in FEW)]
 
 
 def write_figures(result: Result, paths: Iterable[Path], *, quiet: bool, **look: Any) -> None:

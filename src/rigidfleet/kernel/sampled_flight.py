@@ -302,7 +302,7 @@ def is_foreseen(j, k, p, w, flight, mail):
 
 
 @jit
-def release_silent_edges(k, p, w, flight, state):
+def decide_broadcasts(k, p, w, flight, state):
     """Decide which vehicles do not broadcast what they have posted at tick k; keep what the others send."""
     mail = state.mail
     for j in range(state.S.shape[0]):
@@ -381,7 +381,7 @@ def tick(k, t, p, w, flight, state, call):
     if flight.network.every > 0:
         post(k, p, w, flight, state)
         if k % flight.network.every == 0:
-            release_silent_edges(k, p, w, flight, state)
+            decide_broadcasts(k, p, w, flight, state)
             send(k, state.S, flight.network, state.mail)
     return True
 

@@ -26,14 +26,13 @@ from rigidfleet.plotting.curves import (
     distances,
     disturbance,
     inputs,
-    limited_motions,
     motion,
 )
 from rigidfleet.plotting.logged import plan_and_flight
 from rigidfleet.plotting.messages import messages
-from rigidfleet.plotting.operation import leaves_ground, operation
+from rigidfleet.plotting.operation import operation
 from rigidfleet.plotting.page import summary
-from rigidfleet.plotting.quadrotors import has_rotors, rotors, vehicles
+from rigidfleet.plotting.quadrotors import rotors, vehicles
 from rigidfleet.plotting.sketches import formations
 from rigidfleet.plotting.space import trajectory
 from rigidfleet.plotting.style import agent_colours, figure_options, settings
@@ -96,25 +95,7 @@ def figure_names(result: Result | None = None) -> list[str]:
     """
     if result is None:
         return list(_FIGURES)
-    empty = {
-        "distances": not len(result.edges),
-        "attitude": not np.isfinite([result.attitude, result.attitude_reference]).any(),
-        "constraint_force": not len(result.edges),
-        "inputs": not np.isfinite(result.thrust).any(),
-        "formations": not result.mission.formations,
-        "clearance": result.n_agents == 1 and not result.mission.obstacles,
-        "disturbance": result.disturbance_force is None,
-        "rotors": not has_rotors(result),
-        "vehicles": not has_rotors(result),
-        "operation": not leaves_ground(result),
-        "messages": result.message_age is None or not result.message_age.size,
-        "motion": not limited_motions(result),
-        "plan_and_flight": "bands" not in result.statistics,
-    }
-    # Of trajectories that others made, most panels of the summary would be empty.
-    empty["summary"] = empty["distances"] and empty["inputs"] and empty["attitude"]
-    empty["constraint_error"] = empty["distances"] and empty["formations"]
-    return [name for name in _FIGURES if not empty.get(name)]
+    return [name for name, draw in _FIGURES.items() if vars(draw).get("there", bool)(result)]
 
 
 def caption(name: str) -> str:

@@ -119,9 +119,6 @@ def _reference_handle(*values: Floats) -> list[Line2D]:
 def draw_distances(ax: Axes, result: Result) -> None:
     """Lengths of the edges, and their references."""
     ax.set_ylabel("distance [m]")
-    if not len(result.edges):
-        st.write_note(ax, "no edges")
-        return
     draw_edge_lines(ax, result, result.distance, linewidth=1.9)
     wanted = result.distance_reference
     if len(result.edges) > st.MANY:
@@ -136,15 +133,20 @@ def _distinct_columns(values: Floats) -> list[int]:
     return sorted(np.unique(keys, axis=1, return_index=True)[1].tolist())
 
 
+def has_edges(result: Result) -> bool:
+    """Whether there are edges in any formation."""
+    return len(result.edges) > 0
+
+
 @st.in_style
+@st.needs(has_edges, "no edges")
 def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
     ax = axes[0, 0]
     draw_distances(ax, result)
-    if len(result.edges):
-        handles = [*edge_handles(result), *_reference_handle(result.distance_reference)]
-        st.draw_legend(ax, handles, "edge" if len(result.edges) <= SINGLE else "")
+    handles = [*edge_handles(result), *_reference_handle(result.distance_reference)]
+    st.draw_legend(ax, handles, "edge" if len(result.edges) <= SINGLE else "")
     return fig
 
 
@@ -242,37 +244,42 @@ def flown_and_wanted_euler(result: Result) -> tuple[Floats, Floats, list[tuple[f
     return flown, wanted, targets
 
 
+def has_attitude(result: Result) -> bool:
+    """Whether a body frame is attached to the formation, or commanded."""
+    return bool(np.isfinite([result.attitude, result.attitude_reference]).any())
+
+
 @st.in_style
+@st.needs(has_attitude, "no body frame attached")
 def attitude(result: Result) -> Figure:
     """Attitude of the formation: flown, reference (dashed) and waypoints (rings)."""
-    title = "Attitude of the formation"
     flown, wanted, targets = flown_and_wanted_euler(result)
-    if not np.isfinite([flown, wanted]).any():
-        fig, axes = st.time_figure(result, title, 1)
-        st.write_note(axes[0, 0], "no body frame attached")
-        return fig
     turning = [(t, np.degrees(rates)) for t, rates in _waypoint_values(result, "rates")]
     rates = np.degrees(result.rates), np.degrees(result.rates_reference), turning, "p q r", "deg/s"
-    return _body_figure(result, title, (flown, wanted, targets, "roll pitch yaw", "deg"), rates)
+    angles = flown, wanted, targets, "roll pitch yaw", "deg"
+    return _body_figure(result, "Attitude of the formation", angles, rates)
 
 
 # -- forces ------------------------------------------------------------------------------------------
 
 
+def has_thrust(result: Result) -> bool:
+    """Whether the thrust is known."""
+    return bool(np.isfinite(result.thrust).any())
+
+
 def draw_thrust(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
-    if not np.isfinite(result.thrust).any() and np.isfinite(result.slot_position).any():
+    if not has_thrust(result):
         quadrotors.draw_off_slot(ax, result)
         return
     ax.set_ylabel("thrust [N]")
-    if not np.isfinite(result.thrust).any():
-        st.write_note(ax, "forces are not known")
-        return
     panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
-    panel.draw_below(distinct_limits(result.mission.fleet.thrust_limit), always=False)
+    panel.draw(distinct_limits(result.mission.fleet.thrust_limit), always=False)
 
 
 @st.in_style
+@st.needs(has_thrust, "forces are not known")
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
@@ -290,6 +297,7 @@ def inputs(result: Result) -> Figure:
 
 
 @st.in_style
+@st.needs(has_edges, "no edges")
 def constraint_force(result: Result) -> Figure:
     """Constraint force on each vehicle, and tension of each edge (negative: the edge pushes)."""
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
@@ -298,14 +306,12 @@ def constraint_force(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Constraint force", 2, shares=shares)
     above, below = axes[:, 0]
     above.set_ylabel("constraint force [N]")
-    if Panel(above, result, force, "N", result.extreme("constraint_force")).draw_from_zero():
+    if Panel(above, result, force, "N", result.extreme("constraint_force")).draw():
         st.draw_agents_legend(above, result.n_agents)
     below.set_ylabel("tension [N]")
     name = lambda k: f"edge {result.edge_labels[k]}"  # noqa: E731
     edges = Panel(below, result, tension, "N", result.extreme("tension"), name)
-    if not len(result.edges):
-        st.write_note(below, "no edges")
-    elif not edges.note_if_rounding():
+    if not edges.note_if_rounding():
         draw_edge_lines(below, result, tension)
         below.axhline(0.0, color=st.FAINT, linewidth=0.6, zorder=1)
         edges.leave_out_final_peak()
@@ -315,17 +321,16 @@ def constraint_force(result: Result) -> Figure:
 
 
 @st.in_style
+@st.needs(lambda result: result.disturbance_force is not None, "still air")
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
     above, below = axes[:, 0]
     above.set_ylabel("aerodynamic force [N]")
-    if result.disturbance_force is None:
-        st.write_note(above, "still air")
-    else:
-        force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
-        if Panel(above, result, force, "N").draw_from_zero():
-            st.draw_agents_legend(above, result.n_agents)
+    assert result.disturbance_force is not None
+    force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
+    if Panel(above, result, force, "N").draw():
+        st.draw_agents_legend(above, result.n_agents)
     quadrotors.draw_off_slot(below, result)
     return fig
 
@@ -390,6 +395,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
 
 
 @st.in_style
+@st.needs(lambda result: has_edges(result) or result.mission.formations)
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     title = "Constraint error, and shape error of all pairs against the slots"
@@ -461,17 +467,23 @@ def _draw_planned(ax: Axes, result: Result) -> None:
         st.annotate(ax, words, st.places_around(p.t_start, least), color=st.ALERT)
 
 
+def _distances_shown(result: Result) -> list[str]:
+    """Which least distances there are."""
+    mission, several = result.mission, result.n_agents > 1
+    there = {
+        "separation": several,
+        "separation_below": several and mission.limits.separation_below is not None,
+        "clearance": mission.obstacles,
+        "people": mission.people,
+    }
+    return [name for name in there if there[name]]
+
+
 @st.in_style
+@st.needs(_distances_shown, "only one agent, and nothing near it")
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
-    mission, several = result.mission, result.n_agents > 1
-    wanted = {
-        "separation": several or not mission.obstacles,
-        "separation_below": several and mission.limits.separation_below is not None,
-        "clearance": bool(mission.obstacles),
-        "people": bool(mission.people),
-    }
-    names = [name for name, there in wanted.items() if there]
+    names = _distances_shown(result)
     height = 3.2 if len(names) == 1 else 1.8
     fig, axes = st.time_figure(result, "Clearance between surfaces", len(names), height=height)
     for name, ax in zip(names, axes[:, 0], strict=True):
@@ -488,6 +500,7 @@ def limited_motions(result: Result) -> list[Quantity]:
 
 
 @st.in_style
+@st.needs(limited_motions)
 def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]

@@ -31,9 +31,9 @@ def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     names = list(mission.formations)
     with st.settings():
-        fig, rects = sketches.tiled_figure(len(names), 3.5, 0.2, (0.05, 0.1))
-        for rect, name in zip(rects, names, strict=True):
-            _draw_formation(fig, rect, mission, name, judged.get(name))
+        fig, axes = sketches.tiled_figure(len(names), 0.0, 0.1)
+        for ax, name in zip(axes, names, strict=True):
+            _draw_formation(ax, mission, name, judged.get(name))
     return fig
 
 
@@ -58,9 +58,7 @@ def draw_graphs(mission: Mission, judged: Mapping[str, Rigidity | None], path: P
     write_file(path, drawn, parents=True)
 
 
-def _draw_formation(
-    fig: Figure, rect: sketches.Rect, mission: Mission, name: str, rigidity: Rigidity | None
-) -> None:
+def _draw_formation(ax: Axes, mission: Mission, name: str, rigidity: Rigidity | None) -> None:
     redundant = set() if rigidity is None else set(rigidity.redundant.tolist())
     dashed = [k in redundant for k in range(len(mission.formation_edges(name)))]
     colours = [st.FLOWN if dash else st.GREY for dash in dashed]
@@ -70,9 +68,9 @@ def _draw_formation(
         words += f", {len(redundant)} redundant" if redundant else ""
     sideways = rigidity is not None and any(f.motion[:, 2].any() for f in rigidity.flexes)
     look: dict[str, Any] = {"most": _FEW, "dashed": dashed, "sideways": sideways}
-    drawn = sketches.sketch(fig, rect, mission, name, colours, words, **look)
+    drawn = sketches.sketch(ax, mission, name, colours, words, **look)
     if rigidity is not None:
-        _draw_free_motions(drawn.ax, drawn.p, drawn.turn, rigidity)
+        _draw_free_motions(ax, drawn.p, drawn.turn, rigidity)
 
 
 def _draw_free_motions(ax: Axes, p: Any, R: Any, rigidity: Rigidity) -> None:

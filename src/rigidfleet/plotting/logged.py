@@ -97,15 +97,14 @@ def log_names(result: Result) -> list[str]:
 
 
 @st.in_style
+@st.needs(lambda result: "bands" in result.statistics, "no log against a plan")
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
     fig = st.blank_figure(st.WIDTH, 3.9, "constrained")
     above, below = fig.subplots(1, 2, width_ratios=(0.8, 1.2))
     st.draw_head(fig, result, "The flight against its plan")
-    if (off := off_plan(result)) is None:
-        for ax in (above, below):
-            st.write_note(ax, "no log against a plan")
-        return fig
+    off = off_plan(result)
+    assert off is not None  # there are bands
     n, time, slots = result.n_agents, result.time, result.slot_position
     st.draw_time_axis(below, result)
     colours, names = st.agent_colours(n), log_names(result)

@@ -19,6 +19,7 @@ _DIVERGES = 1e4
 
 
 @st.in_style
+@st.needs(lambda result: np.size(result.message_age or ()), "no network: one law knows all states")
 def messages(result: Result) -> Figure:
     """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""
     fig, axes = st.time_figure(result, "Messages of neighbours", 2)
@@ -26,12 +27,9 @@ def messages(result: Result) -> Figure:
     above.set_ylabel("oldest message [s]")
     below.set_ylabel("sum of all\nconstraint forces [N]")
     net = result.mission.network
-    if result.message_age is None or net is None:
-        for ax in (above, below):
-            st.write_note(ax, "no network: one law knows all states")
-        return fig
+    assert net is not None
     age = oldest_messages(result)
-    Panel(above, result, age, "s").draw_from_zero()
+    Panel(above, result, age, "s").draw()
     st.draw_agents_legend(above, result.n_agents)
     if net.silence < 2.0 * np.nanmax(age, initial=0.0):
         st.draw_limit(above, net.silence, f"an edge is let go: {net.silence:g} s")

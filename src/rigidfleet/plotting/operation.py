@@ -23,6 +23,7 @@ def leaves_ground(result: Result) -> bool:
 
 
 @st.in_style
+@st.needs(leaves_ground)
 def operation(result: Result, agents: Sequence[int] = ()) -> Figure:
     """Altitude and speeds of all vehicles, their least separation, and their clearance to obstacles.
 

@@ -44,7 +44,9 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     curves.show_variation(ax, np.concatenate([flown, wanted]), "deg")
 
 
+# Of trajectories that others made, most panels would be empty.
 @st.in_style
+@st.needs(lambda x: curves.has_edges(x) or curves.has_thrust(x) or curves.has_attitude(x))
 def summary(result: Result) -> Figure:
     """Summary of the flight on one page.
 
@@ -61,7 +63,7 @@ def summary(result: Result) -> Figure:
     for ax in over_time:
         st.draw_time_axis(ax, result)
         ax.set_xlabel("time [s]")
-    if len(result.edges):
+    if curves.has_edges(result):
         curves.draw_distances(lengths, result)
     elif result.mission.obstacles and result.n_agents > 1:
         curves.draw_least(lengths, result, "separation")

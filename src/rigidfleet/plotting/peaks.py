@@ -115,23 +115,19 @@ class Panel:
             low = max(float(np.nanmin(self.values)), -top)
             self.ax.set_ylim(low - 0.05 * (top - low), top)
 
-    def draw_from_zero(self) -> bool:
-        """Draw each agent's values from zero, and write the greatest; return whether there was anything to draw."""
+    def draw(self, limits: Sequence[Limit] = (), *, always: bool = True) -> bool:
+        """Draw each agent's values from zero, with their limits; return whether there was anything to draw.
+
+        The greatest is written; see `mark_extremes`.
+        """
         if self.note_if_rounding():
             return False
-        st.draw_agent_lines(self.ax, self.result, self.values)
-        top = peak_before_breakdown(self.result, self.values)
-        if top > 0.0:
-            self.ax.set_ylim(-0.04 * top, 1.12 * top)
-        self.mark_extremes()
-        return True
-
-    def draw_below(self, limits: Sequence[Limit], *, always: bool = True) -> None:
-        """Draw each agent's values from zero to their limits; see `mark_extremes`."""
         st.draw_agent_lines(self.ax, self.result, self.values)
         for limit in limits:
             st.draw_limit(self.ax, *limit)
         peak = peak_before_breakdown(self.result, self.values)
-        top = max([*(value for value, *_ in limits), peak])
-        self.ax.set_ylim(0, 1.12 * top if top > 0 else 1.0)
+        top = max([peak, *(value for value, *_ in limits)])
+        if top > 0.0:
+            self.ax.set_ylim(-0.04 * top, 1.12 * top)
         self.mark_extremes(always=always)
+        return True

@@ -58,17 +58,14 @@ def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
 
 
 @st.in_style
+@st.needs(has_rotors, "no rotors")
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
     above, below = axes[:, 0]
-    if not has_rotors(result):
-        for ax in (above, below):
-            st.write_note(ax, "no rotors")
-    else:
-        _draw_greatest(above, result)
-        st.draw_agents_legend(above, result.n_agents)
-        _draw_nearest(below, result)
+    _draw_greatest(above, result)
+    st.draw_agents_legend(above, result.n_agents)
+    _draw_nearest(below, result)
     return fig
 
 
@@ -84,7 +81,7 @@ def _draw_greatest(ax: Axes, result: Result) -> None:
         force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
         ax.set_ylabel("share of the rotor limit [%]")
     between = None if between is None else between._replace(other=-1)
-    Panel(ax, result, force, unit, between).draw_below(shown)
+    Panel(ax, result, force, unit, between).draw(shown)
 
 
 def _draw_nearest(ax: Axes, result: Result) -> None:
@@ -109,21 +106,19 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
 
 
 @st.in_style
+@st.needs(has_rotors, "no rotors")
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
     saturated = np.zeros(result.left.shape, dtype=np.bool_)
-    if result.saturated is not None and has_rotors(result):
+    if result.saturated is not None:
         saturated = (result.saturated != 0) & result.left
     shares = (1.0, 1.0, 0.6 if saturated.any() else _TEXT_ROW)
     title = "Tilt, tracking error and saturation of the vehicles"
     fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
     above, middle, below = axes[:, 0]
     above.set_ylabel("tilt [deg]")
-    if not has_rotors(result):
-        st.write_note(above, "points do not tilt")
-    else:
-        draw_limited(above, result, "tilt", tilt(result))
-        st.draw_agents_legend(above, result.n_agents)
+    draw_limited(above, result, "tilt", tilt(result))
+    st.draw_agents_legend(above, result.n_agents)
     draw_off_slot(middle, result)
     _draw_saturation(below, result, saturated)
     return fig
@@ -145,10 +140,8 @@ def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = No
     if between is not None:
         between = between._replace(value=q.scale * between.value, other=-1)
     limit, unit = q.limit_of(result.mission), display_unit(q.unit)
-    if Panel(ax, result, values, unit, between).draw_from_zero() and limit is not None:
-        top = max(ax.get_ylim()[1], 1.2 * limit)
-        ax.set_ylim(-0.04 * top, top)
-        st.draw_limit(ax, limit, f"limit {limit:g} {unit}")
+    limits = [] if limit is None else [(limit, f"limit {limit:g} {unit}", st.ALERT)]
+    Panel(ax, result, values, unit, between).draw(limits)
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:

@@ -46,39 +46,29 @@ def sketch_places(mission: Mission, name: str) -> tuple[Floats, bool]:
     return places, False
 
 
-#: Left, bottom, width and height, as shares of a figure.
-Rect = tuple[float, float, float, float]
-
-
-def tiled_figure(
-    n: int, high: float, more: float, beside: tuple[float, float]
-) -> tuple[Figure, list[Rect]]:
-    """A figure with places for n pictures, up to three side by side: ``high`` for each row, and ``more`` [in].
-
-    Above and below the pictures there is room ``beside`` [in].
-    """
-    columns = min(max(n, 1), 3)
-    rows = math.ceil(max(n, 1) / columns)
-    fig = st.blank_figure(max(3.4 * columns, 6.0), more + high * rows)
-    above, below = (room / fig.get_figheight() for room in beside)
-    height = (1 - above - below) / rows
-    places = (divmod(k, columns) for k in range(n))
-    return fig, [
-        (x / columns, 1 - above - (y + 1) * height, 1 / columns, height) for y, x in places
-    ]
+def tiled_figure(n: int, above: float, below: float) -> tuple[Figure, list[Axes]]:
+    """A figure with n pictures, up to three side by side, and room above and below them [in]."""
+    columns = min(n, 3)
+    rows = math.ceil(n / columns)
+    high = 3.35 * rows + above + below
+    fig = st.blank_figure(max(3.4 * columns, 6.0), high)
+    room = {"top": 1 - (above + 0.6) / high, "bottom": (below + 0.1) / high, "hspace": 0.25}
+    axes = fig.subplots(rows, columns, squeeze=False, gridspec_kw=room | {"left": 0, "right": 1})
+    for ax in axes.flat:
+        ax.axis("off")
+    return fig, axes.ravel().tolist()[:n]
 
 
 @st.in_style
+@st.needs(lambda result: result.mission.formations, "the mission has no formation")
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)
-    legend = len(result.edges) > curves.SINGLE and bool(names)
-    fig, rects = tiled_figure(len(names), 3.5, 0.5, (0.45, 0.7 * legend))
+    legend = len(result.edges) > curves.SINGLE
+    fig, axes = tiled_figure(len(names), 0.4, 0.7 * legend)
     st.draw_head(fig, result, "Formations with their body axes")
-    if not names:
-        fig.text(0.5, 0.45, "the mission has no formation", ha="center", color=st.GREY)
-    for rect, name in zip(rects, names, strict=True):
-        _draw_formation(fig, rect, result, name)
+    for ax, name in zip(axes, names, strict=True):
+        _draw_formation(ax, result, name)
     if legend:
         entries = curves.edge_handles(result)
         columns = min(int(fig.get_figwidth() / 2.2), len(entries))
@@ -86,37 +76,34 @@ def formations(result: Result) -> Figure:
     return fig
 
 
-def _draw_formation(fig: Figure, rect: Rect, result: Result, name: str) -> None:
+def _draw_formation(ax: Axes, result: Result, name: str) -> None:
     """Draw a formation with the colours of its edges in all figures, and its body axes."""
     mission, edges = result.mission, result.mission.formation_edges(name).tolist()
     formation, colours = mission.formations[name], {}
     for group in curves.edge_groups(result):
         colours |= {tuple(result.edges[k].tolist()): group.colour for k in group.edges}
     words = formation.shape or ("slots" if formation.slots is not None else "by distances")
-    words += f", {len(edges)} edge{'s' if len(edges) != 1 else ''}"
+    words += f", {len(edges)} edge{'s' if len(edges) != 1 else ''}" * bool(edges)
     of_edge = [colours[i, j] for i, j in edges]
-    drawn = sketch(fig, rect, mission, name, of_edge, words, most=curves.SINGLE)
+    drawn = sketch(ax, mission, name, of_edge, words, most=curves.SINGLE)
     if drawn.placed and mission.n_agents > 1 and not mission.formation_colours(name):
-        size = np.linalg.norm(drawn.p, axis=1)
-        reach, taken = float(size.max()), bool(size.min() < 0.1 * size.max())
-        length = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)] * reach
-        _draw_axes(drawn.ax, drawn.turn.T, length, taken=taken)
+        share = (0.3, 0.3, 0.42, 0.5)[distance_geometry.dimension(drawn.p, 1e-3)]
+        _draw_axes(ax, drawn.turn.T, share * float(np.linalg.norm(drawn.p, axis=1).max()))
 
 
 class Sketch(NamedTuple):
-    """A formation that is drawn: its axes, places (N, 3) [m] about its centre, whether these are its slots; the turn.
+    """A formation that is drawn: places (N, 3) [m] about its centre, whether these are its slots; the turn.
 
     The rows of ``turn`` (3, 3) point to the right, upwards and towards the viewer.
     """
 
-    ax: Axes
     p: Floats
     placed: bool
     turn: Floats
 
 
 def sketch(
-    fig: Figure, rect: Rect, mission: Mission, name: str, colours: list[str], words: str, *,
+    ax: Axes, mission: Mission, name: str, colours: list[str], words: str, *,
     most: int, dashed: Sequence[bool] = (), sideways: bool = False,
 ) -> Sketch:  # fmt: skip
     """Draw a formation's graph under its name and ``words``; lengths of up to ``most`` edges.
@@ -134,15 +121,13 @@ def sketch(
         turn = camera(*np.degrees(seen_from(p)))
     elif sideways or not flat:
         turn = camera(-70.0, 30.0 if flat else 16.0)
-    x, y, w, h = rect
-    title, small = st.clean_name(name), "" if placed else "; their distances fix no positions"
-    look: dict[str, Any] = {"ha": "center", "parse_math": False}
-    fig.text(x + w / 2, y + 0.95 * h, title, **look, fontweight="bold")
-    fig.text(x + w / 2, y + 0.89 * h, words + small, **look, fontsize=7.5, color=st.GREY)
-    ax = fig.add_axes((x + 0.06 * w, y + 0.04 * h, 0.88 * w, 0.8 * h))
+    words += "" if placed else "; their distances fix no positions"
+    ax.set_title(st.clean_name(name), pad=22, fontsize=9, fontweight="bold", parse_math=False)
+    at: dict[str, Any] = {"transform": ax.transAxes, "ha": "center", "parse_math": False}
+    ax.text(0.5, 1.03, words, **at, fontsize=7.5, color=st.GREY)
     shown = lengths if len(edges) <= most else None
     draw_graph(ax, p @ turn.T, edges, colours, shown, dashed=dashed, lights=lit)
-    return Sketch(ax, p, placed, turn)
+    return Sketch(p, placed, turn)
 
 
 def draw_graph(
@@ -228,31 +213,22 @@ def _draw_mesh(ax: Axes, p: Floats, edges: Any, colours: list[str], shown: Seque
     ax.scatter(*p[order, :2].T, s=2000 / len(p) + 1, c=dots[order], linewidths=0, zorder=3)
 
 
-def _draw_axes(ax: Axes, axes: Floats, length: float, *, taken: bool) -> None:
+def _draw_axes(ax: Axes, axes: Floats, length: float) -> None:
     """Draw body axes from the centre of mass; rows of `axes` (3, 3), the last column towards the viewer.
 
-    An axis that points to the viewer is drawn as a ring with a dot, beside the centre if an agent has `taken` it.
+    One that points to the viewer is a ring with a dot, beside the centre, where an agent may be.
     """
-    tips = length * axes
-    for tip, label in zip(tips, "xyz", strict=True):
-        if np.hypot(*tip[:2]) < 1e-6 * length:
-            words = f"⊙ {label}" if taken else label
-            place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top"}
-            place["bbox"] = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
-            ax.annotate(words, (0, 0), (-9, -9), fontsize=9.5, gid="body-axis", zorder=7, **place)
-            if not taken:
-                ring: dict[str, Any] = {"markerfacecolor": "white", "markeredgecolor": st.INK}
-                ax.plot(0, 0, "o", markersize=9, zorder=7, **ring)
-                ax.plot(0, 0, "o", markersize=2.5, color=st.INK, zorder=8)
+    look: dict[str, Any] = {
+        "ha": "center", "va": "center", "zorder": 7, "fontsize": 9.5, "gid": "body-axis",
+        "bbox": {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
+    }  # fmt: skip
+    for (x, y, _), label in zip(length * axes, "xyz", strict=True):
+        if np.hypot(x, y) < 1e-6 * length:
+            ax.annotate(f"⊙ {label}", (0, 0), (-16, -14), textcoords="offset points", **look)
             continue
-        ax.annotate(
-            "", tip[:2], (0, 0), zorder=4,
-            arrowprops={"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0},
-        )  # fmt: skip
-        ax.annotate(
-            label, 1.1 * tip[:2], ha="center", va="center", zorder=7, fontsize=9.5, gid="body-axis",
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
-        )  # fmt: skip
+        arrow = {"arrowstyle": "-|>", "color": st.INK, "linewidth": 1.3, "shrinkA": 0, "shrinkB": 0}
+        ax.annotate("", (x, y), (0, 0), zorder=4, arrowprops=arrow)
+        ax.annotate(label, (1.1 * x, 1.1 * y), **look)
 
 
 def _distances_to_segment(points: Floats, a: Floats, b: Floats) -> Floats:

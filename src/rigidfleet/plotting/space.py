@@ -28,6 +28,7 @@ _ELEVATION = 24.0  # of the camera [deg]
 _LOW, _HIGH, _ASIDE = 12.0, 60.0, 15.0
 _TRAIL = 1500  # points of an agent's path
 _LINES = 2000  # edges that are drawn among paths
+_ONE_PLACE = 0.03  # distance of waypoints that have one name, as a share of the scene's diagonal
 
 
 # -- the content ------------------------------------------------------------------------------
@@ -89,6 +90,21 @@ def _waypoints(result: Result) -> list[tuple[str, Floats]]:
     return [(name, np.array(place)) for place, name in names.items()]
 
 
+def _names_of_places(view: Scene, axes: int) -> list[tuple[str, Floats]]:
+    """Names of the waypoints, of those joined that are at one place as it is seen in 2 or 3 axes."""
+    near, joined = (
+        _ONE_PLACE * np.linalg.norm(view.high - view.low),
+        list[tuple[list[str], Floats]](),
+    )
+    for name, place in view.waypoints:
+        there = (names for names, at in joined if np.linalg.norm((at - place)[:axes]) < near)
+        if (names := next(there, None)) is None:
+            joined.append(([name], place))
+        elif name not in names:
+            names.append(name)
+    return [(", ".join(names), place) for names, place in joined]
+
+
 def _drawn_samples(result: Result, rows: Any) -> list[int]:
     """Samples at which the formation is drawn: start, end, ends of phases, and some in between.
 
@@ -131,7 +147,7 @@ def _edge_segments(result: Result, shots: list[int]) -> Floats:
 def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
     """Draw paths, agents at the drawn samples, start, end and waypoints, in 2 or 3 axes."""
     for _, place in view.waypoints:
-        ax.plot(*place[:axes, None], **_CROSS, zorder=7)
+        ax.plot(*place[:axes, None], **_cross(result), zorder=7)
     n, night, shots = result.n_agents, has_lights(result), result.position[view.shots, :, :axes]
     colours = [st.GREY] * n if night else st.agent_colours(n)
     width, alpha = (0.4, 0.3) if night else (0.4, 0.5) if n > st.MANY else (0.8, 0.9)
@@ -173,9 +189,23 @@ def marker_look(
     }  # fmt: skip
 
 
-_CROSS: dict[str, Any] = {
-    "linestyle": "", "marker": "+", "markersize": 7, "color": st.INK, "markeredgewidth": 1.3,
-}  # fmt: skip
+def _cross(result: Result) -> dict[str, Any]:
+    """Look of a waypoint, which is seen at night, too."""
+    colour = st.GREY if has_lights(result) else st.INK
+    return {
+        "linestyle": "",
+        "marker": "+",
+        "markersize": 7,
+        "color": colour,
+        "markeredgewidth": 1.3,
+    }
+
+
+def _name_look(result: Result) -> dict[str, Any]:
+    """Look of the name of a waypoint."""
+    ink, behind = (st.FAINT, st.NIGHT) if has_lights(result) else (st.INK, "white")
+    look = {"color": ink, "path_effects": st.halo(behind)}
+    return look | {"fontsize": 7.5, "zorder": 8, "parse_math": False}
 
 
 # -- three dimensions --------------------------------------------------------------------------------
@@ -214,12 +244,8 @@ def draw_space(
     if len(edges):
         ax.add_collection3d(Line3DCollection(edges, colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 3)
-    labels = {(name, x, y): z for name, (x, y, z) in view.waypoints}  # once above each other
-    for (name, x, y), z in labels.items():
-        ax.text(
-            x, y, z, f"  {name}", fontsize=7.5, zorder=8, va="bottom", parse_math=False,
-            path_effects=st.halo(),
-        )  # fmt: skip
+    for names, place in _names_of_places(view, 3):
+        ax.text(*place, f"  {names}", va="bottom", **_name_look(result))
     ax.view_init(elevation, azimuth)
     _fit_axes(fig, ax, view, rect)
     _name_axes(fig, ax, view)
@@ -338,19 +364,17 @@ def draw_above(ax: Axes, result: Result, view: Scene) -> None:
     edges = _edge_segments(result, view.shots)[..., :2]
     ax.add_collection(LineCollection(list(edges), colors=st.INK, linewidths=0.6, zorder=4))
     _draw_paths(ax, result, view, 2)
-    over: dict[tuple[float, float], list[str]] = {}
-    for name, (x, y, _) in view.waypoints:
-        over.setdefault((x, y), []).append(name)
-    for (x, y), names in over.items():
-        ax.annotate(
-            ", ".join(names), (x, y), (5, 4), textcoords="offset points", fontsize=7.5, zorder=8,
-            parse_math=False, path_effects=st.halo(),
-        )  # fmt: skip
+    for names, (x, y, _) in _names_of_places(view, 2):
+        side, away = (
+            ("right", -5) if x > view.high[0] - 0.2 * np.ptp(ax.get_xlim()) else ("left", 5)
+        )
+        look = {"textcoords": "offset points", "ha": side, **_name_look(result)}
+        ax.annotate(names, (x, y), (away, 4), **look)
 
 
 def legend_handles(result: Result, view: Scene) -> list[Any]:
     """Legend entries of a trajectory."""
-    waypoints = [st.legend_entry("waypoint", **_CROSS)] if view.waypoints else []
+    waypoints = [st.legend_entry("waypoint", **_cross(result))] if view.waypoints else []
     if has_lights(result):
         return waypoints
     ends = [

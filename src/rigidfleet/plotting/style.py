@@ -104,6 +104,25 @@ def in_style(draw: Draw) -> Draw:
     return draw_in_style
 
 
+def needs(there: Callable[[Result], object], nothing: str = "") -> Callable[[Draw], Draw]:
+    """Mark a figure of what a flight may lack: its picture then says that there is ``nothing``, if that is given."""
+
+    def mark(draw: Draw) -> Draw:
+        @wraps(draw)
+        def draw_if_there(result: Result, *more: Any) -> Figure:
+            if there(result) or not nothing:
+                return draw(result, *more)
+            name = getattr(draw, "__name__", "").replace("_", " ")
+            fig, axes = time_figure(result, name.capitalize(), 1)
+            write_note(axes[0, 0], nothing)
+            return fig
+
+        vars(draw_if_there)["there"] = there
+        return draw_if_there
+
+    return mark
+
+
 @contextmanager
 def figure_options(*, titles: bool = True, width: float | None = None) -> Generator[None]:
     """Draw figures in this context with a title and the mission's name, or without both; of another width [mm]."""
@@ -380,11 +399,11 @@ def is_still(values: Floats) -> bool:
     return not len(known) or float(np.ptp(known)) <= STILL
 
 
-def halo() -> list[Any]:
-    """A white outline of text that stands on lines."""
+def halo(colour: str = "white") -> list[Any]:
+    """An outline, in the colour of the background, of text that stands on lines."""
     from matplotlib.patheffects import withStroke
 
-    return [withStroke(linewidth=2.5, foreground="white")]
+    return [withStroke(linewidth=2.5, foreground=colour)]
 
 
 def write_note(ax: Axes, words: str) -> None:

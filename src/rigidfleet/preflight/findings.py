@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rigidfleet._common.facts import (
+    Cell,
     Fact,
     FactTable,
     Line,
@@ -31,7 +32,6 @@ from rigidfleet.rigidity import (
     Rigidity,
     Spectrum,
 )
-from rigidfleet.rigidity.analysis import WHERE
 
 #: Maximum number of names in one remark.
 _TOLD = 6
@@ -406,7 +406,8 @@ class Preflight(Shown):
         """Formations and laws, what is said of them in words, and the planned paths."""
         tables = [] if self.margins is None else [self.margins.table]
         if self.formations and not self.is_show:
-            tables = [_formation_table(self.formations), self.gains.table, *tables]
+            graphs = _graph_table(self.formations)
+            tables = [_formation_table(self.formations), graphs, self.gains.table, *tables]
         words = "about", "result"
         ways = [
             {"assignment": name, "path length [m]": a.path_length, "least clearance [m]": a.min_clearance}
@@ -463,8 +464,8 @@ class Preflight(Shown):
 
     def _rows(self) -> Iterator[tuple[str, str]]:
         """What is said in words, each with its heading."""
-        in_words = _scene_words if self.is_show else _formation_words
-        yield from ((f.name, words) for f in self.formations if (words := in_words(f)))
+        if self.is_show:
+            yield from ((f.name, words) for f in self.formations if (words := _scene_words(f)))
         lacking = [p.phase for p in self.planned_phases if p.certificate is None]
         if lacking and self.certificates:
             yield "not proved", f"{names_in_words(lacking)} flown without tracked slots"
@@ -589,44 +590,37 @@ def _formation_table(formations: Sequence[FormationCheck]) -> FactTable:
     return table_of(rows, ("rigidity", "held by"))
 
 
-def _formation_words(f: FormationCheck) -> str:
-    """What no column says of a formation."""
-    parts = [] if f.method == "dense" else [f"solved by {solvers.WORDS[f.method]}"]
-    if (r := f.rigidity) is None:
-        return "; ".join(parts)
-    if r.reachable < r.needed:
-        parts.append(f"of its rank, {r.reachable} is reachable on a {WHERE[r.dimension]}")
-    if len(r.redundant):
-        names = ", ".join(f"{i}-{j}" for i, j in (r.edges[r.redundant][:6] + 1).tolist())
-        more = ", ..." if len(r.redundant) > 6 else ""
-        parts.append(f"{len(r.redundant)} edges, any one of which is redundant ({names}{more})")
-    if r.flexes:
-        free = first_few([agent_names(flex.agents) for flex in r.flexes], 3, "; ")
-        parts.append(f"{len(r.flexes)} motions free to first order: {free}")
-    if f.realisations is not None:
-        parts.append(_realisation_words(f.realisations))
-        parts[-1] += f" (in its {WHERE[r.own.space]})" * (r.own.space < 3)
-    return "; ".join(parts)
-
-
-#: A realisation as the goal of a random start.
+#: Columns of the kinds of shapes to which random starts lead.
 _GOALS = {
-    Kind.SAME: "this shape",
-    Kind.MIRRORED: "its mirror image",
-    Kind.FOLDED: "a folded shape",
-    Kind.COINCIDENT: "a shape with coincident agents",
-}
+    Kind.SAME: "this shape", Kind.MIRRORED: "mirror image", Kind.FOLDED: "folded", Kind.COINCIDENT: "coincident",
+}  # fmt: skip
 
 
-def _realisation_words(r: Realisations) -> str:
-    """How many random starts reach which shape: 36 of 40 random starts reach this shape, 4 its mirror image."""
-    if not r.shapes:
-        return f"none of {r.starts} random starts converges"
-    first, *others = [(x.starts, _GOALS[x.kind] + " that bends" * x.bends) for x in r.shapes]
-    verb = "reaches" if first[0] == 1 else "reach"
-    text = f"{first[0]} of {r.starts} random starts {verb} {first[1]}"
-    text += "".join(f", {count} {goal}" for count, goal in others[:3])
-    return text + (f", and there are {len(others) - 3} more shapes" if len(others) > 3 else "")
+def _graph_table(formations: Sequence[FormationCheck]) -> FactTable:
+    """Of each formation: its solve, edges any one of which is redundant, free motions, and where random starts lead."""
+    rows = []
+    for f in formations:
+        row: dict[str, Any] = {"graph": f.name}
+        if f.method != "dense":
+            row["solved by"] = solvers.WORDS[f.method]
+        if (r := f.rigidity) is not None:
+            if r.reachable < r.needed:
+                row["reachable rank"] = r.reachable
+            if len(r.redundant):
+                names = [f"{i}-{j}" for i, j in (r.edges[r.redundant] + 1).tolist()]
+                row["redundant edges"] = Cell(f"{len(names)}", f"({first_few(names, 6)})")
+            if r.flexes:
+                who = [agent_names(flex.agents) for flex in r.flexes]
+                row["free motions"] = Cell(f"{len(who)}", f"({first_few(who, 3, '; ')})")
+        if (others := f.realisations) is not None:
+            row |= {"random starts": others.starts, "this shape": 0}
+            for x in others.shapes:
+                for column in (_GOALS[x.kind], *["bent"] * x.bends):
+                    row[column] = row.get(column, 0) + x.starts
+        rows += [row] if len(row) > 1 else []
+    words = "solved by", "redundant edges", "free motions"
+    heads = ("graph", *words, "reachable rank", "random starts", *_GOALS.values(), "bent")
+    return FactTable(heads, [Row([row.get(name) for name in heads]) for row in rows], words)
 
 
 def _margin_row(where: str, m: Margins) -> dict[str, Any]:

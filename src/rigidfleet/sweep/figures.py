@@ -293,20 +293,19 @@ def correlations(table: Table) -> Figure | None:
     fig = _titled_figure(table, title, st.WIDTH, 2.2 + 0.27 * len(rows))
     ax = fig.subplots()
     image = ax.imshow(values, cmap="PuOr", vmin=-1, vmax=1, aspect="auto")
-    ax.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns])
-    ax.tick_params(axis="x", labelrotation=38, length=0)
-    for label in ax.get_xticklabels():
-        label.set(ha="right", rotation_mode="anchor")
+    names = [c.replace("_", " ") for c in columns]
+    slanting: dict[str, Any] = {"rotation": 38, "ha": "right", "rotation_mode": "anchor"}
+    ax.set_xticks(range(len(columns)), names, **slanting)
     ax.set_yticks(range(len(rows)), rows)
-    ax.tick_params(axis="y", length=0)
+    ax.tick_params(length=0)
     ax.grid(visible=False)
-    for spine in ax.spines.values():
-        spine.set_visible(False)
+    ax.set_frame_on(False)
     for (i, j), value in np.ndenumerate(values):
         if math.isfinite(value):
             colour = "white" if abs(value) > 0.65 else st.INK
-            ax.text(j, i, f"{value:+.2f}", ha="center", va="center", fontsize=7, color=colour)
-    fig.colorbar(image, ax=ax, label="Spearman's rank correlation [-]", pad=0.01)
+            look: dict[str, Any] = {"ha": "center", "va": "center", "color": colour}
+            ax.text(j, i, f"{value:+.2f}", **look, fontsize=min(7.0, 110.0 / len(columns)))
+    fig.colorbar(image, ax=ax, label="Spearman's rank\ncorrelation [-]", pad=0.01)
     return fig
 
 
