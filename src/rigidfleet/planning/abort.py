@@ -26,10 +26,10 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.foreign.curves import curve_to_rows
 from rigidfleet.formation.assignment import assign_slots, downwash_metric, pairs_nearer_than
 from rigidfleet.kernel.problem import septic_polynomial
-from rigidfleet.math import proximity
-from rigidfleet.math.piecewise import Piecewise, common_knots, pad, refine
+from rigidfleet.math import falls, proximity
+from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, refine
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
+from rigidfleet.mission.boundaries import Boundaries, BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.planning.certificate import (
@@ -65,6 +65,9 @@ _KNOTS, _NEAR = 0.2, 0.01
 _LOOKS, _PACE = 33, 0.25
 #: Least and greatest time between samples of vehicles that fly on [s], and the latter over the number of vehicles.
 _SAMPLED = 0.05, 0.25, 5e-4
+#: How far from its fall by the plan a lost vehicle may be [m], and over its acceleration by the wind [s^2], which blows
+#: it on along the ground.
+_ASTRAY, _BLOWN = 0.1, 0.5
 #: How much farther than in the end vehicles are off their ways while drag changes.
 _OVERSHOOT = 1.1
 #: Time before its end within which a plan that lands comes to rest on the ground [s].
@@ -239,7 +242,9 @@ class Aborts:
             self.off = 2.0 * most
         self.apart = widest + self.need + max(allowed, self.off)
         self.below = max(self.apart, widest + (limits.separation_below or 0.0))
-        self.moves = any(x.solid.moves for x in mission.solids)
+        falls_down = mission.gravity >= 1.0
+        self.wrecked = np.flatnonzero(self.lost & falls_down)
+        self.moves = any(x.solid.moves for x in mission.solids) or self.wrecked.size > 0
         start = mission.fleet.position
         below = mission.height_at(*start.T) + ABOVE + self.radius
         self.stands = bool(mission.standing(start).all() and np.isfinite(below).all())
@@ -280,6 +285,22 @@ class Aborts:
         on = np.zeros_like(pieces[-1][:1])
         on[0, ..., :2] = np.moveaxis(Piecewise(time, pieces[-1]).states(time[-1:], 2)[:, 0], 0, -1)
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
+
+    @cached_property
+    def wrecks(self) -> tuple[Piecewise, Floats]:
+        """Falls of the lost vehicles (K, L, 3, P) over mission time, from where they were by the plan; then they lie.
+
+        Beside them, how near others may come to each (L,) [m], beside what these are off.
+        """
+        air, lost_at, ways = Boundaries(self.mission), self.mission.lost_at, []
+        for i in self.wrecked.tolist():
+            states = self.plan.states(lost_at[[i]], 2)
+            (r, v), k = states[:, 0, i], air.k[[i]]
+            height = r[2] - air.ends(*states)[:, i, 2] - self.radius[i]
+            tau = float(falls.fall_time(height, v[2:], k, air.wind[2], air.g)[0])
+            way = falls.way_of(r, v, max(tau, SHORTEST), float(k[0]), air.wind, air.g)
+            ways.append(way.later(float(lost_at[i])))
+        return join(ways), _ASTRAY + _BLOWN * air.k[self.wrecked] * np.linalg.norm(air.wind)
 
     def _way_along(self, clock: Piecewise) -> Piecewise:
         """The ways of all vehicles along the plan by a clock, either way."""
@@ -413,6 +434,8 @@ class Aborts:
             if pads is None or (both >= pads).any() or step.least.separation <= 0.0:
                 who, limit = agent_names(step.least.agents), f"(limit {self.need:g} m)"
                 return f"{who} come within {max(apart, 0.0):.2f} m {on} {limit}"
+        if self.wrecked.size and (problem := self._near_wrecks(way, begin, step.off)):
+            return f"{problem}, {on}"
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
         fastest = float(np.linalg.norm(v, axis=2).max())
         time = np.linspace(0.0, step.duration, 2 + math.ceil(step.duration * fastest / _PACE / 2.0))
@@ -447,6 +470,19 @@ class Aborts:
             if room[k, i] < _PACE:  # less than half the way between two samples
                 thing = things[int(near[k, i])].name
                 return f"'{thing}' stands in the way {step.name} of agent {left[i] + 1}"
+        return ""
+
+    def _near_wrecks(self, way: Piecewise, begin: float, off: float) -> str:
+        """Who comes too near to a lost vehicle on ways from a time on [s], which others are off [m]; "" if none do."""
+        falls, astray = self.wrecks
+        knots = refine(way.time, falls.time - begin)
+        fallen, flown = falls.later(-begin).on(knots, stays=True).pieces, way.on(knots).pieces
+        for k, i in enumerate(self.wrecked.tolist()):
+            both = pad(fallen[:, [k]], 8), pad(flown[:, self.left], 8)
+            near = of_ways(knots, np.concatenate(both, axis=1), self.radius[[i, *self.left]], 1)
+            if near.separation < off + astray[k]:
+                who, apart = self.left[near.agents[1] - 1] + 1, max(near.separation, 0.0)
+                return f"agent {who} comes within {apart:.2f} m of agent {i + 1}, which is lost"
         return ""
 
     # -- ways home from rest ------------------------------------------------------------------------------
@@ -515,6 +551,7 @@ class Aborts:
         p, q = r[left], goal[left]
         if way == "to any place":
             metric, goal = downwash_metric(_UP, self.below / self.apart), goal.copy()
+            q = self._free_places(r, q)
             goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
         if way == "by levels":
             height = _levels(self.apart + off, p, q) * (self.below + off)
@@ -524,8 +561,21 @@ class Aborts:
             stops, r = [("apart", r, one), ("across", one, two)], two
         # No higher than the lowest of them.
         rise = max(0.0, min(FINAL, float((r[left, 2] - goal[left, 2]).min())))
-        above = goal + rise * _UP
+        above = goal.copy()
+        above[left] += rise * _UP
         return [*stops, ("over the places", r, above), ("down", above, goal)]
+
+    def _free_places(self, r: Floats, own: Floats) -> Floats:
+        """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
+        if not self.wrecked.size:
+            return own
+        (falls, astray), every = self.wrecks, self.places(r)
+        apart = (every[:, None] - falls.at(falls.time[-1:])[0])[..., :2]
+        near = (np.linalg.norm(apart, axis=2) < self.apart + astray).any(axis=1)
+        own, spare, taken = own.copy(), every[self.lost & ~near], np.flatnonzero(near[self.left])
+        count = min(len(spare), len(taken))
+        own[taken[:count]] = spare[:count]
+        return own
 
     def places(self, r: Floats) -> Floats:
         """Landing places (N, 3) [m] of the vehicles' centres.
@@ -578,6 +628,7 @@ class Aborts:
         stay = np.ones(self.mission.n_agents, dtype=np.bool_)
         stay[np.array(self.options.agents) - 1] = False
         alone = Aborts(self.mission, self.legs, stay | self.lost)
+        alone.wrecked, alone.moves = self.wrecked, self.moves
         if self.lands:
             alone.start = self.plan.at(np.array([self.end]))[0]
         return alone
