@@ -60,8 +60,11 @@ def landing(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -> Float
 
 
 def way_of(r: Floats, v: Floats, tau: float, k: float, wind: Floats, g: float) -> Piecewise:
-    """The way (_, 3, 4) [m] of a vehicle at r, with v (3,), that falls for a time [s]: cubics, within a millimetre."""
+    """The way (_, 3, 8) [m] of a vehicle at r, with v (3,), that falls for a time [s], within millimetres."""
     time = np.linspace(0.0, tau, _PIECES + 1)
     phi, psi = (x[:, None] for x in weights(np.full(len(time), k), time))
     pull = k * (wind - v) - g * np.array([0.0, 0.0, 1.0])
-    return Piecewise.hermite(time, np.stack([r + v * time[:, None] + psi * pull, v + phi * pull]))
+    a = pull * (1.0 - k * phi)
+    return Piecewise.hermite(
+        time, np.stack([r + v * time[:, None] + psi * pull, v + phi * pull, a, -k * a])
+    )
