@@ -9,6 +9,8 @@ which is the parabola where k is zero, and the same as r0 + v0 tau + psi (k (w -
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from rigidfleet.math.piecewise import Piecewise
@@ -17,7 +19,7 @@ from rigidfleet.typing import Floats
 #: k tau below which psi is a series, whose rest is below 1e-13 of it; steps of Halley's iteration, and the last one,
 #: relative: the error is about its cube.
 _SMALL, _STEPS, _CLOSE = 0.02, 60, 1e-5
-#: Pieces of the way of a fall.
+#: Least number of pieces of the way of a fall.
 _PIECES = 16
 
 
@@ -60,8 +62,8 @@ def landing(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -> Float
 
 
 def way_of(r: Floats, v: Floats, tau: float, k: float, wind: Floats, g: float) -> Piecewise:
-    """The way (_, 3, 8) [m] of a vehicle at r, with v (3,), that falls for a time [s], within millimetres."""
-    time = np.linspace(0.0, tau, _PIECES + 1)
+    """The way (_, 3, 8) [m] of a vehicle at r, with v (3,), that falls for a time [s], within a micrometre."""
+    time = np.linspace(0.0, tau, _PIECES + 1 + math.ceil(k * tau))
     phi, psi = (x[:, None] for x in weights(np.full(len(time), k), time))
     pull = k * (wind - v) - g * np.array([0.0, 0.0, 1.0])
     a = pull * (1.0 - k * phi)
