@@ -72,6 +72,8 @@ _ASTRAY, _BLOWN = 0.1, 0.5
 _OVERSHOOT = 1.1
 #: Time before its end within which a plan that lands comes to rest on the ground [s].
 _TOUCHING = 1.0
+#: Shortest rest of a plan [s].
+_LEAST = 0.01
 #: Steps back along the plan that are tried [s].
 _BACK = 1.0
 #: Decimals of stopped places [m] that count as the same, whose ways home are planned once.
@@ -356,7 +358,7 @@ class Aborts:
             first, self.limits, lambda time: _clock(begins, time, _SLOWING)
         )
         if begins + 0.5 * time >= self.end and self.lands:
-            clock = _clock(begins, max(self.end - begins, SHORTEST), _ON)
+            clock = _clock(begins, max(self.end - begins, _LEAST), _ON)  # beyond it, it is underground
             return self.along("to its end", clock), ""
         problem, step = "", self.along("slow down", _clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
