@@ -153,11 +153,11 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     edges = Region.of_rings(rings).edges
     if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
         return "has two corners in a row at one place", "give each corner once"
-    if any(_width(ring) < _NARROW for ring in rings):
-        return "bounds no area: its corners lie on a line", "give corners around it"
     if some_cross(edges):
         return "has edges that cross", "give the corners in their order; polygons may not overlap"
 
+    if any(_width(ring) < _NARROW for ring in rings):
+        return "bounds no area: its corners lie on a line", "give corners around it"
     areas = [Region.of_rings([ring]) for ring in rings]
     some = [ring[:: max(1, len(ring) // _SOME)] for ring in rings]  # all are on the same side
     inside = np.array([[x.across(r).min() < -_INSIDE for x in areas] for r in some])

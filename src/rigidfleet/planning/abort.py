@@ -358,7 +358,8 @@ class Aborts:
             first, self.limits, lambda time: _clock(begins, time, _SLOWING)
         )
         if begins + 0.5 * time >= self.end and self.lands:
-            clock = _clock(begins, max(self.end - begins, _LEAST), _ON)  # beyond it, it is underground
+            # What goes on beyond the end goes on down.
+            clock = _clock(begins, max(self.end - begins, _LEAST), _ON)
             return self.along("to its end", clock), ""
         problem, step = "", self.along("slow down", _clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
