@@ -273,6 +273,29 @@ def test_files_of_vehicles_lead_home_from_every_second(tmp_path: Path, name: str
     assert (back > 0) == (name == "bridge-inspection")
 
 
+def test_slowing_down_into_a_phase_without_slots_is_proved_too() -> None:
+    """Who slows down while distances alone close up comes no nearer than proved, at samples, and as near."""
+    forms = {name: {"shape": "triangle", "size": x} for name, x in (("wide", 3.0), ("close", 0.6))}
+    phases = [
+        {"kind": "takeoff", "height": 6.0, "duration": 6.0},
+        {"kind": "establish", "formation": "wide", "blend": 4.0, "duration": 5.0},
+        {"kind": "fly", "position": [8.0, 0.0, 6.0], "velocity": [2.0, 0.0, 0.0], "duration": 5.0},
+        {"kind": "reshape", "formation": "close", "blend": 3.0, "control": "open", "duration": 6.0},
+    ]
+    data = {
+        "schema_version": 1, "name": "closing", "smoothness": "jerk", "formations": forms, "phases": phases,
+        "agents": {"position": [[0, 0, 0.2], [3, 0, 0.2], [1.5, 2.5, 0.2]], "mass": 1.0, "radius": 0.2},
+        "obstacles": [{"kind": "ground"}],
+    }  # fmt: skip
+    step = aborts_of(complete_times(Mission.from_dict(data))).at(15.49).steps[0]
+    r = step.way.at(np.linspace(0.0, step.duration, 2000))
+    i, j = np.triu_indices(3, 1)
+    least = np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.4
+    assert least < 2.5
+    assert step.least.separation == pytest.approx(least, abs=1e-3)
+    assert step.least.separation <= least
+
+
 def test_what_follows_if_one_does_not_hear() -> None:
     """The nearest of a vehicle that flies on is that of a search of all vehicles, at fine samples."""
     aborts = aborts_of(show())

@@ -323,15 +323,16 @@ class Aborts:
         """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""
         begin, end = clock.at(clock.time[[0, -1]]).tolist()
         first, last = sorted((begin, end))
-        least = _APART_FOR_EVER
+        make, least = partial(self._way_along, clock), _APART_FOR_EVER
         for leg in self.legs[self.leg_at(first) : self.leg_at(last) + 1]:
             proved = leg.certificate
             if self.lost.any():
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
+            if proved is None and len(self.left) > 1:  # no slots are tracked there
+                proved = self._apart(make(), self.left)
             least = min(least, proved or least)
         # Its polynomials differ from the plan's ways by less than `CLOSE`.
-        make, least = partial(self._way_along, clock), least._replace(time=0.0)
-        return self._step(name, make, least, CLOSE, path=end)
+        return self._step(name, make, least._replace(time=0.0), CLOSE, path=end)
 
     def _step(
         self, name: str, make: Callable[[], Piecewise], least: Certificate, off: float, **how: Any
@@ -479,14 +480,19 @@ class Aborts:
         """Who comes too near to a lost vehicle on ways from a time on [s], which others are off [m]; "" if none do."""
         falls, astray = self.wrecks
         knots = refine(way.time, falls.time - begin)
-        fallen, flown = falls.later(-begin).on(knots, stays=True).pieces, way.on(knots).pieces
-        for k, i in enumerate(self.wrecked.tolist()):
-            both = pad(fallen[:, [k]], 8), pad(flown[:, self.left], 8)
-            near = of_ways(knots, np.concatenate(both, axis=1), self.radius[[i, *self.left]], 1)
-            if near.separation < off + astray[k]:
-                who, apart = self.left[near.agents[1] - 1] + 1, max(near.separation, 0.0)
+        every = Piecewise(knots, pad(way.on(knots).pieces, 8))
+        every.pieces[:, self.wrecked] = falls.later(-begin).on(knots, stays=True).pieces
+        for i, most in zip(self.wrecked, off + astray, strict=True):
+            near = self._apart(every, np.append(i, self.left), 1)
+            if near.separation < most:
+                who, apart = near.agents[1] + 1, max(near.separation, 0.0)
                 return f"agent {who} comes within {apart:.2f} m of agent {i + 1}, which is lost"
         return ""
+
+    def _apart(self, way: Piecewise, who: Ints, first: int | None = None) -> Certificate:
+        """Certificate of the ways of some vehicles (n,), as `of_ways`."""
+        least = of_ways(way.time, way.pieces[:, who], self.radius[who], first)
+        return least._replace(agents=tuple(who[list(least.agents)].tolist()))
 
     # -- ways home from rest ------------------------------------------------------------------------------
 
@@ -649,8 +655,7 @@ class Aborts:
                 continue
             make = partial(self._with_others, begins, waits, alone.steps)
             way = make()
-            proved = of_ways(way.time, way.pieces[:, order], self.radius[order], len(who))
-            proved = proved._replace(agents=tuple(order[list(proved.agents)].tolist()))
+            proved = self._apart(way, order, len(who))
             step = self._step("leave", make, min(proved, plan), 0.0)
             if (apart := proved.separation - step.off) < max(self.need, 1e-6):
                 problem = f"{agent_names(proved.agents)} come within {max(apart, 0.0):.2f} m"
