@@ -9,18 +9,13 @@ which is the parabola where k is zero, and the same as r0 + v0 tau + psi (k (w -
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.typing import Floats
 
 #: k tau below which psi is a series, whose rest is below 1e-13 of it; steps of Halley's iteration, and the last one,
 #: relative: the error is about its cube.
 _SMALL, _STEPS, _CLOSE = 0.02, 60, 1e-5
-#: Least number of pieces of the way of a fall.
-_PIECES = 16
 
 
 def weights(k: Floats, tau: Floats) -> tuple[Floats, Floats]:
@@ -61,12 +56,7 @@ def landing(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -> Float
     return r[..., :2] + v[..., :2] * phi + wind[:2] * (tau[..., None] - phi)
 
 
-def way_of(r: Floats, v: Floats, tau: float, k: float, wind: Floats, g: float) -> Piecewise:
-    """The way (_, 3, 8) [m] of a vehicle at r, with v (3,), that falls for a time [s], within a micrometre."""
-    time = np.linspace(0.0, tau, _PIECES + 1 + math.ceil(k * tau))
-    phi, psi = (x[:, None] for x in weights(np.full(len(time), k), time))
-    pull = k * (wind - v) - g * np.array([0.0, 0.0, 1.0])
-    a = pull * (1.0 - k * phi)
-    return Piecewise.hermite(
-        time, np.stack([r + v * time[:, None] + psi * pull, v + phi * pull, a, -k * a])
-    )
+def places(r: Floats, v: Floats, time: Floats, k: float, wind: Floats, g: float) -> Floats:
+    """Places (K, 3) [m] at times (K,) [s] after a vehicle at r, with v (3,), has failed."""
+    psi = weights(np.full(len(time), k), time)[1][:, None]
+    return r + v * time[:, None] + psi * (k * (wind - v) - g * np.array([0.0, 0.0, 1.0]))

@@ -27,11 +27,11 @@ from rigidfleet.foreign.curves import curve_to_rows
 from rigidfleet.formation.assignment import assign_slots, downwash_metric, pairs_nearer_than
 from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import falls, proximity
-from rigidfleet.math.piecewise import Piecewise, common_knots, join, pad, refine
+from rigidfleet.math.piecewise import Piecewise, common_knots, pad, refine
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.boundaries import Boundaries, BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
-from rigidfleet.mission.obstacles import is_ground
+from rigidfleet.mission.obstacles import Sphere, is_ground
 from rigidfleet.planning.certificate import (
     CLOSE,
     Certificate,
@@ -39,6 +39,7 @@ from rigidfleet.planning.certificate import (
     in_step,
     of_ways,
 )
+from rigidfleet.planning.clearance import greatest_way
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
@@ -68,6 +69,8 @@ _SAMPLED = 0.05, 0.25, 5e-4
 #: How far from its fall by the plan a lost vehicle may be [m], and over its acceleration by the wind [s^2], which blows
 #: it on along the ground.
 _ASTRAY, _BLOWN = 0.1, 0.5
+#: Time between places of a fall, between which it is taken as straight [s]; one at which all lie.
+_FALLING, _EVER = 0.1, 1e6
 #: How much farther than in the end vehicles are off their ways while drag changes.
 _OVERSHOOT = 1.1
 #: Time before its end within which a plan that lands comes to rest on the ground [s].
@@ -289,20 +292,21 @@ class Aborts:
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
 
     @cached_property
-    def wrecks(self) -> tuple[Piecewise, Floats]:
-        """Falls of the lost vehicles (K, L, 3, P) over mission time, from where they were by the plan; then they lie.
-
-        Beside them, how near others may come to each (L,) [m], beside what these are off.
-        """
-        air, lost_at, ways = Boundaries(self.mission), self.mission.lost_at, []
+    def wrecks(self) -> list[Sphere]:
+        """The lost vehicles, which fall from where they were by the plan, and then lie."""
+        air, lost_at, wrecks = Boundaries(self.mission), self.mission.lost_at, []
+        astray = self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
         for i in self.wrecked.tolist():
             states = self.plan.states(lost_at[[i]], 2)
             (r, v), k = states[:, 0, i], air.k[[i]]
             height = r[2] - air.ends(*states)[:, i, 2] - self.radius[i]
             tau = float(falls.fall_time(height, v[2:], k, air.wind[2], air.g)[0])
-            way = falls.way_of(r, v, max(tau, SHORTEST), float(k[0]), air.wind, air.g)
-            ways.append(way.later(float(lost_at[i])))
-        return join(ways), _ASTRAY + _BLOWN * air.k[self.wrecked] * np.linalg.norm(air.wind)
+            time = np.linspace(0.0, max(tau, SHORTEST), 2 + math.ceil(tau / _FALLING))
+            places = falls.places(r, v, np.minimum(time, tau), float(k[0]), air.wind, air.g)
+            moves = {"waypoints": places.tolist(), "times": (lost_at[i] + time).tolist()}
+            size = float(self.radius[i] + astray[i])
+            wrecks.append(Sphere(kind="sphere", name=f"lost agent {i + 1}", radius=size, **moves))
+        return wrecks
 
     def _way_along(self, clock: Piecewise) -> Piecewise:
         """The ways of all vehicles along the plan by a clock, either way."""
@@ -438,11 +442,15 @@ class Aborts:
             if pads is None or (both >= pads).any() or step.least.separation <= 0.0:
                 who, limit = agent_names(step.least.agents), f"(limit {self.need:g} m)"
                 return f"{who} come within {max(apart, 0.0):.2f} m {on} {limit}"
-        if self.wrecked.size and (problem := self._near_wrecks(way, begin, step.off)):
-            return f"{problem}, {on}"
+        things = [*self.mission.solids, *self.wrecks]
+        things = [x for x in things if x.solid.moves or not along]
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
-        fastest = float(np.linalg.norm(v, axis=2).max())
-        time = np.linspace(0.0, step.duration, 2 + math.ceil(step.duration * fastest / _PACE / 2.0))
+        far, when = step.duration * float(np.linalg.norm(v, axis=2).max()), np.array([begin])
+        moved = (
+            greatest_way(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
+        )
+        far += max(moved, default=0.0)
+        time = np.linspace(0.0, step.duration, 2 + math.ceil(far / _PACE / 2.0))
         r = way.at(time)[:, left]
         if limits.geofence is not None and not along:
             low, high = (np.array(x) for x in (limits.geofence.min, limits.geofence.max))
@@ -465,7 +473,6 @@ class Aborts:
             if limit is not None and q.rank(x.value) > q.rank(limit) + 1e-6:
                 words = boundary_in_words(name, f"agent {x.who + 1}", place, x.value, begin + x.time)  # fmt: skip
                 return f"{words}, {on}"
-        things = [x for x in self.mission.solids if x.solid.moves or not along]
         if step.lands:
             things = [x for x in things if not is_ground(x)]
         if things:
@@ -474,19 +481,6 @@ class Aborts:
             if room[k, i] < _PACE:  # less than half the way between two samples
                 thing = things[int(near[k, i])].name
                 return f"'{thing}' stands in the way {step.name} of agent {left[i] + 1}"
-        return ""
-
-    def _near_wrecks(self, way: Piecewise, begin: float, off: float) -> str:
-        """Who comes too near to a lost vehicle on ways from a time on [s], which others are off [m]; "" if none do."""
-        falls, astray = self.wrecks
-        knots = refine(way.time, falls.time - begin)
-        every = Piecewise(knots, pad(way.on(knots).pieces, 8))
-        every.pieces[:, self.wrecked] = falls.later(-begin).on(knots, stays=True).pieces
-        for i, most in zip(self.wrecked, off + astray, strict=True):
-            near = self._apart(every, np.append(i, self.left), 1)
-            if near.separation < most:
-                who, apart = near.agents[1] + 1, max(near.separation, 0.0)
-                return f"agent {who} comes within {apart:.2f} m of agent {i + 1}, which is lost"
         return ""
 
     def _apart(self, way: Piecewise, who: Ints, first: int | None = None) -> Certificate:
@@ -578,9 +572,8 @@ class Aborts:
         """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
         if not self.wrecked.size:
             return own
-        (falls, astray), every = self.wrecks, self.places(r)
-        apart = (every[:, None] - falls.at(falls.time[-1:])[0])[..., :2]
-        near = (np.linalg.norm(apart, axis=2) < self.apart + astray).any(axis=1)
+        every = self.places(r)
+        near = proximity.obstacle_clearances(every, self.radius, self.wrecks, _EVER)[0] < _PACE
         own, spare, taken = own.copy(), every[self.lost & ~near], np.flatnonzero(near[self.left])
         count = min(len(spare), len(taken))
         own[taken[:count]] = spare[:count]
