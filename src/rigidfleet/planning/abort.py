@@ -291,11 +291,17 @@ class Aborts:
         on[0, ..., :2] = np.moveaxis(Piecewise(time, pieces[-1]).states(time[-1:], 2)[:, 0], 0, -1)
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
 
+    @property
+    def astray(self) -> Floats:
+        """How far from its fall by the plan each vehicle (N,) may be that is lost [m]."""
+        air = Boundaries(self.mission)
+        return self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
+
     @cached_property
     def wrecks(self) -> list[Sphere]:
-        """The lost vehicles, which fall from where they were by the plan, and then lie."""
+        """The lost vehicles, wider by `astray`, which fall from where they were by the plan, and then lie."""
         air, lost_at, wrecks = Boundaries(self.mission), self.mission.lost_at, []
-        astray = self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
+        astray = self.astray
         for i in self.wrecked.tolist():
             states = self.plan.states(lost_at[[i]], 2)
             (r, v), k = states[:, 0, i], air.k[[i]]
