@@ -173,12 +173,15 @@ def test_aborts_keep_their_promise_in_flight(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rotors", [False, True])
-def test_two_hundred_aborts_keep_their_promise_in_flight(rotors: bool) -> None:
-    """Of 200 random missions in wind, with one vehicle lost, no abort is below its promise as flown: 1 has no way."""
+@pytest.mark.parametrize(("rotors", "none"), [(False, 17), (True, 24)])
+def test_two_hundred_aborts_keep_their_promise_in_flight(rotors: bool, none: int) -> None:
+    """Of 200 random missions in wind, with one vehicle lost, no abort is below its promise as flown.
+
+    From 1 no way leads home since the plan leads two too near, and from the others for where the lost one falls.
+    """
     margins = np.array([flown_apart(seed, rotors=rotors) for seed in range(200)])
     assert margins.min() > -1e-9
-    assert np.isinf(margins).sum() == 1
+    assert np.isinf(margins).sum() == none
 
 
 @pytest.mark.parametrize("to", ["any", "own"])
