@@ -145,6 +145,22 @@ def test_a_gap_is_in_doubt() -> None:
     assert np.mean(wide[1::2]) > 5.0 * np.mean(wide[::2])
 
 
+def test_a_slow_log_beside_a_fast_one_hides_no_motion() -> None:
+    """A vehicle that is logged once a second takes nothing from another's 100 samples: intervals hold its motion."""
+    random, pulse = np.random.default_rng(18), np.pi
+    t, slow = np.linspace(0.0, 10.0, 1001), np.arange(11.0)
+    for amplitude, word in ((0.4, "passed"), (0.6, "failed")):
+        fast = np.stack([amplitude * np.sin(pulse * t), 0 * t, 5.0 + 0 * t], axis=1)
+        still = np.tile([0.0, 2.0, 5.0], (11, 1))
+        ways = [x + SIGMA * random.standard_normal(x.shape) for x in (fast, still)]
+        log = logged([t, slow], ways)
+        _, verdict = judge_log(log, None, Doubts(SIGMA, 0.0), limits={"speed": 1.65})
+        for name, true in (("speed", amplitude * pulse), ("acceleration", amplitude * pulse**2)):
+            low, high = verdict.by_name[name].interval or (np.inf, np.inf)
+            assert low <= true <= high
+        assert verdict.word == word
+
+
 @many
 def test_a_near_limit_is_undecided(count: int) -> None:
     """A flight that keeps its limit is never failed, one that collides by more than the noise never passed."""

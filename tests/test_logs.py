@@ -248,6 +248,76 @@ def test_odometry_of_mavlink_is_of_its_frame(tmp_path, frame, turned):
         read_trajectories(write("start.tlog", 20))
 
 
+def telemetry(path: Path, rows) -> Path:
+    """A log that pymavlink packs: when each message came [us], from which system and component."""
+    common = pytest.importorskip("pymavlink.dialects.v20.common")
+    parts = []
+    for received, system, component, name, values in rows:
+        message = getattr(common, f"MAVLink_{name}_message")(*values)
+        packed = message.pack(common.MAVLink(None, system, component))
+        parts.append(struct.pack(">Q", received) + packed)
+    path.write_bytes(b"".join(parts))
+    return path
+
+
+def test_a_system_is_its_autopilot(tmp_path):
+    """A computer beside an autopilot has a clock and places of its own, and a camera is never armed."""
+    rows = []
+    for k in range(100):
+        t = 1_700_000_000_000_000 + 100_000 * k
+        rows += [(t, 1, 191, "local_position_ned", (900_000 + 100 * k, 50.0, 0.1 * k, -9.0, 0, 0, 0)),
+                 (t, 1, 1, "local_position_ned", (5000 + 100 * k, 0.1 * k, 0.0, -1.0, 1, 0, 0)),
+                 (t, 1, 154, "heartbeat", (30, 8, 0, 0, 4, 3)),
+                 (t, 1, 1, "heartbeat", (2, 3, 129 if 20 <= k < 80 else 1, 0, 4, 3))]  # fmt: skip
+    path = telemetry(tmp_path / "one.tlog", rows)
+    read = read_trajectories(path)
+    place = np.stack([np.zeros(100), 0.1 * np.arange(100), np.ones(100)], axis=1)
+    np.testing.assert_allclose(at_samples(read)[1], place, atol=1e-6)
+    assert read.read[0]["armed"] == ["2 to 8 s"]
+    assert said(read, "--topic may name LOCAL_POSITION_NED:191")
+    other = at_samples(read_trajectories(path, topic="LOCAL_POSITION_NED:191"))[1]
+    np.testing.assert_allclose(other[:, 1:], [[50.0, 9.0]] * 100)
+
+
+def test_vehicles_of_which_no_origin_is_known_are_compared_on_the_earth(tmp_path):
+    """Systems at their own zeros do not collide: of several, places on the Earth count, in one log or in several."""
+    rows, east = [], np.degrees(4.0 / (6_378_137.0 * np.cos(np.radians(47.4))))
+    for k in range(50):
+        for system in (10, 2):
+            boot, longitude = 1000 * system + 100 * k, round(1e7 * (8.5 + east * (system == 10)))
+            geodetic = 474_000_000 + 9 * k, longitude, 500_000
+            rows += [(1_700_000_000_000_000 + 100_000 * k, system, 1, name, (boot, *values)) for name, values in (
+                ("local_position_ned", (0.1 * k, 0, -1, 1, 0, 0)),
+                ("global_position_int", (*geodetic, 0, 100, 0, 0, 65_535)))]  # fmt: skip
+    parts = [telemetry(tmp_path / f"v{n}.tlog", [x for x in rows if x[1] == n]) for n in (2, 10)]
+    for files, names in (
+        (telemetry(tmp_path / "all.tlog", rows), ("system 2", "system 10")),
+        (parts, ("v2", "v10")),
+    ):
+        read = read_trajectories(files)
+        assert read.names == names
+        apart = at_samples(read, 1)[1] - at_samples(read, 0)[1]
+        np.testing.assert_allclose(apart, [[4.0, 0.0, 0.0]] * 50, atol=0.02)
+    assert np.isnan(read.curves[0].at(np.zeros(1))[0, 3])  # a heading that is not known
+    assert at_samples(read_trajectories(parts[0]))[1][-1, 1] == pytest.approx(4.9)  # alone
+
+
+def test_a_receiver_without_a_fix_tells_no_place(tmp_path):
+    """Places count from a fix in three dimensions on, in MAVLink's messages and in PX4's."""
+    fixes = [(1_700_000_000_000_000 + 200_000 * k, 1, 1, "gps_raw_int",
+              (5_000_000 + 200_000 * k, 1 + (k >= 10) + (k >= 20), 474_000_000 + 90 * k, 85_000_000, 500_000, *[0] * 5))
+             for k in range(50)]  # fmt: skip
+    read = read_trajectories(telemetry(tmp_path / "a.tlog", fixes))
+    assert len(read.curves[0].time) == 30
+    assert said(read, "20 samples without a valid position are left out")
+    rows = [
+        (5_000_000 + 100_000 * k, 0, 474_000_000 + 90 * k, 85_500_000, 488_000, 3 * (k > 3))
+        for k in range(20)
+    ]
+    topic = ("vehicle_gps_position", 0, [*GPS, ("uint8_t", "fix_type")], rows)
+    assert len(read_trajectories(ulog(tmp_path / "a.ulg", [topic])).curves[0].time) == 16
+
+
 def test_jumps_of_an_estimator_are_told(log, tmp_path):
     """Where a position moves against its velocity, when the estimator is set anew, a note says so."""
     path = log("cores.bin")
@@ -327,6 +397,16 @@ def test_local_positions_of_px4_are_turned_and_timed(tmp_path):
     assert said(read, "the estimator moves its position by 0.52 m at 0.8 s")
     assert said(read, "--topic may name vehicle_local_position:1")
     assert read.read[0]["origin"] == pytest.approx([47.4, 8.55, 488.0])
+
+
+def test_a_vehicle_is_armed_until_it_is_not(tmp_path):
+    """The last message of arming holds to the end of the log."""
+    pytest.importorskip("pyulog")
+    fields = [("uint64_t", "timestamp"), ("bool", "armed")]
+    topics = [("vehicle_local_position", 0, LOCAL, list(local_rows())),
+              ("actuator_armed", 0, fields, [(5_000_000, False), (5_400_000, True)])]  # fmt: skip
+    read = read_trajectories(ulog(tmp_path / "one.ulg", topics))
+    assert read.read[0]["armed"] == ["5.4 to 6.9792 s"]
 
 
 def test_a_reset_is_no_flight(tmp_path):
@@ -566,17 +646,22 @@ def test_a_robot_that_others_recorded(tmp_path, storage):
     )
 
 
-def poses_bag(folder: Path, rows: list[tuple[str, int, int, list[float]]]) -> Path:
+def poses_bag(
+    folder: Path, rows: list[tuple[str, int, int, list[float]]], packed: str = "", plugin: str = "MCAP"
+) -> Path:  # fmt: skip
     """A recording that `rosbags` writes, of poses: topic, when it was recorded and stamped [ns], place [m]."""
     rosbag2 = pytest.importorskip("rosbags.rosbag2")
     pytest.importorskip("mcap")
-    from rosbags.rosbag2.enums import StoragePlugin
+    from rosbags.rosbag2.enums import CompressionFormat, CompressionMode, StoragePlugin
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
     of = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
     kind, to = of["PoseStamped"].__msgtype__, {}
-    with rosbag2.Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+    writer = rosbag2.Writer(folder, version=9, storage_plugin=StoragePlugin[plugin])
+    if packed:
+        writer.set_compression(CompressionMode[packed], CompressionFormat.ZSTD)
+    with writer:
         for topic, received, stamp, place in rows:
             if topic not in to:
                 to[topic] = writer.add_connection(topic, kind, typestore=store)
@@ -584,8 +669,95 @@ def poses_bag(folder: Path, rows: list[tuple[str, int, int, list[float]]]) -> Pa
             pose = of["Pose"](of["Point"](*place), of["Quaternion"](0.0, 0.0, 0.0, 1.0))
             data = store.serialize_cdr(of["PoseStamped"](header, pose), kind)
             writer.write(to[topic], received, data)
-    (path,) = folder.glob("*.mcap")
+    (path,) = (x for x in folder.iterdir() if x.suffix != ".yaml")
     return path
+
+
+#: Poses of vehicles 10, 2 and 1, in this order.
+OF_THREE = [
+    (f"/cf{n}/pose", t, t, [float(n), 1e-9 * (t - 1_700_000_000 * 10**9), 1.0])
+    for t in range(1_700_000_000 * 10**9, 1_700_000_001 * 10**9, 20_000_000)
+    for n in (10, 2, 1)
+]
+
+
+@pytest.mark.parametrize("plugin", ["MCAP", "SQLITE3"])
+@pytest.mark.parametrize("packed", ["", "MESSAGE", "FILE", "STORAGE"])
+def test_recordings_are_packed_in_several_ways(tmp_path, packed, plugin):
+    """Messages and chunks are unpacked, a whole file is refused with a remedy; vehicles are in their numbers' order."""
+    if (packed, plugin) == ("STORAGE", "SQLITE3"):
+        pytest.skip("only MCAP packs chunks")
+    path = poses_bag(tmp_path / "bag", OF_THREE, packed, plugin)
+    if packed == "FILE":
+        for given in (path, path.parent):
+            with pytest.raises(
+                TrajectoryError, match=r"compressed as a whole\. Unpack it: zstd -d"
+            ):
+                read_trajectories(given)
+        return
+    for given in (path, path.parent):
+        read = read_trajectories(given)
+        assert read.names == ("/cf1/pose", "/cf2/pose", "/cf10/pose")
+        place = [[10.0, 0.02 * k, 1.0] for k in range(50)]
+        np.testing.assert_allclose(at_samples(read, 2)[1], place, atol=1e-9)
+        assert read.read[0]["rate_hz"] == pytest.approx(50.0)
+
+
+def test_a_frame_is_no_robot(tmp_path):
+    """Of a map, odometry in it, a robot in that and its wheel (REP 105), the robot is what moves."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    of = {name.rpartition("/")[2]: kind for name, kind in store.types.items()}
+    kind = of["TFMessage"].__msgtype__
+    with rosbag2.Writer(tmp_path / "bag", version=9) as writer:
+        to = writer.add_connection("/tf", kind, typestore=store)
+        for k in range(50):
+            moved = []
+            for frame, body, x in (
+                ("map", "odom", 0.01),
+                ("odom", "base_link", 0.1 * k),
+                ("base_link", "wheel", 0.2),
+            ):
+                header = of["Header"](of["Time"](1_700_000_000, 20_000_000 * k), frame)
+                transform = of["Transform"](
+                    of["Vector3"](x, 0.0, 0.0), of["Quaternion"](0.0, 0.0, 0.0, 1.0)
+                )
+                moved.append(of["TransformStamped"](header, body, transform))
+            writer.write(to, 20_000_000 * k, store.serialize_cdr(of["TFMessage"](moved), kind))
+    read = read_trajectories(tmp_path / "bag")
+    assert read.names == ("/tf:base_link",)
+    np.testing.assert_allclose(at_samples(read)[1][:, 0], 0.1 * np.arange(50))
+    assert read_trajectories(tmp_path / "bag", topic="/tf:odom").names == ("/tf:odom",)
+
+
+@pytest.mark.parametrize(
+    "path", [x for kind in ("*.mcap", "*.db3") for x in sorted(Path(MORE).glob(kind) if MORE else ())]
+)  # fmt: skip
+def test_public_recordings_of_ros2(path):
+    """What ROS 2 itself recorded: places and times of each topic are those that `rosbags` decodes."""
+    highlevel = pytest.importorskip("rosbags.highlevel")
+    from rosbags.typesys import Stores, get_typestore
+
+    rows: dict[str, list[list[float]]] = {}
+    with highlevel.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        for to, _, raw in reader.messages():
+            if to.topic != "/tf_static" and to.msgtype.endswith(
+                ("/Odometry", "Stamped", "/TFMessage")
+            ):
+                message = reader.deserialize(raw, to.msgtype)
+                for each in getattr(message, "transforms", [message]):
+                    body = f":{each.child_frame_id}" if hasattr(each, "transform") else ""
+                    pose = getattr(each, "pose", None)
+                    pose = getattr(pose, "pose", pose)
+                    x = pose.position if pose else each.transform.translation
+                    rows.setdefault(to.topic + body, []).append([seconds(each), x.x, x.y, x.z])
+    assert rows
+    for topic, own in rows.items():
+        time, place = at_samples(read := read_trajectories(path, topic=topic, gaps="bridge"))
+        np.testing.assert_array_equal(place, np.array(own)[:, 1:])
+        np.testing.assert_allclose(time + read.since, np.array(own)[:, 0], atol=1e-6)
 
 
 def test_messages_without_a_stamp_are_no_places(tmp_path):

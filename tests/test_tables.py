@@ -548,7 +548,7 @@ def test_the_verdict_says_what_was_read(tmp_path, capsys):
     for words in (
         "vehicles: 2",
         "end s: 2.0",
-        "rate hz: 2.5",
+        "rate hz: 2.0",
         "ignored: battery",
         "time s (the file)",
         "enu (assumed)",
@@ -558,6 +558,9 @@ def test_the_verdict_says_what_was_read(tmp_path, capsys):
     (read,) = json.loads(capsys.readouterr().out)["read"]
     assert (read["vehicles"], read["rows"], read["vehicles_by"]) == (2, 10, ["uav"])
     assert read["axes"] == "enu (the option)"
+    wide = "time_s,x1,y1,z1,x2,y2,z2\n" + "".join(f"{k},{k},0,5,{k},4,5\n" for k in range(4))
+    (tmp_path / "wide.csv").write_text(wide)
+    assert read_trajectories(tmp_path / "wide.csv").read[0]["rate_hz"] == 1.0  # 4 rows of 3 s
 
 
 # -- the same in a mission ----------------------------------------------------------------------------

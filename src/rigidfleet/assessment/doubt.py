@@ -97,9 +97,7 @@ class DrawnWays:
             return _greatest_length(shifts[:, 0, k, i] - shifts[:, 0, k, j])
         if _is_of_pairs(name):
             return 2.0 * most
-        if (
-            name == "people"
-        ):  # where a vehicle falls depends on its velocity, for the time of a fall
+        if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
             return most + math.sqrt(2.0 * height / gravity) * _greatest_length(shifts[:, 1])
         values = -self.measurements.close.each if name == "clearance" else None
@@ -160,21 +158,17 @@ def verdict_with_doubt(
     """
     checks, resets = [], facts.get("resets_s", [])
     for check in verdict.checks:
-        why = "" if deviations else "the noise is not told. State it: --noise"
-        if not shared and _is_of_pairs(check.check):
+        name, why = check.check, "" if deviations else "the noise is not told. State it: --noise"
+        if not shared and _is_of_pairs(name):
             why = "vehicles have no common clock"
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
-        if check.check in _UNSEEN:
-            continue
-        if check.check in _CERTAIN:
-            checks.append(check)
-        elif why or deviations is None:
-            words = f"{check.check.replace('_', ' ')} is not judged: {why}"
-            undecided = replace(check, passed=False, undecided=True, message=words)
-            checks.append(undecided if check.judged else check)
-        else:
+        if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
             check = _with_interval(check, deviations.of_check(check), facts["noise_m"])  # noqa: PLW2901
-            checks.append(_unless_reset(check, resets))
+            check = _unless_reset(check, resets)  # noqa: PLW2901
+        elif why and check.judged and name not in _CERTAIN:
+            words = f"{name.replace('_', ' ')} is not judged: {why}"
+            check = replace(check, passed=False, undecided=True, message=words)  # noqa: PLW2901
+        checks += [check] * (name not in _UNSEEN)
     return replace(verdict, checks=checks, doubt=facts, notes=[*doubt_notes(facts), *verdict.notes])
 
 
@@ -221,12 +215,9 @@ def facts_of(
     flown: Result, deviations: DrawnWays | None, estimate: NoiseEstimate, alignment: Alignment | None, clock: str
 ) -> dict[str, Any]:  # fmt: skip
     """What is told of noise, clock, set-up and, beside a plan, of vehicles: how far off their slots, and when."""
-    noise = estimate.noise
-    facts: dict[str, Any] = {
-        "noise_m": None if noise is None else noise.sigma,
-        "correlation_s": None if noise is None else noise.tau,
-        "source": estimate.source, "remark": estimate.words, "clock": clock,
-    }  # fmt: skip
+    sigma, tau = estimate.noise or (None, None)
+    facts: dict[str, Any] = {"noise_m": sigma, "correlation_s": tau, "source": estimate.source}
+    facts |= {"remark": estimate.words, "clock": clock}
     if resets := flown.statistics["resets"]:
         facts["resets_s"] = resets
     if alignment is None:
@@ -271,21 +262,19 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
     else:
         late = _lateness(*explained["offset_s"])
         yield f"the log is {late} against the plan; {applied}. Positions alone do not tell a clock from a lag"
+    turn, scale = explained["turn_deg"], explained["scale"]
     parts = []
-    for key, one, words in (
-        ("turn_deg", 0.0, "turned by {} deg about the vertical"),
-        ("scale", 1.0, "scaled by {}"),
-    ):
-        if (x := explained[key]) and abs(x[0] - one) > _SURE * x[1]:
-            parts.append(words.format(_pair(*x)))
+    if turn and abs(turn[0]) > _SURE * turn[1]:
+        parts.append(f"turned by {_pair(*turn)} deg about the vertical")
+    if scale and abs(scale[0] - 1.0) > _SURE * scale[1]:
+        parts.append(f"scaled by {_pair(*scale)}")
     if any(x and abs(x[0]) > max(_SURE * x[1], _OFF) for x in explained["shift_m"]):
         parts.append(f"shifted by ({', '.join(value(x[0]) for x in explained['shift_m'])}) m")
     if parts:
         far, left = (value(explained[key], "m") for key in ("rms_as_logged_m", "rms_explained_m"))
-        yield (
-            f"against the plan the log is {' and '.join(parts)}. It is judged as flown, {far} off (root mean square); "
-            f"without clock and set-up, {left} are left"
-        )
+        judged = f"It is judged as flown, {far} off (root mean square)"
+        causes = f"against the plan the log is {' and '.join(parts)}"
+        yield f"{causes}. {judged}; without clock and set-up, {left} are left"
     for each in facts["vehicles"]:
         if each["off_its_slot"]:
             off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])

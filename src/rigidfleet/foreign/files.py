@@ -11,7 +11,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -36,25 +36,22 @@ Gaps = Literal["refuse", "bridge"]
 _BYTES, _FILES, FARTHEST = 256 << 20, 20_000, 1e6
 #: Greatest number of notes on what was read.
 _NOTES = 10
-_ZIP, _HDF, _BAG = b"PK", b"\x89HDF", b"#ROSBAG"
+_ZIP = b"PK"
+#: What is not read, by its first bytes, and what to do with it.
+_REFUSED = {
+    b"\x89HDF": "is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`",
+    b"#ROSBAG": "is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {} --dst FOLDER",
+    poses.ZSTANDARD: "is compressed as a whole. Unpack it: zstd -d {}",
+}
 #: Suffixes of recordings and logs, which may be longer than what is read as a whole, and of all files of trajectories
 #: in a folder. Files ``.bin`` are logs only by their content.
-_RECORDINGS, _LOGS = {".mcap", ".db3"}, {".ulg", ".tlog"}
+_RECORDINGS, _LOGS = {".mcap", ".db3", ".zstd"}, {".ulg", ".tlog"}
 _SUFFIXES = {".csv", ".skyc"} | _RECORDINGS | _LOGS
 #: A time between two samples that is noted, and one that is refused, in usual steps (medians) of the vehicle; repeated
 #: positions that are noted.
 _NOTED, _LONGEST, _REPEATED = 1.5, 10.0, 5
 #: Share of a number that is rounding, and the greatest number of things that a note lists.
 _ROUNDING, _LISTED = 1e-6, 5
-
-
-class _Options(NamedTuple):
-    """How files are read; see `read_trajectories`."""
-
-    interpolation: Interpolation
-    units: Units
-    topics: tuple[str, ...] = ()
-    origin: logs.Geodetic | None = None
 
 
 def read_trajectories(
@@ -100,9 +97,8 @@ def read_trajectories(
         if word not in get_args(known):
             raise ValueError(f"there is no {word!r}; use {' or '.join(get_args(known))}")
     if origin and not (abs(origin[0]) < 90.0 and abs(origin[1]) <= 180.0 and abs(origin[2]) < 2e4):
-        raise TrajectoryError(
-            f"origin: {origin} is no place on the Earth. Give latitude, longitude [deg] and height [m]."
-        )
+        remedy = "Give latitude, longitude [deg] and height [m]"
+        raise _error("origin", f"{origin} is no place on the Earth", remedy)
     paths = [Path(files)] if isinstance(files, str | Path) else [Path(file) for file in files]
     if not paths:
         raise TrajectoryError("no file was given. Give at least one.")
@@ -110,60 +106,73 @@ def read_trajectories(
     if len(listed) > _FILES:
         raise TrajectoryError(f"{paths[0]}: {len(listed):,} files are more than {_FILES:,}.")
     left_out = [note for path in paths for note in _notes_on_unread_files(path, listed)]
-    topics = (topic,) if isinstance(topic, str) else tuple(topic)
-    options, parts = _Options(interpolation, units_of(units, axes), topics, origin), []
+    topics, words = (topic,) if isinstance(topic, str) else tuple(topic), units_of(units, axes)
+    sources, parts, several = [group[0] for group in listed], [], len(listed) > 1
     for group in listed:
-        parts.append(_read_sequence(group, options))
-        place = parts[-1].read[0].get("origin")
-        options = options._replace(origin=options.origin or (place and tuple(place)))
-    parts = _put_on_one_clock(parts, listed)
-    own_clocks = len(parts) > 1 and any(part.own_clocks for part in parts)
-    kinds = {part.assumed: group[0] for part, group in zip(parts, listed, strict=True)}
-    if len(kinds) > 1:
-        (_, first), (_, second), *_ = kinds.items()
-        why = f"{second}: is of another kind than {first}"
-        raise TrajectoryError(f"{why}. Give files of one kind for one flight.")
-    names = [name for part in parts for name in part.names]
-    sources = [group[0] for part, group in zip(parts, listed, strict=True) for _ in part.names]
-    if len(set(names)) < len(names):
-        stems = [group[0].stem for group in listed]
-        # Tables of one name are told apart by their folders.
-        files = [group[0].stem if stems.count(stem) == 1 else group[0].resolve().parent.name
-                 for stem, group in zip(stems, listed, strict=True)]  # fmt: skip
-        names = [file if len(part.names) == 1 else f"{file}/{name}"
-                 for part, file in zip(parts, files, strict=True) for name in part.names]  # fmt: skip
-    if len(set(names)) < len(names):
-        again = next(name for name in names if names.count(name) > 1)
-        raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
+        parts.append(_read_sequence(group, interpolation, words, topics, origin, several))
+        origin = origin or parts[-1].read[0].get("origin")
+    parts = _put_on_one_clock(parts, sources)
+    assumed = parts[0].assumed
+    for part, source in zip(parts, sources, strict=True):
+        if part.assumed != assumed:
+            remedy = "Give files of one kind for one flight"
+            raise _error(source, f"is of another kind than {sources[0]}", remedy)
+    names = _names_of_vehicles(parts, sources)
     curves = tuple(curve for part in parts for curve in part.curves)
     whose: dict[str, list[str]] = {}
-    for part, group in zip(parts, listed, strict=True):
-        who = group[0].stem if len(parts) > 1 and "clock" in part.read[0] else ""
+    for part, source in zip(parts, sources, strict=True):
         for note in part.notes:
+            who = source.stem if several and "clock" in part.read[0] else ""
             whose.setdefault(note, []).append(who)
     notes = [*logs.of_all(whose)]
-    if len(parts) > 1 and any(part.read[0].get("clock") == logs.GNSS for part in parts):
+    if several and any(part.read[0].get("clock") == logs.GNSS for part in parts):
         notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
+    own_clocks = several and any(part.own_clocks for part in parts)
     if own_clocks:
-        words = "each vehicle has a clock of its own: times of one say nothing of another's"
-        notes.insert(0, words)
+        spans = "away"
+        notes.insert(
+            0, "each vehicle has a clock of its own: times of one say nothing of another's"
+        )
     if len(notes) > _NOTES:
         notes[_NOTES:] = [f"of the files there are {len(notes) - _NOTES:,} more notes like these"]
-    sampled = parts[0].assumed in ASSUMED.values()
-    spans = "away" if own_clocks else spans
+    sampled = assumed in ASSUMED.values()
     away = spans == "away" or (sampled and spans == "refuse")
     since = min(part.read[0].get("since_1970_ns") or 0 for part in parts) / 1e9
     records = _records_of_alike_files(parts)
     measured = tuple(own for part in parts for own in part.measured)
     measured = measured if len(measured) == len(curves) else ()
-    read = Trajectories(
-        tuple(names), curves, parts[0].assumed, (), records, away, since, measured, own_clocks
-    )
-    notes += _notes_on_gaps(read, sources, spans, gaps) if sampled else []
+    read = Trajectories(names, curves, assumed, (), records, away, since, measured, own_clocks)
+    if sampled:
+        whence = [x for part, x in zip(parts, sources, strict=True) for _ in part.names]
+        notes += _notes_on_gaps(read, whence, spans, gaps)
     return read._replace(notes=(*left_out, *notes, *_note_on_spans(read)))
 
 
-def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> list[Trajectories]:
+def _error(where: object, why: str, remedy: str) -> TrajectoryError:
+    return TrajectoryError(f"{where}: {why}. {remedy}.")
+
+
+def _names_of_vehicles(parts: list[Trajectories], sources: list[Path]) -> tuple[str, ...]:
+    """Names as files have them; if two are alike, those of files, or of their folders, say whose they are.
+
+    Raises
+    ------
+    TrajectoryError
+        Two are alike all the same.
+    """
+    names = [name for part in parts for name in part.names]
+    if len(set(names)) < len(names):
+        stems = [path.stem for path in sources]
+        files = [x.stem if stems.count(x.stem) == 1 else x.resolve().parent.name for x in sources]
+        own = [(file, part.names) for file, part in zip(files, parts, strict=True)]
+        names = [f"{x}/{name}" if len(every) > 1 else x for x, every in own for name in every]
+    for again in names if len(set(names)) < len(names) else ():
+        if names.count(again) > 1:
+            raise TrajectoryError(f"two vehicles are named {again!r}. Rename a file or a vehicle.")
+    return tuple(names)
+
+
+def _put_on_one_clock(parts: list[Trajectories], sources: list[Path]) -> list[Trajectories]:
     """The same parts, those that count their times from a date all from the first one.
 
     Raises
@@ -171,37 +180,35 @@ def _put_on_one_clock(parts: list[Trajectories], listed: list[list[Path]]) -> li
     TrajectoryError
         Some times are dates and others not.
     """
-    since = [part.read[0].get("since_1970_ns") for part in parts]
-    dated = [x for x in since if x is not None]
-    if not dated:
-        return parts
-    if len(dated) < len(parts):
-        i, j = since.index(None), next(k for k, x in enumerate(since) if x is not None)
-        raise TrajectoryError(
-            f"{listed[i][0]}: has times that are no dates, and {listed[j][0]} has dates. Give all files one clock."
-        )
-    begins = [(x - min(dated)) / 1e9 for x in dated]
+    dates = [part.read[0].get("since_1970_ns") for part in parts]
+    dated = {date: source for date, source in zip(dates, sources, strict=True) if date is not None}
+    if dated and None in dates:
+        why = f"has times that are no dates, and {next(iter(dated.values()))} has dates"
+        raise _error(sources[dates.index(None)], why, "Give all files one clock")
+    since = [(date - min(dated)) / 1e9 if dated else 0.0 for date in dates]
     return [
         part._replace(curves=tuple(curve.later(begin) for curve in part.curves))
-        for part, begin in zip(parts, begins, strict=True)
+        for part, begin in zip(parts, since, strict=True)
     ]
 
 
 def _records_of_alike_files(parts: list[Trajectories]) -> tuple[dict[str, Any], ...]:
     """What was taken for what, once for files that are alike."""
-    every: dict[str, dict[str, Any]] = {}
+    alike: dict[str, list[Trajectories]] = {}
     for part in parts:
         record = {k: v for k, v in part.read[0].items() if k not in ("rows", "since_1970_ns")}
-        nothing = {"files": 0, "vehicles": 0, "rows": 0, "begin_s": np.inf, "end_s": -np.inf}
-        own = every.setdefault(repr(record), nothing | {"rate_hz": 0.0} | record)
-        own["files"] += 1
-        own["vehicles"] += len(part.names)
-        own["rows"] += part.read[0].get("rows", 0)
-        own["begin_s"] = min(own["begin_s"], *(float(curve.time[0]) for curve in part.curves))
-        own["end_s"] = max(own["end_s"], *(float(curve.time[-1]) for curve in part.curves))
-        seconds = own["vehicles"] * (own["end_s"] - own["begin_s"])
-        own["rate_hz"] = round(own["rows"] / seconds, 6)
-    return tuple(every.values())
+        alike.setdefault(repr(record), []).append(part._replace(read=(record, part.read[0])))
+    records = []
+    for same in alike.values():
+        times = [curve.time for part in same for curve in part.curves]
+        begins, ends = np.transpose([time[[0, -1]] for time in times])
+        steps, seconds = sum(len(time) - 1 for time in times), float((ends - begins).sum())
+        records.append({
+            "files": len(same), "vehicles": len(times), "rows": sum(part.read[1].get("rows", 0) for part in same),
+            "begin_s": float(begins.min()), "end_s": float(ends.max()), "rate_hz": round(steps / seconds, 6),
+            **same[0].read[0],
+        })  # fmt: skip
+    return tuple(records)
 
 
 def groups_of_files(path: Path) -> list[list[Path]]:
@@ -221,28 +228,23 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     files = [p for p in inside if p.is_file() and _is_read(p)]
     kinds = {p.suffix.lower() for p in files}
     if len(kinds) > 1:
-        raise TrajectoryError(
-            f"{path}: the folder has files {' and '.join(sorted(kinds))}. Give files of one kind for one flight."
-        )
+        why = f"the folder has files {' and '.join(sorted(kinds))}"
+        raise _error(path, why, "Give files of one kind for one flight")
     if files:
         return [[p] for p in files]
     folders = [p for p in inside if p.is_dir()]
-    groups = [[p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders]
-    if not groups or not all(groups):
-        bare = next((f for f, g in zip(folders, groups, strict=True) if not g), path)
-        raise TrajectoryError(
-            f"{bare}: the folder has no .csv, .skyc, .mcap or log. Give a folder with one table a vehicle."
-        )
-    for group in groups:
+    groups = {x: [p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders}
+    for folder, group in groups.items() or [(path, [])]:
+        if not group:
+            why = "the folder has no .csv, .skyc, .mcap or log"
+            raise _error(folder, why, "Give a folder with one table a vehicle")
         numbers = zip(*(re.findall(r"\d+", p.stem) for p in group), strict=False)
         counts = [[int(x) for x in column] for column in numbers if len({*column}) > 1]
         whole = [[*range(first, first + len(group))] for first in (0, 1)]
         if len(group) > 1 and (len(counts) != 1 or counts[0] not in whole):
-            raise TrajectoryError(
-                f"{group[0].parent}: {first_few([p.name for p in group])} are no sequence. Number the tables that a "
-                "vehicle flies one after the other from 0 or 1 on, and leave none out."
-            )
-    return groups
+            remedy = "Number the tables that a vehicle flies one after the other from 0 or 1 on, and leave none out"
+            raise _error(folder, f"{first_few([p.name for p in group])} are no sequence", remedy)
+    return [*groups.values()]
 
 
 def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
@@ -254,23 +256,24 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
         One of them may be a further vehicle.
     """
     read = {p for group in listed for p in group}
-    rest = [p for p in sorted(path.rglob("*"), key=_sort_key) if p.is_file() and p not in read]
+    inside = sorted(path.rglob("*"), key=logs.natural_key)
+    rest = [p for p in inside if p.is_file() and p not in read]
     for p in rest:
         hidden = _is_read(p) and not _is_hidden(p)
         with suppress(TrajectoryError):
-            hidden = hidden or bool(_read_file([p], _Options("linear", units_of(None, None))))
-        if hidden:
-            raise TrajectoryError(
-                f"{p}: may be a further vehicle, but is not read beside {listed[0][0].name}. Give its path as well, or "
-                "move it out of the folder."
+            hidden = hidden or bool(
+                _read_file([p], "linear", units_of(None, None), (), None, False)
             )
+        if hidden:
+            why = f"may be a further vehicle, but is not read beside {listed[0][0].name}"
+            raise _error(p, why, "Give its path as well, or move it out of the folder")
     names = first_few([p.relative_to(path) for p in rest])
     return [f"of '{path.name}', {names} is not read"] if rest else []
 
 
 def _seen_in(folder: Path) -> list[Path]:
     """What is in a folder, in order, and not hidden."""
-    return [p for p in sorted(folder.iterdir(), key=_sort_key) if not _is_hidden(p)]
+    return [p for p in sorted(folder.iterdir(), key=logs.natural_key) if not _is_hidden(p)]
 
 
 def _is_read(path: Path) -> bool:
@@ -299,48 +302,37 @@ def _is_hidden(path: Path) -> bool:
     return path.name.startswith((".", "__MACOSX"))
 
 
-def _sort_key(path: Path) -> list[tuple[int, str]]:
-    """Names in the order of the numbers in them: 2 before 10."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
-
-
-def _read_sequence(group: list[Path], options: _Options) -> Trajectories:
+def _read_sequence(group: list[Path], *options: Any) -> Trajectories:
     """What is in the file of a vehicle, in the parts of a recording, or in several files that follow each other."""
     if len(group) == 1 or group[0].suffix.lower() in _RECORDINGS:
-        return _read_file(group, options)
-    parts = [_read_file([path], options) for path in group]
+        return _read_file(group, *options)
+    parts = [_read_file([path], *options) for path in group]
     if {part.assumed for part in parts} != {texts.POLYNOMIALS}:
-        raise TrajectoryError(
-            f"{group[0]}: only tables of polynomials follow each other. Give a folder with one table a vehicle."
-        )
+        why = "only tables of polynomials follow each other"
+        raise _error(group[0], why, "Give a folder with one table a vehicle")
     curve, *more = (part.curves[0] for part in parts)
     for after in more:
         time = np.concatenate([curve.time, after.time[1:] + curve.time[-1]])
         curve = Piecewise(time, np.concatenate([curve.pieces, after.pieces]))
-    name = group[0].parent.name
-    return Trajectories((name,), (curve,), parts[0].assumed, parts[0].notes, parts[0].read)
+    return parts[0]._replace(names=(group[0].parent.name,), curves=(curve,))
 
 
-def _read_file(parts: list[Path], options: _Options) -> Trajectories:
-    """What is in one file, or in the parts of a recording, by its content."""
-    path, (interpolation, units, topics, origin) = parts[0], options
-    head, suffix = _head_of(path), path.suffix.lower()
-    if head.startswith(_HDF):
-        raise TrajectoryError(
-            f"{path}: is a result of `rigidfleet run`. Give it alone: `rigidfleet assess FILE.nc`."
-        )
-    if head.startswith(_BAG):
-        raise TrajectoryError(
-            f"{path}: is of ROS 1. Convert it: pip install rosbags; rosbags-convert --src {path.name} --dst FOLDER."
-        )
+def _read_file(
+    parts: list[Path], interpolation: str, units: Units, topics: tuple[str, ...], origin: Any, several: bool
+) -> Trajectories:  # fmt: skip
+    """What is in one file of ``several``, or in the parts of a recording, by its content; see `read_trajectories`."""
+    path = parts[0]
+    head, suffix, log = _head_of(path), path.suffix.lower(), None
+    for begin, why in _REFUSED.items():
+        if head.startswith(begin):
+            raise TrajectoryError(f"{path}: {why.format(path.name)}.")
     try:
         if head.startswith((poses.MCAP, poses.SQLITE)) or suffix in _RECORDINGS:
             log = poses.read_recording(parts, topics)
-            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
         elif head.startswith((logs.ULOG, logs.BIN)) or suffix in _LOGS:
-            log = logs.read_log(path)
-            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin)
+            log = logs.read_log(path, head)
+        if log is not None:
+            read = logs.trajectories_of(log, path.stem, interpolation, topics, origin, several)
         elif topics:
             raise fault("has no topics", "Remove --topic")
         elif head.startswith(_ZIP) or suffix == ".skyc":
@@ -407,18 +399,14 @@ def _notes_on_gaps(read: Trajectories, sources: list[Path], spans: Spans, gaps: 
         steps, (first, last) = np.diff(curve.time), curve.time[[0, -1]]
         shares = steps / (np.median(steps) * (1.0 + _ROUNDING))
         if spans == "refuse" and max(first - begin, end - last) * shares[0] > steps[0]:
-            raise TrajectoryError(
-                f"{source}: {name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s. "
-                "Give all vehicles the same span of time, or say what it does before and after: `assess --spans stand` "
-                "or `--spans away`."
-            )
+            why = f"{name!r} has samples from {first:g} to {last:g} s, and others from {begin:g} to {end:g} s"
+            remedy = "Give all vehicles the same span of time, or say what it does before and after: `assess --spans "
+            raise _error(source, why, f"{remedy}stand` or `--spans away`")
         k = int(shares.argmax())
         if gaps == "refuse" and shares[k] > _LONGEST:
-            raise TrajectoryError(
-                f"{source}: {name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, "
-                f"{shares[k]:.0f} times its usual step. Give its samples, or let the curve bridge the gap: `assess "
-                "--gaps bridge`."
-            )
+            why = f"{name!r} has no sample between {curve.time[k]:g} and {curve.time[k + 1]:g} s, {shares[k]:.0f} times"
+            remedy = "Give its samples, or let the curve bridge the gap: `assess --gaps bridge`"
+            raise _error(source, f"{why} its usual step", remedy)
         holes += [(float(shares[k]), i, k) for k in np.flatnonzero(shares > _NOTED).tolist()]
         moves = np.linalg.norm(np.diff(curve.pieces[:, :3, 0], axis=0), axis=1)
         moving = np.flatnonzero(moves > 1e-9)
@@ -457,11 +445,9 @@ def _note_on_spans(read: Trajectories) -> list[str]:
     """A note if vehicles begin or end at different times."""
     starts, ends = np.array([curve.time[[0, -1]] for curve in read.curves]).T
     begin, end = starts.min(), ends.max()
-    part = [
-        f"{name!r} from {a:.9g} to {b:.9g} s"
-        for name, a, b in zip(read.names, starts, ends, strict=True)
-        if max(a - begin, end - b) > 1e-6
-    ]
+    every = zip(read.names, starts, ends, strict=True)
+    short = [each for each in every if max(each[1] - begin, end - each[2]) > 1e-6]
+    part = [f"{name!r} from {a:.9g} to {b:.9g} s" for name, a, b in short]
     if not part:
         return []
     if not read.away:

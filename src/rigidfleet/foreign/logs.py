@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from array import array
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -73,39 +74,37 @@ _GLOBAL = _Fields("geodetic", "lat lon alt", spread=_EPH)
 _GPS = _Fields("geodetic", "latitude_deg longitude_deg altitude_msl_m", spread=_EPH)
 _ODOMETRY = _Fields("ned", "position[0] position[1] position[2]")
 _ODOMETRY = _ODOMETRY._replace(spread=_ODOMETRY.place.replace("position", "position_variance"))
-_FRAMED = _Fields(
-    "ned", "x y z", spread="pose_covariance[0] pose_covariance[6] pose_covariance[11]"
-)
+_COVARIANCES = "pose_covariance[0] pose_covariance[6] pose_covariance[11]"
+_FRAMED = _Fields("ned", "x y z", spread=_COVARIANCES)
 _FILTER = _Fields("ned", "PN PE PD", "VN VE VD", "Yaw", _VARIANCES, (1.0, 1.0, 1.0, 1.0, _DEGREE))
 _POSE = _Fields("enu", "x y z", "vx vy vz", "yaw", "var_x var_y var_z")
-#: Messages with places, those that are preferred first; one has two forms.
-_MESSAGES = [
-    ("vehicle_local_position", _LOCAL), ("vehicle_odometry", _ODOMETRY), ("vehicle_odometry", _FRAMED),
-    ("vehicle_global_position", _GLOBAL),
-    *[(name, form) for name in ("vehicle_gps_position", "sensor_gps")
-      for form in (_GPS, _GLOBAL._replace(units=_INTEGERS))],
-    ("vehicle_mocap_odometry", _ODOMETRY), ("vehicle_visual_odometry", _ODOMETRY), ("estimator_odometry", _ODOMETRY),
-    ("estimator_local_position", _LOCAL), ("estimator_global_position", _GLOBAL),
-    ("vehicle_local_position_groundtruth", _LOCAL), ("vehicle_global_position_groundtruth", _GLOBAL),
-    ("LOCAL_POSITION_NED", _Fields("ned", "x y z", "vx vy vz")),
-    ("GLOBAL_POSITION_INT", _Fields("geodetic", "lat lon alt", "vx vy vz", "hdg", "", _INTEGERS)),
-    ("ODOMETRY", _FRAMED), ("ATT_POS_MOCAP", _Fields("ned", "x y z")),
-    ("GPS_RAW_INT", _Fields("geodetic", "lat lon alt", units=_INTEGERS)),
-    ("XKF1", _FILTER), ("NKF1", _FILTER), ("EKF1", _FILTER),
-    *[(name, _Fields("geodetic", "Lat Lng Alt")) for name in ("POS", "GPS", "SIM")],
-    *[(name, _POSE) for name in ("PoseStamped", "NamedPoseArray", "Odometry", "PoseWithCovarianceStamped",
-                                 "TransformStamped", "TFMessage")],
-    ("NavSatFix", _GLOBAL._replace(spread="")),
-]  # fmt: skip
-RANK = {name: k for k, (name, _) in enumerate(_MESSAGES)}
+#: What messages with places may have, those that are preferred first.
+FORMS: dict[str, list[_Fields]] = {name: forms for *forms, names in (
+    (_LOCAL, "vehicle_local_position"), (_ODOMETRY, _FRAMED, "vehicle_odometry"), (_GLOBAL, "vehicle_global_position"),
+    (_GPS, _GLOBAL._replace(units=_INTEGERS), "vehicle_gps_position sensor_gps"),
+    (_ODOMETRY, "vehicle_mocap_odometry vehicle_visual_odometry estimator_odometry"),
+    (_LOCAL, "estimator_local_position"), (_GLOBAL, "estimator_global_position"),
+    (_LOCAL, "vehicle_local_position_groundtruth"), (_GLOBAL, "vehicle_global_position_groundtruth"),
+    (_Fields("ned", "x y z", "vx vy vz"), "LOCAL_POSITION_NED"),
+    (_Fields("geodetic", "lat lon alt", "vx vy vz", "hdg", "", _INTEGERS), "GLOBAL_POSITION_INT"),
+    (_FRAMED, "ODOMETRY"), (_Fields("ned", "x y z"), "ATT_POS_MOCAP"),
+    (_Fields("geodetic", "lat lon alt", units=_INTEGERS), "GPS_RAW_INT"),
+    (_FILTER, "XKF1 NKF1 EKF1"), (_Fields("geodetic", "Lat Lng Alt"), "POS GPS SIM"),
+    (_POSE, "PoseStamped NamedPoseArray Odometry PoseWithCovarianceStamped TransformStamped TFMessage"),
+    (_GLOBAL._replace(spread=""), "NavSatFix"),
+) for name in names.split()}  # fmt: skip
 #: What else of logs of ArduPilot and MAVLink is read, by message, and fields by which a vehicle is armed.
 _BESIDE = {
     "ORGN": "Lat Lng Alt Type", "XKV1": _VARIANCES, "NKV1": _VARIANCES, "XKF4": "PI", "NKF4": "PI", "ARM": "ArmState",
-    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode", "BAD_DATA": "",
+    "GPS_GLOBAL_ORIGIN": "latitude longitude altitude", "HEARTBEAT": "base_mode autopilot", "BAD_DATA": "",
 }  # fmt: skip
-#: Fields that are not 0 where a place of PX4 is valid, and those that count how often its estimator set it anew.
-_VALID = {"xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"}
+#: What fields are at least where a place is valid (a fix of GNSS in three dimensions is 3), and those that count how
+#: often an estimator set it anew.
+_VALID = dict.fromkeys(("xy_valid", "z_valid", "lat_lon_valid", "alt_valid", "is_ned"), 1)
+_VALID |= {"fix_type": 3, "Status": 3}
 _RESETS = [f"{name}reset_counter" for name in ("xy_", "z_", "lat_lon_", "alt_", "")]
+#: What MAVLink writes for a heading that is not known [0.01 deg], and who is no autopilot.
+_UNKNOWN, _NO_AUTOPILOT = 65535, 8
 #: Frames of the Earth of MAVLink's `MAV_FRAME`: local ones that are turned anyhow are not read.
 _FRAMES = {1: "local_ned", 4: "local_enu"}
 
@@ -140,19 +139,17 @@ class Log(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read_log(path: Path) -> Log:
-    """The log of an autopilot, by its content.
+def read_log(path: Path, head: bytes) -> Log:
+    """The log of an autopilot, by how it begins.
 
     Raises
     ------
     ContentError
         A package is missing, or the log is damaged.
     """
-    with path.open("rb") as file:
-        head = file.read(8)
-    package, read = "pymavlink", _read_bin if head.startswith(BIN) else _read_tlog
-    if head.startswith(ULOG):
-        package, read = "pyulog", _read_ulog
+    readers = {ULOG: _read_ulog, BIN: _read_bin}
+    read = next((own for begin, own in readers.items() if head.startswith(begin)), _read_tlog)
+    package = "pyulog" if read is _read_ulog else "pymavlink"
     if find_spec(package) is None:
         raise fault(f"needs the package {package!r}", "Run: pip install rigidfleet[logs]")
     complaints = _Complaints()
@@ -190,25 +187,36 @@ def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
         words = f" {' or '.join(topics)}" if topics else ""
         every = ", ".join(sorted(c.topic for c in channels)[:20]) or "none"
         raise fault(f"has no topic{words} with positions", f"Topics with positions are: {every}")
-    return sorted(chosen, key=lambda c: RANK[c.message])
+    return sorted(chosen, key=lambda c: [*FORMS].index(c.message))
+
+
+def natural_key(name: object) -> list[tuple[int, str]]:
+    """Names in the order of the numbers in them: 2 before 10."""
+    parts = re.split(r"(\d+)", str(name))
+    return [(int(x), "") if x.isdecimal() and len(x) < 19 else (-1, x) for x in parts]
 
 
 def trajectories_of(
-    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None
-) -> Trajectories:
-    """Curves through the places of a log, in east, north, up about an origin.
+    log: Log, stem: str, interpolation: str, topics: Sequence[str], origin: Geodetic | None, several: bool
+) -> Trajectories:  # fmt: skip
+    """Curves through the places of a log, in east, north, up about an origin; vehicles in the order of their names.
 
-    Without one, places are about the origin of the first vehicle's estimator, or its first place.
+    Without one, places are about the origin of the first vehicle's estimator, or its first place. Of ``several``
+    vehicles, places about an origin that the log does not tell come last: those of two have nothing in common.
 
     Raises
     ------
     ContentError
         A vehicle has no valid position.
     """
-    tracks, notes = {}, {note: [""] for note in log.notes}
-    for who, channels in log.vehicles.items():
+    tracks: dict[str, _Track] = {}
+    notes = {note: [""] for note in log.notes}
+    several |= len(log.vehicles) > 1
+    for who in sorted(log.vehicles, key=natural_key):
         reasons: list[str] = []
-        for channel in choose(channels, topics):
+        channels = choose(log.vehicles[who], topics)
+        unlike = lambda c: several and FORMS[c.message][0].frame == "ned" and c.reference is None  # noqa: E731
+        for channel in sorted(channels, key=unlike):
             try:
                 track = _track_of(channel, origin)
                 break
@@ -222,38 +230,34 @@ def trajectories_of(
         for note in (*[words] * (who != channel.topic), *reasons[:1], *track.notes):
             notes.setdefault(note, []).append(who)
         tracks[who or stem], origin = track, origin or track.origin
-    first = min(int(track.time[0]) for track in tracks.values())
+    every = tracks.values()
+    first, last = min(int(x.time[0]) for x in every), max(int(x.time[-1]) for x in every)
     zero = first if first > _DATES else 0
-    curves, measured = [], []
-    for track in tracks.values():
-        time = (track.time - first) / 1e9 + (first - zero) / 1e9  # whole numbers lose none
-        where = lambda k, topic=track.topic: f"{topic}: message {k + 1}"  # noqa: E731
-        curves.append(curve_through_samples(time, track.place, track.yaw, interpolation, where))
-        size = len(curves[-1].time), 3  # a single sample stays for a second
-        both = track.velocity, track.deviation
-        each = (None if x is None else np.resize(x, size) for x in both)
-        measured.append(LoggedStates(*each, track.resets))
+    seconds = lambda time: (time - first) / 1e9 + (first - zero) / 1e9  # noqa: E731  # whole numbers lose none
+    samples = [(seconds(x.time), x.place, x.yaw) for x in every]
+    curves = [curve_through_samples(*own, interpolation, str) for own in samples]
     if not topics and all(who == track.topic for who, track in tracks.items()):
         _refuse_twins([*tracks], curves)
-    frames = [*dict.fromkeys(track.frame for track in tracks.values())]
+    frames = [*dict.fromkeys(track.frame for track in every)]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
         notes[f"positions are in frames {words}: where one is in another is not known"] = [""]
     record: dict[str, Any] = {
-        "topics": [*dict.fromkeys(track.topic for track in tracks.values())][:20], "frame": frames[0],
+        "topics": [*dict.fromkeys(track.topic for track in every)][:20], "frame": frames[0],
         "clock": log.clock or "the vehicle's own, from its start", "since_1970_ns": zero or None,
-        "rows": sum(len(track.time) for track in tracks.values()),
+        "rows": sum(len(track.time) for track in every),
     }  # fmt: skip
-    if any(track.origin for track in tracks.values()):
+    if any(track.origin for track in every):
         record["origin"] = list(origin or ())
     if log.armed is not None:
         time, on = log.armed
         k = np.flatnonzero(np.diff(np.concatenate([[0], on != 0, [0]])))
-        spans = (np.append(time, time[-1:])[k].reshape(-1, 2) - zero) / 1e9
+        spans = seconds(np.append(time, max([last, *time[-1:]]))[k].reshape(-1, 2))
         record["armed"] = [f"{a:.6g} to {b:.6g} s" for a, b in spans[:_LISTED]] or "never"
-    lines = tuple(of_all(notes))
-    read = Trajectories(tuple(tracks), tuple(curves), ASSUMED[interpolation], lines, (record,))
-    return read._replace(measured=tuple(measured), own_clocks=not log.clock)
+    return Trajectories(
+        tuple(tracks), tuple(curves), ASSUMED[interpolation], tuple(of_all(notes)), (record,),
+        measured=tuple(track.measured for track in every), own_clocks=not log.clock,
+    )  # fmt: skip
 
 
 def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
@@ -282,18 +286,16 @@ def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
 
 
 class _Track(NamedTuple):
-    """Times (K,) [ns], places, velocities, deviations (K, 3) in east, north, up, yaws (K,), and resets of a vehicle."""
+    """Times (K,) [ns], places (K, 3) in east, north, up, and yaws (K,) of a vehicle, and what its log says beside."""
 
     topic: str
     frame: str
     time: Ints
     place: Floats
-    velocity: Floats | None
-    deviation: Floats | None
     yaw: Floats | None
+    measured: LoggedStates
     origin: Geodetic | None
     notes: list[str]
-    resets: Ints
 
 
 def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
@@ -305,7 +307,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         It has no valid one.
     """
     columns, notes, reference = channel.columns, [], channel.reference
-    forms = [form for name, form in _MESSAGES if name == channel.message]
+    forms = FORMS[channel.message]
     form = next((f for f in forms if {*f.place.split()} <= columns.keys()), None)
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
@@ -313,15 +315,12 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     place = _fields(columns, form.place) * form.units[:3]
     known = np.isfinite(place).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
-    for name in _VALID & columns.keys():
-        known &= columns[name] != 0
+    for name in _VALID.keys() & columns.keys():
+        known &= columns[name] >= _VALID[name]
     if not known.any():
-        turned = "is_ned" in columns and not columns["is_ned"].any()
-        why = (
-            "positions are in a frame that is turned anyhow to north"
-            if turned
-            else "no position is valid"
-        )
+        why = "no position is valid"
+        if not columns.get("is_ned", known | True).any():
+            why = "positions are in a frame that is turned anyhow to north"
         raise fault(f"{channel.topic}: {why}")
     if not known.all():
         notes.append(f"{np.sum(~known):,} samples without a valid position are left out")
@@ -350,19 +349,19 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     for name in {*form.yaw.split()} & own.keys():
         yaw = own[name].astype(np.float64) * form.units[4]
         yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
+        yaw = yaw if np.isfinite(yaw).all() and (own[name] != _UNKNOWN).all() else None
     resets = _resets(own, time / 1e9, place, velocity)
     if len(resets):
         far = np.linalg.norm(place[resets] - place[resets - 1], axis=1)
-        when = (time[resets] - time[0]) / 1e9
-        words = ", ".join(
-            f"{x:.3g} m at {t:.6g} s" for x, t in zip(far[:_LISTED], when, strict=False)
-        )
+        steps = zip(far[:_LISTED], (time[resets] - time[0]) / 1e9, strict=False)
+        words = ", ".join(f"{x:.3g} m at {t:.6g} s" for x, t in steps)
         words += f" from its first sample ({len(resets):,} times in all): no vehicle flew that"
         notes.append(f"the estimator moves its position by {words}")
     origin, frame = reference and (origin or reference), f"{frame} {channel.frame}".strip()
-    return _Track(
-        channel.topic, frame, time, place, velocity, deviation, yaw, origin, notes, resets
-    )
+    count = max(len(time), 2), 3  # a single sample stays for a second
+    beside = (None if x is None else np.resize(x, count) for x in (velocity, deviation))
+    states = LoggedStates(*beside, resets)
+    return _Track(channel.topic, frame, time, place, yaw, states, origin, notes)
 
 
 def _fields(columns: dict[str, Any], names: str) -> Floats:
@@ -412,19 +411,18 @@ def _read_ulog(path: Path) -> Log:
     from pyulog import ULog
 
     with path.open("rb") as file:
-        log = ULog(file, ["actuator_armed", *RANK])
+        log = ULog(file, ["actuator_armed", *FORMS])
     channels, armed, after = [], None, 0
     dated = 1000 * log.start_timestamp > _DATES
     for data in (x.data for x in log.data_list if "time_utc_usec" in x.data and not dated):
         if (known := data["time_utc_usec"] > 0).any():
             late = data["time_utc_usec"].astype(np.int64) - data["timestamp"].astype(np.int64)
             after = int(np.median((late - data.get("timestamp_time_relative", 0))[known]))
-    for name, number, data in ((x.name, x.multi_id, x.data) for x in log.data_list):
-        channel = channel_of_px4(f"{name}:{number}" if number else name, name, data, after)
-        if name == "actuator_armed":
-            armed = data["time"], data["armed"]
-        else:
-            channels.append(channel)
+    for x in log.data_list:
+        topic = f"{x.name}:{x.multi_id}" if x.multi_id else x.name
+        channels.append(channel_of_px4(topic, x.name, x.data, after))
+        if x.name == "actuator_armed":
+            armed = channels.pop().columns["time"], x.data["armed"]
     notes = [DAMAGED] * log.file_corruption
     if lost := [x.duration / 1e3 for x in log.dropouts]:
         words = f"{sum(lost):.3g} s in all, at most {max(lost):.3g} s"
@@ -444,24 +442,24 @@ def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) 
     return Channel(topic, name, data, "", _place_of(data, "ref_lat ref_lon ref_alt"))
 
 
-def _collect(log: Any) -> dict[tuple[str, str, int], dict[str, Any]]:
-    """Columns of the messages of a log that matter, by system, message and lane of the estimator.
+def _collect(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
+    """Columns of the messages of a log that matter, by system, message and lane: a core, or a component of a system.
 
     ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log.
     """
     names = {name: own.split() for name, own in _BESIDE.items()}
-    for name, form in _MESSAGES:
-        every = f"{form.place} {form.velocity} {form.yaw} {form.spread}"
-        names[name] = [*every.split(), "frame_id", *_RESETS]
-    rows: dict[tuple[str, str, int], array[float]] = defaultdict(lambda: array("d"))
+    for name, ((_, *own, _), *_) in FORMS.items():
+        names[name] = [*" ".join(own).split(), "frame_id", *_RESETS, *_VALID]
+    rows: dict[tuple[int, str, int], array[float]] = defaultdict(lambda: array("d"))
     while (message := log.recv_match(type=[*names])) is not None:
         kind, received = message.get_type(), message._timestamp
-        who = f"{message.get_srcSystem()}" if hasattr(message, "get_srcSystem") else ""
-        lane = 0 if kind in _BESIDE else getattr(message, "C", getattr(message, "I", 0))
+        who, lane = 0, getattr(message, "C", getattr(message, "I", 0))
+        if hasattr(message, "get_srcSystem"):
+            who, lane = message.get_srcSystem(), message.get_srcComponent()
         stamp = getattr(message, "time_usec", 0.0) / 1e6 or received
         stamp = getattr(message, "time_boot_ms", 1e3 * stamp) / 1e3
         own = (_number_of(message, *name.split("[")) for name in names[kind])
-        rows[who, kind, lane].extend((stamp, received, *own))
+        rows[who, kind, 0 if kind in _BESIDE else lane].extend((stamp, received, *own))
     table = {}
     for key, numbers in rows.items():
         own = np.frombuffer(numbers).reshape(-1, 2 + len(names[key[1]])).T
@@ -503,8 +501,8 @@ def _read_bin(path: Path) -> Log:
         del columns["received"]
         main = lane == (int(np.median(own["PI"])) if own and kind[1:] == "KF1" else 0)
         if main and kind[1:] == "KF1" and (own := beside.get(f"{kind[0]}KV1")):
-            for name in _VARIANCES.split():
-                columns[name] = np.interp(columns["time"], own["time"], own[name])
+            at = columns["time"], own["time"]
+            columns |= {name: np.interp(*at, own[name]) for name in _VARIANCES.split()}
         made = Channel(f"{kind}:{lane}" if lane else kind, kind, columns, "", place)
         channels.insert(0 if main else len(channels), made)
     armed = (own["time"], own["ArmState"]) if (own := beside.get("ARM")) else None
@@ -516,20 +514,24 @@ def _read_tlog(path: Path) -> Log:
 
     with closing(mavlogfile(str(path))) as log:
         table = _collect(log)
-    vehicles: dict[str, list[Channel]] = defaultdict(list)
-    for (who, kind, _), columns in table.items():
+    vehicles: dict[int, list[Channel]] = defaultdict(list)
+    for (who, kind, lane), columns in sorted(table.items(), key=lambda each: each[0][2]):
         if kind not in _BESIDE:
             own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
             place, frame = _place_of(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
             if "frame_id" in columns:
                 frame = _FRAMES.get(int(columns["frame_id"][0]), "")
                 columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)
-            vehicles[f"system {who}"].append(Channel(kind, kind, columns, frame, place))
+            # An autopilot has the least number of those who tell of a system: a camera or a computer may, too.
+            first = all(kind != other.message for other in vehicles[who])
+            name = kind if first else f"{kind}:{lane}"
+            vehicles[who].append(Channel(name, kind, columns, frame, place))
     armed, notes = None, (DAMAGED,) if any(kind == "BAD_DATA" for _, kind, _ in table) else ()
-    if len(vehicles) == 1:
-        ((who, channels),) = vehicles.items()
-        if own := table.get((who.removeprefix("system "), "HEARTBEAT", 0)):
-            armed = own["received"], own["base_mode"].astype(int) & 128
-        vehicles = {"": channels}
-    clock = "that of who wrote the log, less the shortest delay"
-    return Log(vehicles or {"": []}, clock, armed, notes)
+    named = {f"system {who}": channels for who, channels in vehicles.items()}
+    if len(vehicles) < 2:
+        ((who, channels),) = vehicles.items() or [(0, [])]
+        if own := table.get((who, "HEARTBEAT", 0)):
+            flies = own["autopilot"] != _NO_AUTOPILOT
+            armed = own["received"][flies], own["base_mode"][flies].astype(int) & 128
+        named = {"": channels}
+    return Log(named, "that of who wrote the log, less the shortest delay", armed, notes)

@@ -14,10 +14,12 @@ import re
 import sqlite3
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from functools import lru_cache
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -26,10 +28,13 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import DAMAGED, RANK, Channel, Log, channel_of_px4, choose
+from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4, choose
 
-MCAP, SQLITE = b"\x89MCAP0\r\n", b"SQLite format 3\0"
+#: How recordings begin, and what Zstandard packed.
+MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
 _BILLION = 1_000_000_000
+#: Frames of REP 105 in which robots move; that of odometry moves in the map itself.
+_FRAMES = {"map", "odom"}
 #: Greatest size of a chunk of a recording when it is unpacked, and of a message [bytes].
 _CHUNK, _MESSAGE = 32 << 20, 1 << 20
 #: What no position [m] or quaternion reaches.
@@ -42,6 +47,8 @@ _NUMBERS = {
 }  # fmt: skip
 
 
+#: Topic and body, how their `_Rows` begin, stamp and time of recording [ns], and numbers of a position.
+_Place = tuple[str, Any, int, int, Sequence[float]]
 #: What is no log of places, and what to give instead.
 _PATH = "is a path that is planned, not a log: give poses, odometry or transforms of what flew"
 _UNDEFINED = (
@@ -77,20 +84,12 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     unread: dict[str, str] = {}
     notes: list[str] = []
     try:
-        for topic, kind, definition, data, received in (
-            each for path in paths for each in _messages(path, unread)
-        ):
-            layout = _layout(definition, data[1:2] == b"\1") if definition else None
-            try:
-                for who, frame, stamp, numbers in _decode(kind, layout, data):
-                    new = _Rows(kind, layout, frame, array("q"), array("q"), array("d"))
-                    own = rows.setdefault(f"{topic}{who}", new)
-                    own.stamps.append(stamp)
-                    own.received.append(received)
-                    own.numbers.extend(numbers)
-            except struct.error:
-                where = f"{topic}: message {len(rows[topic].stamps) + 1 if topic in rows else 1}"
-                raise fault(f"{where}: is cut off", "Record again") from None
+        for each in chain.from_iterable(_places(path, unread) for path in paths):
+            topic, first, stamp, received, numbers = each
+            own = rows.setdefault(topic, _Rows(*first, array("q"), array("q"), array("d")))
+            own.stamps.append(stamp)
+            own.received.append(received)
+            own.numbers.extend(numbers)
     except ContentError:
         raise
     except ImportError as error:
@@ -111,10 +110,11 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         chosen = [c for c in chosen if c not in undated]
     if not topics:
         chosen = [c for c in chosen if c.message == chosen[0].message]
-        parts = {c.topic.rpartition(":")[2] for c in chosen if c.message == "TFMessage"}
-        chosen = [c for c in chosen if c.frame not in parts]  # what moves in a body is a part of it
-        others = sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]
-        if others:
+        bodies = {c.topic.partition(":")[2] for c in chosen if c.message == "TFMessage"} - _FRAMES
+        # What moves in a body is a part of it, and what a robot moves in is no robot.
+        moving = [c for c in chosen if c.topic.partition(":")[2] not in _FRAMES]
+        chosen = [c for c in moving or chosen if c.frame not in bodies]
+        if others := sorted({c.topic for c in channels} - {c.topic for c in chosen})[:5]:
             notes.append(f"topics that are not read: {', '.join(others)}; --topic may name them")
     clock = "that of the stamps in messages"
     if any("received" in c.columns for c in chosen):
@@ -123,11 +123,17 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
     return Log({c.topic: [c] for c in chosen}, clock, None, tuple(notes))
 
 
-def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, str, bytes, int]]:
-    """Topic, kind, definition ("" but of PX4's), content and time of recording [ns] of each message with positions.
+def _places(path: Path, unread: dict[str, str]) -> Iterator[_Place]:
+    """Each position in a file.
 
     Topics that seem to have some and cannot be read get a reason in ``unread``.
+
+    Raises
+    ------
+    ContentError
+        A message is encoded in another way, or cut off.
     """
+    count: Counter[str] = Counter()
     with path.open("rb") as stream:
         records = _records_of_sqlite if stream.read(16) == SQLITE else _records_of_mcap
     for topic, name, code, definition, data, received in records(path):
@@ -137,12 +143,23 @@ def _messages(path: Path, unread: dict[str, str]) -> Iterator[tuple[str, str, st
             kind = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind).lower()  # as PX4's logs name it
         if name == "nav_msgs/msg/Path":
             unread[topic] = _PATH
-        elif own and kind in RANK and not definition:
+        elif own and kind in FORMS and not definition:
             unread[topic] = _UNDEFINED
-        elif kind in (RANK if own else _NUMBERS) and topic != "/tf_static":
+        elif kind in (FORMS if own else _NUMBERS) and topic != "/tf_static":
             if code != "cdr":
                 raise fault(f"{topic}: is encoded as {code!r}, not as CDR")
-            yield topic, kind, definition if own else "", data, received
+            if data.startswith(ZSTANDARD):  # recorded with --compression-mode message
+                from zstandard import ZstdDecompressor
+
+                data = ZstdDecompressor().decompress(data, _MESSAGE)  # noqa: PLW2901
+            layout = _layout(definition, data[1:2] == b"\1") if own else None
+            count[topic] += 1
+            try:
+                for who, frame, stamp, numbers in _decode(kind, layout, data):
+                    yield f"{topic}{who}", (kind, layout, frame), stamp, received, numbers
+            except struct.error:
+                where = f"{topic}: message {count[topic]}"
+                raise fault(f"{where}: is cut off", "Record again") from None
 
 
 def _records_of_sqlite(path: Path) -> Iterator[tuple[str, str, str, str, bytes, int]]:

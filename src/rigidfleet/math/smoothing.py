@@ -175,9 +175,8 @@ def smooth(
         quadratic = max(quadratic - float((points * of).sum()), 1e-12 * squares)
         of_points = 2.0 * float(np.log(factor[0]).sum()) + whole * log_variance
         variance = quadratic / numbers if free else 1.0
-        return whitening + numbers * np.log(
-            variance
-        ) + quadratic / variance + 3.0 * of_points, variance
+        of_samples = whitening + numbers * np.log(variance) + quadratic / variance
+        return of_samples + 3.0 * of_points, variance
 
     zero = 0.0 if free else 2.0 * np.log(noise.sigma)  # in units of the noise, where it is known
     bounds = _SMALLEST + zero, _LARGEST + zero
@@ -186,9 +185,8 @@ def smooth(
     third = np.diff(about, 3, axis=0)
     value = value - matrix @ about
     squares, right = float((value**2).sum()), matrix.T @ value
-    best = minimize_scalar(
-        lambda x: evaluate(x)[0], bounds=bounds, method="bounded", options={"xatol": _CLOSE}
-    )
+    near = {"xatol": _CLOSE}
+    best = minimize_scalar(lambda x: evaluate(x)[0], bounds=bounds, method="bounded", options=near)
     deviance, variance = evaluate(best.x)
     weight = calm * np.exp(-best.x)
     random = np.random.default_rng(0)
@@ -226,17 +224,19 @@ class NoiseEstimate(NamedTuple):
 def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) -> NoiseEstimate:
     """The noise of some vehicles alike: of a stated standard deviation [m], or else of one that they show themselves.
 
-    The correlation time is the likeliest. Without a stated size it must stand out from white noise, and from noise so
-    slow that it cannot be told from motion; and what remains must be white.
+    Knots are a ``step`` [s] apart, or as rare as samples. The correlation time is the likeliest. Without a stated size
+    it must stand out from white noise, and from noise so slow that it cannot be told from motion; and what remains must
+    be white.
     """
     some = []
     for own in sorted(vehicles, key=lambda own: -len(own.time))[:_SOME]:
         first = max(0, (len(own.time) - _ENOUGH) // 2)  # the middle of the samples
         some.append(Positions(*(x[first : first + _ENOUGH] for x in own)))
-    knots = [knots_over(own.time, 0.0, step) for own in some]
-    usual = float(np.median([np.median(np.diff(own.time)) for own in some]))
+    steps = [float(np.median(np.diff(own.time))) for own in some]
+    both = zip(some, steps, strict=True)
+    knots = [knots_over(own.time, 0.0, max(step, each)) for own, each in both]
+    usual = float(np.median(steps))
     size = np.nan if sigma is None else sigma
-
     calm = [smooth(own, PositionNoise(size), k).calm for own, k in zip(some, knots, strict=True)]
 
     def fit(tau: float) -> tuple[float, list[Smoothed]]:
@@ -260,18 +260,11 @@ def noise_of(vehicles: Sequence[Positions], sigma: float | None, step: float) ->
         every = fit(tau)[1]
     size = float(np.median([each.noise.sigma for each in every]))
     residual = np.concatenate([each.residual for each in every])
-    lags = [
-        float((residual[j:] * residual[:-j]).mean() / residual.var()) for j in range(1, _LAGS + 1)
-    ]
-    white = max(map(abs, lags)) < _WHITE + 3.0 / np.sqrt(residual.size)
+    lags = [abs((residual[j:] * residual[:-j]).mean()) for j in range(1, _LAGS + 1)]
+    white = max(lags) / residual.var() < _WHITE + 3.0 / np.sqrt(residual.size)
     clear = k == 0 or (tau < _SHOWN and min(deviances[-1], deviances[0]) > deviances[k] + _CLEAR)
-    known = PositionNoise(size, tau)
     if sigma is None and not (white and clear):
-        return NoiseEstimate(
-            None,
-            "data",
-            "what remains of the samples is not white, nor noise of one correlation time",
-        )
-    return NoiseEstimate(
-        known, "data" if sigma is None else "stated", "" if white else "what remains is not white"
-    )
+        words = "what remains of the samples is not white, nor noise of one correlation time"
+        return NoiseEstimate(None, "data", words)
+    words = "" if white else "what remains is not white"
+    return NoiseEstimate(PositionNoise(size, tau), "data" if sigma is None else "stated", words)

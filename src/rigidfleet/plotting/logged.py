@@ -60,10 +60,13 @@ class OffPlan(NamedTuple):
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
         for i, off in enumerate(self.off.T):
-            for a, b in _spans(runs(off), time):
-                k = a + int(np.nanargmax(self.far[a:b, i]))
-                ends = float(time[a]), float(time[b - 1])
-                drifts.append(Drift(i, *ends, float(self.far[k, i]), float(time[k])))
+            k = np.flatnonzero(off)
+            again = (np.diff(k) > 1) & (np.diff(time[k]) >= _SOON)
+            for part in np.split(k, np.flatnonzero(again) + 1)[: len(k)]:
+                a, b = part[[0, -1]]
+                worst = a + np.nanargmax(self.far[a : b + 1, i])
+                numbers = time[a], time[b], self.far[worst, i], time[worst]
+                drifts.append(Drift(i, *map(float, numbers)))
         return drifts
 
 
@@ -71,15 +74,6 @@ def runs(mask: Bools) -> list[tuple[int, int]]:
     """Where a mask (K,) is true: the first sample of each run, and the one after its last."""
     ends = np.flatnonzero(np.diff(np.pad(mask, 1).astype(int))).tolist()
     return list(pairwise(ends))[::2]
-
-
-def _spans(spans: list[tuple[int, int]], time: Floats) -> list[tuple[int, int]]:
-    """Runs of samples, those that follow soon after another joined to it."""
-    joined: list[tuple[int, int]] = []
-    for a, b in spans:
-        soon = joined and time[a] - time[joined[-1][1] - 1] < _SOON
-        joined.append((joined.pop()[0], b) if soon else (a, b))
-    return joined
 
 
 def off_plan(result: Result) -> OffPlan | None:

@@ -54,9 +54,8 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
                 st.draw_line(ax, flight.time, values, **look)
                 known |= bool(np.isfinite(values).any())
             q, logarithmic = QUANTITIES[name], name in ("tracking_error", "constraint")
-            ax.set_title(
-                f"{'least' if q.at_least else 'greatest'} {q.name_in_words} [{display_unit(q.unit)}]"
-            )
+            worst = "least" if q.at_least else "greatest"
+            ax.set_title(f"{worst} {q.name_in_words} [{display_unit(q.unit)}]")
             if not known:
                 st.write_note(ax, "nothing to show")
             elif logarithmic:
@@ -102,10 +101,8 @@ def _looks(flights: Sequence[object]) -> list[dict[str, Any]]:
 
 
 def _key(fig: Figure, flights: Sequence[object], labels: Sequence[str]) -> None:
-    handles = [
-        st.legend_entry(st.clean_name(label), **look)
-        for label, look in zip(labels, _looks(flights), strict=True)
-    ]
+    looks = zip(labels, _looks(flights), strict=True)
+    handles = [st.legend_entry(st.clean_name(label), **look) for label, look in looks]
     fig.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 4))
 
 

@@ -19,17 +19,9 @@ from rigidfleet.assessment.doubt import DrawnWays, facts_of, verdict_with_doubt
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
+from rigidfleet.math import smoothing
 from rigidfleet.math.piecewise import Piecewise, join
-from rigidfleet.math.smoothing import (
-    NoiseEstimate,
-    PositionNoise,
-    Positions,
-    Smoothed,
-    knots_over,
-    noise_of,
-    smooth,
-    spline,
-)
+from rigidfleet.math.smoothing import NoiseEstimate, PositionNoise, Positions, Smoothed
 from rigidfleet.result import Extremum, Result
 from rigidfleet.setpoints import ways_of
 from rigidfleet.simulation.extremes import CurveWatch
@@ -91,9 +83,8 @@ def judge_log(
         raise TrajectoryError(f"the plan {plan.mission.name!r} {words}. Give the log of each.")
     if read.own_clocks:
         if plan is None:
-            raise TrajectoryError(
-                "each vehicle has a clock of its own. Give a plan to compare them with."
-            )
+            words = "each vehicle has a clock of its own. Give a plan to compare them with."
+            raise TrajectoryError(words)
         doubts = doubts._replace(clock="own")
     flown, drawn, estimate, alignment = _likely_flight(read, plan, doubts, judged)
     deviations = None if drawn is None else DrawnWays(flown, drawn)
@@ -111,40 +102,39 @@ def _likely_flight(
     sizes = [x.deviation for x in read.measured if x.deviation is not None]
     known = len(sizes) == len(logs) and all((x > 0.0).all() for x in sizes)
     if doubts.noise == "log" and not known:
-        raise TrajectoryError(
-            f"{read.names[0]}: the log does not say its noise. State it: --noise."
-        )
+        words = "the log does not say its noise. State it: --noise."
+        raise TrajectoryError(f"{read.names[0]}: {words}")
     if doubts.noise in ("log", "") and known:
         # The least of a log is the unit.
         least = float(min(x.min() for x in sizes))
         doubts = doubts._replace(noise=least)
         scales = (np.sqrt((x**2).mean(axis=1)) / least for x in sizes)
         logs = [log._replace(scale=scale) for log, scale in zip(logs, scales, strict=True)]
-    step = max(_STEP, *(float(np.median(np.diff(log.time))) for log in logs))
-    estimate = _noise_of_logs(logs, doubts, step)
+    estimate = _noise_of_logs(logs, doubts)
     noise = estimate.noise or PositionNoise(math.nan)
     planned = None if plan is None else _planned_ways(plan)
-    alignment, smoothed, late = None, _smooth_all(logs, noise, step), np.zeros(1)
+    alignment, smoothed, late = None, _smooth_all(logs, noise), np.zeros(1)
     if planned is not None:
-        alignment = _alignment(smoothed, logs, planned, doubts.clock)
+        plans = planned.pieces[:, :, :3].swapaxes(0, 1)
+        times = [np.arange(log.time[0], log.time[-1], _ALIGNED) for log in logs]
+        places = [(t, own.way.at(t)) for t, own in zip(times, smoothed, strict=True)]
+        alignment = align(places, [Piecewise(planned.time, x) for x in plans], doubts.clock)
         offsets, late = _offsets(alignment, doubts.clock)
         every = np.broadcast_to(offsets, len(logs))
         logs = [log._replace(time=log.time - by) for log, by in zip(logs, every, strict=True)]
         if offsets.any():
-            smoothed = _smooth_all(logs, noise, step)
+            smoothed = _smooth_all(logs, noise)
     # Beside a plan, a sample counts a usual step beyond it, by part of which clocks may be off.
     ends = np.array([log.time[[0, -1]] for log in logs])
     if planned is not None:
         ends += np.array([[-1.0, 1.0]]) * [[np.median(np.diff(log.time))] for log in logs]
-    whole = join(
-        [each.way.between(*end) for each, end in zip(smoothed, ends.tolist(), strict=True)]
-    )
+    each = zip(smoothed, ends.tolist(), strict=True)
+    whole = join([own.way.between(*end) for own, end in each])
     spans = ends.tolist() if read.away and np.ptp(ends, axis=0).any() else []
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
-        flown = of_curve(
-            whole.beside(blank), WORDS, names=read.names, spans=spans, since=read.since, **judged
-        )
+        judged |= {"names": read.names, "spans": spans, "since": read.since}
+        flown = of_curve(whole.beside(blank), WORDS, **judged)
     else:
         flown = flight_of_plan(plan, planned, whole, spans)
     del whole, planned  # large
@@ -158,7 +148,7 @@ def _likely_flight(
         return flown, None, estimate, alignment
     # Noise of a known size and an unknown course may be any of several; each gives ways of its own.
     unknown = _COURSES if estimate.words and estimate.source == "stated" else ()
-    models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau), step) for tau in unknown)]
+    models = [smoothed, *(_smooth_all(logs, noise._replace(tau=tau)) for tau in unknown)]
     drawn = _deviations(flown, models, late)
     if plan is not None:
         few = slice(None, None, -(-len(flown.time) // _BANDS))
@@ -167,22 +157,29 @@ def _likely_flight(
     return flown, drawn, estimate, alignment
 
 
-def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts, step: float) -> NoiseEstimate:
+def _noise_of_logs(logs: Sequence[Positions], doubts: Doubts) -> NoiseEstimate:
     """The noise as it is stated, unless samples show more; or as they show it."""
     size, tau = doubts.noise, doubts.tau
     if not isinstance(size, str) and tau is not None:
         return NoiseEstimate(PositionNoise(size, tau), "stated", "")
-    shown = noise_of(logs, None, step)
+    shown = smoothing.noise_of(logs, None, _STEP)
     if isinstance(size, str):
         return shown
     if shown.noise is None or shown.noise.sigma <= _MORE * size:
-        return noise_of(logs, size, step)
+        return smoothing.noise_of(logs, size, _STEP)
     words = f"that is more than the {1e3 * size:.3g} mm stated"
     return shown._replace(words=words)
 
 
-def _smooth_all(logs: Sequence[Positions], noise: PositionNoise, step: float) -> list[Smoothed]:
-    return [smooth(log, noise, knots_over(log.time, 0.0, step)) for log in logs]
+def _smooth_all(logs: Sequence[Positions], noise: PositionNoise) -> list[Smoothed]:
+    """Likely ways, on knots as rare as each one's samples; rare knots are at some of the others', whatever the rate."""
+    usual = np.array([max(_STEP, np.median(np.diff(log.time))) for log in logs])
+    steps = usual.min() * 2.0 ** np.floor(np.log2(usual / usual.min()))
+    both = zip(logs, steps.tolist(), strict=True)
+    return [
+        smoothing.smooth(log, noise, smoothing.knots_over(log.time, 0.0, step))
+        for log, step in both
+    ]
 
 
 def _planned_ways(plan: Result) -> Piecewise:
@@ -192,17 +189,6 @@ def _planned_ways(plan: Result) -> Piecewise:
     state[:, 2:] = np.nan_to_num(state[:, 2:])  # of straight lines
     still = np.zeros_like(slots.yaw)
     return ways_of(slots._replace(state=state, yaw=still, yaw_rate=still), slice(None))
-
-
-def _alignment(
-    smoothed: Sequence[Smoothed], logs: Sequence[Positions], planned: Piecewise, clock: Clock
-) -> Alignment:
-    alone = [Piecewise(planned.time, pieces) for pieces in planned.pieces[:, :, :3].swapaxes(0, 1)]
-    places = []
-    for each, log in zip(smoothed, logs, strict=True):
-        t = np.arange(log.time[0], log.time[-1], _ALIGNED)
-        places.append((t, each.way.at(t)))
-    return align(places, alone, clock)
 
 
 def _offsets(alignment: Alignment, clock: Clock) -> Floats:
@@ -218,9 +204,8 @@ def _offsets(alignment: Alignment, clock: Clock) -> Floats:
         return np.zeros((2, 1))
     offsets = np.where(np.isnan(alignment.own), every, alignment.own) if clock == "own" else every
     if np.isnan(offsets).any():
-        raise TrajectoryError(
-            "the clock cannot be told: the plan hardly moves. Give logs of one clock, with --clock recorded."
-        )
+        why = "the clock cannot be told: the plan hardly moves"
+        raise TrajectoryError(f"{why}. Give logs of one clock, with --clock recorded.")
     return offsets
 
 
@@ -234,7 +219,7 @@ def _deviations(flown: Result, models: Sequence[Sequence[Smoothed]], late: Float
         inside = flown.left[:, i]
         drawn = [model[i].draw(share, random) for model, share in zip(models, shares, strict=True)]
         points = np.concatenate(drawn, axis=2) - likely.points[..., None]
-        states = spline(likely.knots, points).states(time[inside], 3)
+        states = smoothing.spline(likely.knots, points).states(time[inside], 3)
         off[:, :, inside, i] = np.moveaxis(states, -1, 0)
     rates = np.stack([flown.velocity, np.nan_to_num(flown.acceleration)])
     for s, by in enumerate(late * random.standard_normal((count, len(late)))):
