@@ -83,7 +83,8 @@ def random_mission(seed: int, *, rotors: bool = False) -> tuple[Mission, int]:
 def flown_apart(seed: int, *, rotors: bool = False) -> float:
     """How much farther than promised the vehicles of a random mission stay apart in flight, after an abort [m].
 
-    Infinite where no way is promised, since the plan itself leads two within the limit of separation, as flown.
+    Infinite where no way is promised, since the plan itself leads two within the limit of separation, as flown, or one
+    would come too near to where the lost one falls. Who goes home hits no lost one.
     """
     mission, lost = random_mission(seed, rotors=rotors)
     begins, at = mission.abandons_at, mission.aborting.at
@@ -100,9 +101,13 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
         assert result.complete
         assert since == 0.0 or result.time[-1] == pytest.approx(abort.end, abs=1e-6)
         r = result.position[result.time >= since]
+        if gone.any() and since > 0.0:
+            assert np.linalg.norm(r[:, left] - r[:, [lost]], axis=2).min() > 0.3
         return float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 0.3
 
     if not abort.way:
+        if "'lost agent" in abort.reason:
+            return np.inf
         assert "the plan itself" in abort.reason
         data = mission.to_dict()
         assert apart(Mission.from_dict(data | {"abort": {}, "disturbances": {}}), 0.0) < 0.3
@@ -114,6 +119,10 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
 HARD = [
     ("bridge-inspection", "own", 21.43), ("change-of-picture", "own", 14.28), ("market-square", "any", 30.77),
     ("windy-passage", "any", 20.22), ("passage-quadrotors", "own", 42.02),
+    # Quadrotors that turn with the body when the order comes.
+    ("cube-passage-quadrotors", "any", 79.0),
+    # Ten microseconds before the plan has landed.
+    ("change-of-picture", "own", 30.21199),
 ]  # fmt: skip
 
 
@@ -164,12 +173,15 @@ def test_aborts_keep_their_promise_in_flight(seed: int) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("rotors", [False, True])
-def test_two_hundred_aborts_keep_their_promise_in_flight(rotors: bool) -> None:
-    """Of 200 random missions in wind, with one vehicle lost, no abort is below its promise as flown: 1 has no way."""
+@pytest.mark.parametrize(("rotors", "none"), [(False, 17), (True, 24)])
+def test_two_hundred_aborts_keep_their_promise_in_flight(rotors: bool, none: int) -> None:
+    """Of 200 random missions in wind, with one vehicle lost, no abort is below its promise as flown.
+
+    From 1 no way leads home since the plan leads two too near, and from the others for where the lost one falls.
+    """
     margins = np.array([flown_apart(seed, rotors=rotors) for seed in range(200)])
     assert margins.min() > -1e-9
-    assert np.isinf(margins).sum() == 1
+    assert np.isinf(margins).sum() == none
 
 
 @pytest.mark.parametrize("to", ["any", "own"])
@@ -264,6 +276,29 @@ def test_files_of_vehicles_lead_home_from_every_second(tmp_path: Path, name: str
     assert (back > 0) == (name == "bridge-inspection")
 
 
+def test_slowing_down_into_a_phase_without_slots_is_proved_too() -> None:
+    """Who slows down while distances alone close up comes no nearer than proved, at samples, and as near."""
+    forms = {name: {"shape": "triangle", "size": x} for name, x in (("wide", 3.0), ("close", 0.6))}
+    phases = [
+        {"kind": "takeoff", "height": 6.0, "duration": 6.0},
+        {"kind": "establish", "formation": "wide", "blend": 4.0, "duration": 5.0},
+        {"kind": "fly", "position": [8.0, 0.0, 6.0], "velocity": [2.0, 0.0, 0.0], "duration": 5.0},
+        {"kind": "reshape", "formation": "close", "blend": 3.0, "control": "open", "duration": 6.0},
+    ]
+    data = {
+        "schema_version": 1, "name": "closing", "smoothness": "jerk", "formations": forms, "phases": phases,
+        "agents": {"position": [[0, 0, 0.2], [3, 0, 0.2], [1.5, 2.5, 0.2]], "mass": 1.0, "radius": 0.2},
+        "obstacles": [{"kind": "ground"}],
+    }  # fmt: skip
+    step = aborts_of(complete_times(Mission.from_dict(data))).at(15.49).steps[0]
+    r = step.way.at(np.linspace(0.0, step.duration, 2000))
+    i, j = np.triu_indices(3, 1)
+    least = np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.4
+    assert least < 2.5
+    assert step.least.separation == pytest.approx(least, abs=1e-3)
+    assert step.least.separation <= least
+
+
 def test_what_follows_if_one_does_not_hear() -> None:
     """The nearest of a vehicle that flies on is that of a search of all vehicles, at fine samples."""
     aborts = aborts_of(show())
@@ -316,6 +351,46 @@ def test_a_loss_may_send_the_others_home() -> None:
     assert np.abs(end - start[order]).max() < 0.01
 
 
+def test_nobody_lands_on_a_wreck() -> None:
+    """A quadrotor falls onto the place of another, which lands elsewhere."""
+    data = load_mission("crazyflies").to_dict()
+    data["disturbances"] |= {"lost": [{"agent": 2, "time": 12.0}], "on_loss": "abort"}
+    result = rf.simulate(Mission.from_dict(data))
+    pads = result.mission.fleet.position[:, :2]
+    wreck = result.position[-1, 1, :2]
+    assert np.linalg.norm(pads[2] - wreck) < 0.05
+    others = result.position[result.time >= 12.5][:, [0, 2, 3, 4, 5]]
+    fallen = result.position[result.time >= 12.5][:, [1]]
+    assert np.linalg.norm(others - fallen, axis=2).min() > 0.3
+    assert rf.assess(result).passed
+
+
+@pytest.mark.parametrize(("to", "home"), [("any", True), ("own", False)])
+def test_a_wreck_on_the_own_place_is_said_to_stand_in_the_way(to: str, home: bool) -> None:
+    """Above the place of the second vehicle the first is lost: the second lands on the first one's place, or not."""
+    phases = [
+        {"kind": "takeoff", "height": 6.0, "duration": 6.0},
+        {"kind": "fly", "position": [4.5, 0.0, 6.0], "duration": 8.0},
+        {"kind": "hold", "duration": 9.0},
+    ]
+    data = {
+        "schema_version": 1, "name": "pair", "smoothness": "jerk", "gravity": 9.81, "phases": phases,
+        "agents": {"position": [[0.0, 0.0, 0.2], [3.0, 0.0, 0.2]], "mass": 1.0, "radius": 0.2},
+        "obstacles": [{"kind": "ground"}], "limits": {"separation": 0.5}, "abort": {"to": to},
+        "disturbances": {"lost": [{"agent": 1, "time": 16.0}], "on_loss": "abort"},
+    }  # fmt: skip
+    mission = Mission.from_dict(data)
+    result = rf.simulate(mission)
+    assert np.abs(result.position[-1, 0, :2] - [3.0, 0.0]).max() < 1e-3
+    assert result.complete == home
+    assert rf.assess(result).passed == home
+    if home:
+        assert np.abs(result.position[-1, 1, :2]).max() < 1e-3
+    else:
+        assert "'lost agent 1' stands in the way down of agent 2" in result.ending
+        assert "lost agent 1' stands in the way" in str([x.text for x in rf.check(mission).remarks])
+
+
 @pytest.mark.parametrize(("agents", "T"), [([3], 19.0), ([8, 9], 5.0)])
 def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
     """Those that leave come down where the plan leads them; the others fly as without them; none come too near."""
@@ -363,6 +438,30 @@ def test_what_stands_in_the_way_is_named() -> None:
     assert not result.complete
     assert "'roof' stands in the way" in result.ending
     assert "no way home is proved" in str([x.text for x in rf.check(result.mission).remarks])
+
+
+def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
+    """A ball of 0.6 m at 30 m/s that crosses the way down of a vehicle leaves it no such way, if it hits it."""
+    data = show().to_dict()
+    abort = aborts_of(show()).at(12.0)
+    down = abort.end - 0.5 * abort.steps[-1].duration
+    x, y, z = abort.at(np.array([down]))[0, 6].tolist()
+    hits = set()
+    for late in (0.0, 0.5, 2.0, 3.5):
+        waypoints = [[x - 60.0, y, z], [x + 60.0, y, z]]
+        times = [down + late - 2.0, down + late + 2.0]
+        ball = {"kind": "sphere", "radius": 0.6, "waypoints": waypoints, "times": times}
+        ball["name"], ball["appears"], ball["vanishes"] = "ball", times[0] + 1.5, times[0] + 2.5
+        every = {"obstacles": [*data["obstacles"], ball]}
+        planned = aborts_of(Mission.from_dict(data | every)).at(12.0)
+        t = np.linspace(times[0] + 1.5, times[0] + 2.5, 2001)
+        r = abort.at(t)
+        centre = np.linspace(x - 15.0, x + 15.0, 2001)
+        far = r - np.column_stack([centre, 0.0 * t + y, 0.0 * t + z])[:, None]
+        hit = np.linalg.norm(far, axis=2).min() < 0.6 + 0.15
+        hits.add(bool(hit))
+        assert (planned.way == abort.way) == (not hit)
+    assert hits == {True, False}
 
 
 def test_flights_side_by_side_abort_like_one_alone() -> None:

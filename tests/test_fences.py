@@ -126,6 +126,8 @@ def test_a_fall_with_drag_solves_its_differential_equation(k):
         assert tau == pytest.approx(solved.t_events[0][0], rel=1e-9)
         place = falls.landing(np.array(start[:3]), np.array(v), tau, np.array(k), wind)
         assert place == pytest.approx(solved.y_events[0][0][:2], abs=1e-6)
+        places = falls.places(np.array(start[:3]), np.array(v), solved.t, k, wind, g)
+        assert places == pytest.approx(solved.y[:3].T, abs=1e-6)
 
 
 def test_a_fall_ends_on_terrain_where_that_is_hit():
@@ -416,6 +418,25 @@ def test_polygons_of_geojson(data, polygons, note):
     assert (note is None and not notes) or (note is not None and note in " ".join(notes))
 
 
+def test_an_island_in_a_hole_is_inside():
+    """A polygon within the hole of another counts, as it does by the parity of the rings around random points."""
+
+    def ring(half):
+        return [[x / 1e4, y / 1e4] for x, y in square(0.0, 0.0, half)]
+
+    origin = {"latitude_deg": 0.0, "longitude_deg": 0.0}
+    coordinates = [[ring(9.0), ring(5.0)], [ring(3.0), ring(1.0)]]
+    fence = {"kind": "inclusion", "coordinates": coordinates}
+    mission = rf.Mission.from_dict(beside(geodetic_origin=origin, fences=[fence]))
+    (area,) = mission.fences
+    points = RNG.uniform(-110.0, 110.0, (400, 2))
+    rings = area.rings(mission.geodetic_origin)
+    around = sum(Outline(x).contains_points(points).astype(int) for x in rings)
+    inside = area.region(mission.geodetic_origin, 0.0).across(points) < 0.0
+    assert np.array_equal(inside, around % 2 == 1)
+    assert 50 < inside.sum() < 350
+
+
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
@@ -430,6 +451,8 @@ def test_polygons_of_geojson(data, polygons, note):
             "in degrees",
         ),
         ('{"type": "Polygon", "coordinates": [[[NaN, 1], [2, 3], [3, 4]]]}', "in degrees"),
+        ('{"type": "Polygon", "coordinates": [[["1", 1], [2, 3], [3, 4]]]}', "in degrees"),
+        ('{"type": "Polygon", "coordinates": [[[true, 1], [2, 3], [3, 4]]]}', "in degrees"),
         (
             '{"type": "Polygon", "coordinates": [], "crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::3857"}}}',
             "coordinate reference system",

@@ -674,3 +674,30 @@ def test_what_vehicles_did_before_a_loss_still_counts():
     flown = lossy.phases[1].t_end - lossy.phases[1].t_start
     assert 0.0 <= after["saturation"].value < 1.0
     assert flown == 10.0
+
+
+@pytest.mark.parametrize(("speed", "hits"), [(2.0, False), (3.2, True)])
+def test_check_tells_who_lands_on_a_lost_vehicle(speed, hits):
+    """A vehicle that brakes and lands hits the wreck of the one ahead by the check if it does in flight."""
+    line = {"shape": "line", "size": 2.0}
+    phases = [
+        {"kind": "establish", "formation": "line", "duration": 4.0, "attitude": "free"},
+        {
+            "kind": "fly",
+            "position": [20.0, 0.0, 5.0],
+            "velocity": [speed, 0.0, 0.0],
+            "duration": 9.0,
+        },
+        {"kind": "fly", "position": [40.0, 0.0, 5.0], "duration": 9.0},
+    ]
+    m = mission(
+        {"lost": [{"agent": 2, "time": 13.0}], "on_loss": "land"},
+        agents={"mass": 1.0, "radius": RADIUS, "position": [[0.0, 0, 5], [2.0, 0, 5]]},
+        formations={"line": line}, phases=phases,
+    )  # fmt: skip
+    remarks = [r for r in check(m, search=False).remarks if "hits 'lost agent 2'" in r.text]
+    result = simulate(m)
+    after = result.position[result.time > 13.0]
+    assert (np.linalg.norm(after[:, 0] - after[:, 1], axis=1).min() < 2.0 * RADIUS) == hits
+    assert [r.level for r in remarks] == ["fails"] * hits
+    assert assess(result).passed != hits

@@ -34,7 +34,7 @@ EDGES = [
 
 
 #: Vehicles that keep the yaw that they start with.
-TURN = YawTurn(0.0, np.zeros(8), np.zeros(8))
+TURN = YawTurn(0.0, np.zeros((2, 8)), np.zeros((2, 8)))
 
 
 def mission(

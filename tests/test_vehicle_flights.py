@@ -357,7 +357,10 @@ def test_points_have_a_path_in_tables_and_no_attitude():
         flight.advance()
     problem, first = flight.plan.problem, round(flight.t * mission.autopilot.rate)
     sampled = sampled_flight(mission)
-    tables, turn = TickTables(mission, sampled), YawTurn(flight.t, np.zeros(8), np.zeros(8))
+    tables, turn = (
+        TickTables(mission, sampled),
+        YawTurn(flight.t, np.zeros((2, 8)), np.zeros((2, 8))),
+    )
     tables.start_path(problem, first, sampled.tables)
     made = tables.tables_for(first, first + 600, problem, turn)
     assert not any(map(len, (made.yaw, made.jerk, made.snap)))
@@ -381,7 +384,7 @@ def test_yaw_along_the_way_goes_on_from_table_to_table():
         flight.advance()
     problem, start = flight.plan.problem, flight.plan.start
     first = round(start * mission.autopilot.rate)
-    turn = YawTurn(start, np.array([0.3, -0.2, 1.0]), np.zeros(3))
+    turn = YawTurn(start, np.array([[0.3, -0.2, 1.0], [0, 0, 0]]), np.zeros((2, 3)))
     sampled = sampled_flight(mission)
     whole = TickTables(mission, sampled).tables_for(first, first + 1500, problem, turn).yaw
     tables, ends = TickTables(mission, sampled), first + np.array([0, 7, 403, 1001, 1500])

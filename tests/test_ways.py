@@ -1,5 +1,6 @@
 """Ways found round obstacles: phases of kind "go"."""
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.math import proximity
 from rigidfleet.math.attitude import dcm_from_rotation_vector
 from rigidfleet.mission import Mission, load_mission
+from rigidfleet.planning import ways
 from rigidfleet.planning.clearance import closest, greatest_speeds, pace
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.lattice import FreeSpace, keeps_room
@@ -383,3 +385,26 @@ def test_a_search_says_what_it_looks_for(monkeypatch):
     with watched_by(heard.append):
         complete_times(load_mission("narrow-passage-found"))
     assert any("looking for a way of '" in step and "round obstacles" in step for step in heard)
+
+
+def test_a_way_whose_proof_lacks_room_is_looked_for_again_with_more(monkeypatch):
+    """If the proof lacks 0.9 m, the way that is found next has it, at samples of its straight parts."""
+    tried: list[tuple[float, float]] = []
+    try_way = ways._Search._try_way
+
+    def lacking_at_first(search, roadmap, way):
+        room, stops = np.inf, list(zip(way.places, way.layers, strict=True))
+        for (a, i), (b, j) in pairwise(stops):
+            if i == j:
+                straight = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
+                places = straight[:, None] + roadmap.layers[i].offsets
+                room = min(room, roadmap.space.room(places, roadmap.radius).min())
+        tried.append((roadmap.need, room))
+        mission, lacking = try_way(search, roadmap, way)
+        return mission, 0.9 if len(tried) == 1 else lacking
+
+    monkeypatch.setattr(ways._Search, "_try_way", lacking_at_first)
+    complete_times(load_mission("narrow-passage-found"))
+    (need, room), (more, roomier) = tried
+    assert more == pytest.approx(need + 0.902)
+    assert room < more <= roomier

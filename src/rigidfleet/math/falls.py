@@ -4,7 +4,7 @@ With k the drag per mass, w the wind and g gravity, v' = k (w - v) - g z. A time
 
     r = r0 + v0 phi + w (tau - phi) - g psi z,    phi = (1 - exp(-k tau)) / k,    psi = (tau - phi) / k,
 
-which is the parabola where k is zero.
+which is the parabola where k is zero, and the same as r0 + v0 tau + psi (k (w - v0) - g z).
 """
 
 from __future__ import annotations
@@ -54,3 +54,9 @@ def landing(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -> Float
     """Places (..., 2) [m] as seen from above, a time (...) [s] after vehicles at r, with v (..., 3), have failed."""
     phi = weights(k, tau)[0][..., None]
     return r[..., :2] + v[..., :2] * phi + wind[:2] * (tau[..., None] - phi)
+
+
+def places(r: Floats, v: Floats, time: Floats, k: float, wind: Floats, g: float) -> Floats:
+    """Places (K, 3) [m] at times (K,) [s] after a vehicle at r, with v (3,), has failed."""
+    psi = weights(np.full(len(time), k), time)[1][:, None]
+    return r + v * time[:, None] + psi * (k * (wind - v) - g * np.array([0.0, 0.0, 1.0]))

@@ -26,6 +26,8 @@ CLOSE, CLOSE_FALL = 1e-3, 1e-2
 #: Heights between floor and ceiling of people at which falls are looked at. Between two of them, the way that is flown
 #: sideways counts in full: a distance is at most an eighth of that less than it is.
 _LEVELS = 5
+#: Heights at which a fall is looked at that may end on terrain or a roof.
+_HEIGHTS = 128
 #: Curves that are searched together, and steps of an agent in one box.
 _TOGETHER, _BOXED = 20_000, 32
 #: States whose falls fit into the processor's cache.
@@ -76,6 +78,7 @@ class Boundaries:
     """The fences of a mission and its places with people, as measures of states and curves."""
 
     def __init__(self, mission: Mission) -> None:
+        self.mission = mission
         self.radius, self.k = mission.fleet.radius, mission.drag / mission.true_mass
         d = mission.disturbances
         self.wind = np.array((0.0, 0.0, 0.0) if d is None else d.wind)
@@ -105,6 +108,24 @@ class Boundaries:
         k = np.broadcast_to(self.k, r.shape[:2])
         tau = falls.fall_time(r[..., 2] - level, v[..., 2], k, self.wind[2], self.g)
         return falls.landing(r, v, tau, k, self.wind)
+
+    def ends(self, r: Floats, v: Floats) -> Floats:
+        """Where these falls end (K, N, 3) [m]: on the ground, or at z = 0 without one.
+
+        Terrain and roofs count at some heights of each fall.
+        """
+        mission = self.mission
+        level = mission.ground if np.isfinite(mission.ground) else 0.0
+        terrain = [np.array(x.heights).min() for x in mission.solids if x.kind == "heights"]
+        level = min([level, *terrain])
+        ends = np.full(r.shape, level)
+        ends[..., :2] = self.landings(r, v, level)
+        for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
+            height = level + share * (r[..., 2] - level)
+            x, y = np.moveaxis(self.landings(r, v, height), 2, 0)
+            above = mission.height_at(x, y) >= height
+            ends[above] = np.stack([x, y, height], axis=2)[above]
+        return ends
 
     def _falls(self, region: Region, points: Floats, who: Ints) -> Measured:
         """How near people falls from curves (M, 6, P) of agents (M,) go: minus distances [m], see `Measure`."""

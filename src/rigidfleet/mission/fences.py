@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,6 +19,10 @@ from rigidfleet.typing import Floats
 
 #: Farthest corner from the origin [m]: beyond, longitude and latitude are taken to be swapped, or the origin wrong.
 _FAR = 100_000.0
+#: Width of a ring that counts as none, its area over half of its length [m].
+_NARROW = 1e-4
+#: How far inside an area a corner of another one at least is [m], one that touches it is not; how many are looked at.
+_INSIDE, _SOME = 1e-6, 8
 #: Height up to which people reach [m].
 _TALL = 2.0
 
@@ -150,11 +155,24 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
         return "has two corners in a row at one place", "give each corner once"
     if some_cross(edges):
         return "has edges that cross", "give the corners in their order; polygons may not overlap"
-    for border, *holes in polygons:
-        inside = Region.of_rings([border])
-        others = [one[0] for one in polygons if one[0] is not border]
-        if any(inside.across(ring[:1])[0] < 0.0 for ring in others):
+
+    if any(_width(ring) < _NARROW for ring in rings):
+        return "bounds no area: its corners lie on a line", "give corners around it"
+    areas = [Region.of_rings([ring]) for ring in rings]
+    some = [ring[:: max(1, len(ring) // _SOME)] for ring in rings]  # all are on the same side
+    inside = np.array([[x.across(r).min() < -_INSIDE for x in areas] for r in some])
+    first = np.cumsum([0, *(len(polygon) for polygon in polygons)])
+    # In a polygon, and not in its holes, an odd number of rings is around.
+    odd = inside.sum(axis=1) % 2 == 1
+    for border, after in pairwise(first.tolist()):
+        if odd[border]:
             return "has a polygon inside another", "give it as a hole, or leave it out"
-        if any(inside.across(ring)[0] > 0.0 for ring in holes):
+        if not (odd & inside[:, border])[border + 1 : after].all():
             return "has a hole outside of its polygon", "leave it out"
     return None
+
+
+def _width(ring: Floats) -> float:
+    """The area of a ring (m, 2) over half of its length [m]."""
+    (x, y), (x1, y1) = ring.T, np.roll(ring, -1, axis=0).T
+    return float(abs((x * y1 - y * x1).sum()) / np.hypot(x1 - x, y1 - y).sum())

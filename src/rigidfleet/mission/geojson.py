@@ -54,6 +54,8 @@ def _polygons(node: dict[str, Any], notes: list[str]) -> Iterator[list[Any]]:
 
 def _ring(ring: list[Any], notes: list[str]) -> list[list[float]]:
     """Corners of a ring, each once."""
+    if any(type(x) not in (int, float) for corner in ring for x in corner):
+        raise TypeError
     corners = [[float(x) for x in corner] for corner in ring]
     if any(len(corner) > 2 for corner in corners):
         notes.append("altitudes are left out: floor and ceiling have the heights")

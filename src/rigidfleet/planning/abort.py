@@ -26,12 +26,12 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.foreign.curves import curve_to_rows
 from rigidfleet.formation.assignment import assign_slots, downwash_metric, pairs_nearer_than
 from rigidfleet.kernel.problem import septic_polynomial
-from rigidfleet.math import proximity
+from rigidfleet.math import falls, proximity
 from rigidfleet.math.piecewise import Piecewise, common_knots, pad, refine
 from rigidfleet.mission import Mission, Phase
-from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
+from rigidfleet.mission.boundaries import Boundaries, BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
-from rigidfleet.mission.obstacles import is_ground
+from rigidfleet.mission.obstacles import Sphere, is_ground
 from rigidfleet.planning.certificate import (
     CLOSE,
     Certificate,
@@ -39,6 +39,7 @@ from rigidfleet.planning.certificate import (
     in_step,
     of_ways,
 )
+from rigidfleet.planning.clearance import greatest_way
 from rigidfleet.planning.courses import ABOVE
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.legs import Leg
@@ -65,10 +66,17 @@ _KNOTS, _NEAR = 0.2, 0.01
 _LOOKS, _PACE = 33, 0.25
 #: Least and greatest time between samples of vehicles that fly on [s], and the latter over the number of vehicles.
 _SAMPLED = 0.05, 0.25, 5e-4
+#: How far from its fall by the plan a lost vehicle may be [m], and over its acceleration by the wind [s^2], which blows
+#: it on along the ground.
+_ASTRAY, _BLOWN = 0.1, 0.5
+#: Time between places of a fall, between which it is taken as straight [s]; one at which all lie.
+_FALLING, _EVER = 0.1, 1e6
 #: How much farther than in the end vehicles are off their ways while drag changes.
 _OVERSHOOT = 1.1
 #: Time before its end within which a plan that lands comes to rest on the ground [s].
 _TOUCHING = 1.0
+#: Shortest rest of a plan [s].
+_LEAST = 0.01
 #: Steps back along the plan that are tried [s].
 _BACK = 1.0
 #: Decimals of stopped places [m] that count as the same, whose ways home are planned once.
@@ -239,7 +247,9 @@ class Aborts:
             self.off = 2.0 * most
         self.apart = widest + self.need + max(allowed, self.off)
         self.below = max(self.apart, widest + (limits.separation_below or 0.0))
-        self.moves = any(x.solid.moves for x in mission.solids)
+        falls_down = mission.gravity >= 1.0
+        self.wrecked = np.flatnonzero(self.lost & falls_down)
+        self.moves = any(x.solid.moves for x in mission.solids) or self.wrecked.size > 0
         start = mission.fleet.position
         below = mission.height_at(*start.T) + ABOVE + self.radius
         self.stands = bool(mission.standing(start).all() and np.isfinite(below).all())
@@ -281,6 +291,29 @@ class Aborts:
         on[0, ..., :2] = np.moveaxis(Piecewise(time, pieces[-1]).states(time[-1:], 2)[:, 0], 0, -1)
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
 
+    @property
+    def astray(self) -> Floats:
+        """How far from its fall by the plan each vehicle (N,) may be that is lost [m]."""
+        air = Boundaries(self.mission)
+        return self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
+
+    @cached_property
+    def wrecks(self) -> list[Sphere]:
+        """The lost vehicles, wider by `astray`, which fall from where they were by the plan, and then lie."""
+        air, lost_at, wrecks = Boundaries(self.mission), self.mission.lost_at, []
+        astray = self.astray
+        for i in self.wrecked.tolist():
+            states = self.plan.states(lost_at[[i]], 2)
+            (r, v), k = states[:, 0, i], air.k[[i]]
+            height = r[2] - air.ends(*states)[:, i, 2] - self.radius[i]
+            tau = float(falls.fall_time(height, v[2:], k, air.wind[2], air.g)[0])
+            time = np.linspace(0.0, max(tau, SHORTEST), 2 + math.ceil(tau / _FALLING))
+            places = falls.places(r, v, np.minimum(time, tau), float(k[0]), air.wind, air.g)
+            moves = {"waypoints": places.tolist(), "times": (lost_at[i] + time).tolist()}
+            size = float(self.radius[i] + astray[i])
+            wrecks.append(Sphere(kind="sphere", name=f"lost agent {i + 1}", radius=size, **moves))
+        return wrecks
+
     def _way_along(self, clock: Piecewise) -> Piecewise:
         """The ways of all vehicles along the plan by a clock, either way."""
         duration, plan = float(clock.time[-1]), self.plan
@@ -300,15 +333,16 @@ class Aborts:
         """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""
         begin, end = clock.at(clock.time[[0, -1]]).tolist()
         first, last = sorted((begin, end))
-        least = _APART_FOR_EVER
+        make, least = partial(self._way_along, clock), _APART_FOR_EVER
         for leg in self.legs[self.leg_at(first) : self.leg_at(last) + 1]:
             proved = leg.certificate
             if self.lost.any():
                 proved = certificate_of(leg.phase, leg.reference, leg.radius, self.lost)
+            if proved is None and len(self.left) > 1:  # no slots are tracked there
+                proved = self._apart(make(), self.left)
             least = min(least, proved or least)
         # Its polynomials differ from the plan's ways by less than `CLOSE`.
-        make, least = partial(self._way_along, clock), least._replace(time=0.0)
-        return self._step(name, make, least, CLOSE, path=end)
+        return self._step(name, make, least._replace(time=0.0), CLOSE, path=end)
 
     def _step(
         self, name: str, make: Callable[[], Piecewise], least: Certificate, off: float, **how: Any
@@ -335,7 +369,8 @@ class Aborts:
             first, self.limits, lambda time: _clock(begins, time, _SLOWING)
         )
         if begins + 0.5 * time >= self.end and self.lands:
-            clock = _clock(begins, max(self.end - begins, SHORTEST), _ON)
+            # What goes on beyond the end goes on down.
+            clock = _clock(begins, max(self.end - begins, _LEAST), _ON)
             return self.along("to its end", clock), ""
         problem, step = "", self.along("slow down", _clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
@@ -413,9 +448,15 @@ class Aborts:
             if pads is None or (both >= pads).any() or step.least.separation <= 0.0:
                 who, limit = agent_names(step.least.agents), f"(limit {self.need:g} m)"
                 return f"{who} come within {max(apart, 0.0):.2f} m {on} {limit}"
+        things = [*self.mission.solids, *self.wrecks]
+        things = [x for x in things if x.solid.moves or not along]
         v = way.states(np.linspace(0.0, step.duration, _LOOKS), 2)[1]
-        fastest = float(np.linalg.norm(v, axis=2).max())
-        time = np.linspace(0.0, step.duration, 2 + math.ceil(step.duration * fastest / _PACE / 2.0))
+        far, when = step.duration * float(np.linalg.norm(v, axis=2).max()), np.array([begin])
+        moved = (
+            greatest_way(x.solid, when, when + step.duration)[0] for x in things if x.solid.moves
+        )
+        far += max(moved, default=0.0)
+        time = np.linspace(0.0, step.duration, 2 + math.ceil(far / _PACE / 2.0))
         r = way.at(time)[:, left]
         if limits.geofence is not None and not along:
             low, high = (np.array(x) for x in (limits.geofence.min, limits.geofence.max))
@@ -438,7 +479,6 @@ class Aborts:
             if limit is not None and q.rank(x.value) > q.rank(limit) + 1e-6:
                 words = boundary_in_words(name, f"agent {x.who + 1}", place, x.value, begin + x.time)  # fmt: skip
                 return f"{words}, {on}"
-        things = [x for x in self.mission.solids if x.solid.moves or not along]
         if step.lands:
             things = [x for x in things if not is_ground(x)]
         if things:
@@ -448,6 +488,11 @@ class Aborts:
                 thing = things[int(near[k, i])].name
                 return f"'{thing}' stands in the way {step.name} of agent {left[i] + 1}"
         return ""
+
+    def _apart(self, way: Piecewise, who: Ints, first: int | None = None) -> Certificate:
+        """Certificate of the ways of some vehicles (n,), as `of_ways`."""
+        least = of_ways(way.time, way.pieces[:, who], self.radius[who], first)
+        return least._replace(agents=tuple(who[list(least.agents)].tolist()))
 
     # -- ways home from rest ------------------------------------------------------------------------------
 
@@ -515,6 +560,7 @@ class Aborts:
         p, q = r[left], goal[left]
         if way == "to any place":
             metric, goal = downwash_metric(_UP, self.below / self.apart), goal.copy()
+            q = self._free_places(r, q)
             goal[left] = q[assign_slots(p, q, turn=np.eye(3), metric=metric).order]
         if way == "by levels":
             height = _levels(self.apart + off, p, q) * (self.below + off)
@@ -524,8 +570,20 @@ class Aborts:
             stops, r = [("apart", r, one), ("across", one, two)], two
         # No higher than the lowest of them.
         rise = max(0.0, min(FINAL, float((r[left, 2] - goal[left, 2]).min())))
-        above = goal + rise * _UP
+        above = goal.copy()
+        above[left] += rise * _UP
         return [*stops, ("over the places", r, above), ("down", above, goal)]
+
+    def _free_places(self, r: Floats, own: Floats) -> Floats:
+        """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
+        if not self.wrecked.size:
+            return own
+        every = self.places(r)
+        near = proximity.obstacle_clearances(every, self.radius, self.wrecks, _EVER)[0] < _PACE
+        own, spare, taken = own.copy(), every[self.lost & ~near], np.flatnonzero(near[self.left])
+        count = min(len(spare), len(taken))
+        own[taken[:count]] = spare[:count]
+        return own
 
     def places(self, r: Floats) -> Floats:
         """Landing places (N, 3) [m] of the vehicles' centres.
@@ -578,6 +636,7 @@ class Aborts:
         stay = np.ones(self.mission.n_agents, dtype=np.bool_)
         stay[np.array(self.options.agents) - 1] = False
         alone = Aborts(self.mission, self.legs, stay | self.lost)
+        alone.wrecked, alone.moves = self.wrecked, self.moves
         if self.lands:
             alone.start = self.plan.at(np.array([self.end]))[0]
         return alone
@@ -595,8 +654,7 @@ class Aborts:
                 continue
             make = partial(self._with_others, begins, waits, alone.steps)
             way = make()
-            proved = of_ways(way.time, way.pieces[:, order], self.radius[order], len(who))
-            proved = proved._replace(agents=tuple(order[list(proved.agents)].tolist()))
+            proved = self._apart(way, order, len(who))
             step = self._step("leave", make, min(proved, plan), 0.0)
             if (apart := proved.separation - step.off) < max(self.need, 1e-6):
                 problem = f"{agent_names(proved.agents)} come within {max(apart, 0.0):.2f} m"

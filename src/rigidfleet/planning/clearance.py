@@ -128,7 +128,7 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         spans = todo.popleft()
         way = spans.speed * spans.length[:, None]
         if solid.moves:
-            way = way + _way(met, spans.first, spans.first + spans.length)[:, None]
+            way = way + greatest_way(met.solid, spans.first, spans.first + spans.length)[:, None]
         low = 0.5 * (spans.near + spans.far - way)
         open_ = low < best - CLOSE
         if not open_.any():
@@ -182,9 +182,8 @@ def _while_there(
     return at, np.concatenate([first, planned.position[within], last]), speed[span]
 
 
-def _way(thing: Obstacle | _Thing, begin: Floats, end: Floats) -> Floats:
-    """Greatest way (L,) [m] of an obstacle between times (L,) [s]: its greatest speed counts wherever it moves."""
-    solid = thing.solid
+def greatest_way(solid: Solids, begin: Floats, end: Floats) -> Floats:
+    """Greatest way (L,) [m] of a solid between times (L,) [s]: its greatest speed counts wherever it moves."""
     speed = np.linalg.norm(np.diff(solid.ways, axis=0), axis=1) / np.diff(solid.times)
     within = (solid.times[:-1] < end[:, None]) & (solid.times[1:] > begin[:, None])
     return np.where(within, speed, 0.0).max(axis=1, initial=0.0) * (end - begin)

@@ -229,7 +229,7 @@ class Roadmap:
     ) -> None:  # fmt: skip
         """Build the lattices; the parameters are those of `Lattice`, for each layer and frame.
 
-        ``known`` has the lattices of networks before, in the same space, and gets the new ones.
+        ``known`` has the lattices of networks before, in the same space and of the same need, and gets the new ones.
         """
         self.space, self.layers, self.changes = space, layers, changes
         self.radius, self.need = radius, need

@@ -45,8 +45,10 @@ DENSITY = 1.225
 _STILL = 0.1
 #: Share of the drag that its feedforward leaves in fast descents, where rotors turn slower than at the thrust desired.
 _LEFT = 0.2
-#: Time in which a vehicle turns from its yaw at a switch to the yaw asked for [s].
+#: Time in which a vehicle turns from its yaw at a switch, and its rate, to those asked for [s].
 _TURN_TIME = 3.0
+#: Difference of two rates of yaw that counts as none [rad/s].
+_SAME_RATE = 1e-3
 #: Time constant with which vehicles in a network estimate the acceleration by what they do not know [s].
 _ESTIMATE = 0.15
 #: Probability with which all messages that a vehicle owes its neighbours within the time of silence are lost.
@@ -364,10 +366,10 @@ class TickTables:
         )  # fmt: skip
 
     def yaw_at(self, problem: Problem, t: float, turn: YawTurn) -> Floats:
-        """Yaw (N,) [rad] asked of each vehicle at a time [s] of a phase."""
+        """Yaw and its rate (2, N) [rad, rad/s] asked of each vehicle at a time [s] of a phase."""
         if t <= turn.begun:
             return turn.start
-        return self._references(problem, np.array([t]), turn)[0][0, :, 0]
+        return self._references(problem, np.array([t]), turn)[0][0, :, :2].T
 
     def _references(self, problem: Problem, time: Floats, turn: YawTurn) -> tuple[Floats, Floats]:
         """Yaw with two derivatives (K, N, 3) of each vehicle at times (K,) [s], and derivatives (5, 3, N, K) of slots.
@@ -376,12 +378,12 @@ class TickTables:
         """
         if problem.control.kind != TRACKING:
             still = np.zeros((len(time), self.n, 3))
-            still[..., 0] = turn.start
+            still[..., 0] = turn.start[0]
             return still, np.zeros((0, 3, self.n, len(time)))
         reference, motion = problem.reference, problem.motion
         since, start = turn.begun, turn.start
         if self._known is not None and self._known[0] is turn and self._known[1] < time[0]:
-            _, since, start = self._known
+            since, start = self._known[1], self._known[2][None]
         whole = np.concatenate([[since], time])
         slots, turned, known = slots_and_yaw(
             reference, motion, whole, self.yaw, turn._replace(start=start)
@@ -416,33 +418,39 @@ def asked_yaw(mission: Mission) -> Yaw:
 
 
 def first_yaw(mission: Mission) -> Floats:
-    """Yaw (N,) [rad] with which vehicles start."""
-    frame = mission.body_frame
-    return np.full(mission.n_agents, 0.0 if frame is None else math.radians(frame.yaw_deg))
+    """Yaw and its rate (2, N) [rad, rad/s] with which vehicles start."""
+    start, frame = np.zeros((2, mission.n_agents)), mission.body_frame
+    start[0] = 0.0 if frame is None else math.radians(frame.yaw_deg)
+    return start
 
 
 class YawTurn(NamedTuple):
     """How vehicles turn from their yaw at a time into the one asked for."""
 
     begun: float  # [s]
-    start: Floats  # (N,) yaw there [rad]
-    off: Floats  # (N,) what it differs by from the one asked for [rad]
+    start: Floats  # (2, N) yaw and its rate there [rad, rad/s]
+    off: Floats  # (2, N) what these differ by from those asked for
 
 
 def turn_from(problem: Problem, t: float, yaw: Yaw, start: Floats) -> YawTurn:
-    """The turn of vehicles with yaws ``start`` (N,) [rad] at a time [s] of a problem, at which its motion begins."""
+    """The turn of vehicles with yaws and rates ``start`` (2, N) at a time [s] of a problem, at which its motion begins.
+
+    Where no slots are tracked, they keep their yaw.
+    """
     if problem.control.kind != TRACKING:
-        return YawTurn(t, start, np.zeros(len(start)))
+        still = start * np.array([[1.0], [0.0]])
+        return YawTurn(t, still, np.zeros_like(start))
     return turn_along(problem.reference, problem.motion, t, yaw, start)
 
 
 def turn_along(reference: Reference, motion: Motion, t: float, yaw: Yaw, start: Floats) -> YawTurn:
     """`turn_from` while slots are tracked."""
     if yaw.kind == "along":
-        return YawTurn(t, start, np.zeros(len(start)))
-    off = start - yaw_derivatives(reference, motion, np.array([t]), yaw)[0, 0]
+        return YawTurn(t, start, np.zeros_like(start))
+    off = start - yaw_derivatives(reference, motion, np.array([t]), yaw)[0, :2]
+    off[1, np.abs(off[1]) < _SAME_RATE] = 0.0
     if yaw.kind != "formation":
-        off = (off + np.pi) % (2.0 * np.pi) - np.pi
+        off[0] = (off[0] + np.pi) % (2.0 * np.pi) - np.pi
     return YawTurn(t, start, off)
 
 
@@ -452,16 +460,21 @@ def slots_and_yaw(
     """Series of the slots (5, 3, N, K), and the yaw with two derivatives (3, N, K) that is asked of the vehicles.
 
     Yaw "along" continues from ``turn.start`` at ``time[0]``; it is known at the time returned beside (see `yaw_along`).
+    A rate that differs at first, as that of a body that turns no more, fades as tau (1 - s), with the blend s.
     """
     body = body_series(motion, time)
     slots = slot_series(reference, body, time)
     if yaw.kind == "along":
-        return slots, *yaw_along(reference, motion, time, slots, turn.start)
+        return slots, *yaw_along(reference, motion, time, slots, turn.start[0])
     turned = yaw_of(body, slots, yaw)
-    turned[0] += turn.off[:, None]
+    turned[0] += turn.off[0, :, None]
+    done = blend_series(time, turn.begun, _TURN_TIME)[:3]
     if yaw.kind != "formation":
-        done = series.derivatives(blend_series(time, turn.begun, _TURN_TIME)[:3])
-        turned -= done[:, None] * turn.off[:, None]
+        turned -= series.derivatives(done)[:, None] * turn.off[0, :, None]
+    if turn.off[1].any():
+        tau = np.stack([time - turn.begun, np.ones_like(time), np.zeros_like(time)])
+        fading = series.derivatives(tau - series.product(tau, done))
+        turned += fading[:, None] * turn.off[1, :, None]
     return slots, turned, None
 
 

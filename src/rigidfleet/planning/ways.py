@@ -98,7 +98,6 @@ class _Search:
         self.reach = most + float(mission.fleet.radius.max())
         self.each = mission.n_agents <= _EACH
         self.radius = mission.fleet.radius if self.each else np.array([self.reach])
-        self._known: dict[Any, Lattice] = {}
 
     # -- what there is to choose from ------------------------------------------------------------------
 
@@ -146,6 +145,7 @@ class _Search:
     def _cheapest_way(self, need: float) -> tuple[Roadmap, Way]:
         """The way of least cost among shapes: more shapes, and then more yaws, as long as there is no short one."""
         best: tuple[Roadmap, Way] | None = None
+        known: dict[Any, Lattice] = {}
         straight = float(np.linalg.norm(self.end - self.begin))
         stages = sorted({s.stage for s in self.shapes})
         for stage, more in [*((k, False) for k in stages), (stages[-1], True)]:
@@ -155,7 +155,7 @@ class _Search:
             report(
                 f"looking for a way of '{self.phase.name}' round obstacles, shapes: {len(shapes)}"
             )
-            roadmap = self._roadmap(shapes, need, more=more)
+            roadmap = self._roadmap(shapes, need, known, more=more)
             way = roadmap.shortest((self.begin, 0), (self.end, self._last))
             if way is not None and (best is None or way.cost < best[1].cost):
                 best = roadmap, way
@@ -165,7 +165,9 @@ class _Search:
             raise self._none(roadmap)
         return best[0], best[0].shorten(best[1])
 
-    def _roadmap(self, shapes: list[layers.CandidateShape], need: float, *, more: bool) -> Roadmap:
+    def _roadmap(
+        self, shapes: list[layers.CandidateShape], need: float, known: dict[Any, Lattice], *, more: bool
+    ) -> Roadmap:  # fmt: skip
         frames = layers.frames(self._near())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
@@ -200,7 +202,7 @@ class _Search:
         if not self.each:  # the one ball that covers all neither turns nor changes
             stays = staying(nodes[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
-        return Roadmap(space, nodes, changes, self.radius, need, frames, common, self._known)
+        return Roadmap(space, nodes, changes, self.radius, need, frames, common, known)
 
     # -- from nodes to phases --------------------------------------------------------------------------
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 PEOPLE = "#6A3D9A"
 #: Line of a soft fence.
 _SOFT = 0, (4, 2)
-#: Heights at which a fall is looked at that may end on terrain or a roof.
-_HEIGHTS = 128
 #: Colour of places where vehicles fall, and the most places of a kind that are drawn.
 _FALLS, _MOST = "#E69F00", 4000
 
@@ -69,20 +67,9 @@ def falls_of(result: Result) -> Floats:
     """
     from rigidfleet.mission.boundaries import Boundaries
 
-    mission = result.mission
-    if mission.gravity < 1.0:
+    if result.mission.gravity < 1.0:
         return np.full((*result.position.shape[:2], 2), np.nan)
-    boundaries, states = Boundaries(mission), (result.position, result.velocity)
-    level = mission.ground if np.isfinite(mission.ground) else 0.0
-    terrain = [np.array(x.heights).min() for x in mission.solids if x.kind == "heights"]
-    level = min([level, *terrain])
-    places = boundaries.landings(*states, level)
-    for share in np.linspace(0.0, 1.0, _HEIGHTS) if mission.roofs.kind.size else ():
-        height = level + share * (result.position[..., 2] - level)
-        above = boundaries.landings(*states, height)
-        ends = mission.height_at(*np.moveaxis(above, 2, 0)) >= height
-        places[ends] = above[ends]
-    return places
+    return Boundaries(result.mission).ends(result.position, result.velocity)[..., :2]
 
 
 @st.in_style

@@ -6,10 +6,17 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from rigidfleet.math import proximity
 from rigidfleet.mission import Mission
+from rigidfleet.planning.abort import Aborts
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.losses import Answer, answer_to
-from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
+from rigidfleet.planning.preview import (
+    FEWEST_SAMPLES,
+    PlannedPhase,
+    planned_phase,
+    samples_per_phase,
+)
 from rigidfleet.planning.reference import copy_with
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
 from rigidfleet.preflight.obstacles import boundary_remarks, obstacle_remarks
@@ -57,6 +64,20 @@ def loss_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]:
         separation_remarks, downwash_remarks, thrust_remarks, obstacle_remarks, boundary_remarks, limit_remarks,
     ):  # fmt: skip
         yield from judge(mission, part)
+    yield from _wreck_remarks(Aborts(mission, legs, mission.lost_at <= first), part.planned_phases)
+
+
+def _wreck_remarks(aborts: Aborts, way: Sequence[PlannedPhase]) -> Iterator[Remark]:
+    """Remarks on those left who hit a lost vehicle that falls or lies, at samples of the way after the loss."""
+    left, radius = aborts.left, aborts.radius[aborts.left] - aborts.astray.max()
+    for planned in way if aborts.wrecks else ():
+        r, time = planned.position[:, left], planned.time
+        room, near = proximity.obstacle_clearances(r, radius, aborts.wrecks, time)
+        k, i = np.unravel_index(int(room.argmin()), room.shape)
+        if room[k, i] < 0.0:
+            wreck = aborts.wrecks[int(near[k, i])].name
+            text = f"agent {left[i] + 1} hits '{wreck}' at {time[k]:.2f} s in '{planned.phase}'"
+            yield Remark("fails", "loss", text)
 
 
 def planned_answer(mission: Mission, at: Leg, legs: Sequence[Leg]) -> Answer:

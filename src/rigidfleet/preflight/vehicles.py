@@ -55,7 +55,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
         time = np.linspace(leg.start, leg.end, max(11, min(count, _PLACES // n)))
         turn = turn_along(leg.reference, leg.motion, leg.start, setting, angle)
         slots, turned, _ = slots_and_yaw(leg.reference, leg.motion, time, setting, turn)
-        angle, yaw = turned[0, :, -1], turned.transpose(2, 0, 1)
+        angle, yaw = turned[:2, :, -1], turned.transpose(2, 0, 1)
         x = series.derivatives(slots).transpose(3, 0, 2, 1)
         for i, model in enumerate(models):
             if not model.point:

@@ -73,8 +73,8 @@ class FleetState:
         self.tables = TickTables(mission, self.flight)
         self.avoidance = avoidance_in_flight(mission, self.flight)
         start = mission.fleet
-        self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch
-        yaw = float(self.yaw[0])
+        self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch, and its rate
+        yaw = float(self.yaw[0, 0])
         self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
