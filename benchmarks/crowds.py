@@ -21,7 +21,7 @@ import numpy as np
 
 import rigidfleet as rf
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import BARRIER, GUARD, TICKS, avoidance
+from rigidfleet.kernel.avoidance import BARRIER, GUARD, TICKS, avoidance_arrays
 from rigidfleet.kernel.engine import native, sampled
 from rigidfleet.kernel.problem import graph, workspace
 from rigidfleet.planning.legs import leg_of
@@ -83,12 +83,12 @@ def kernel(n: int, **given: Any) -> tuple[Any, ...]:
     mass = np.ones(n)
     problem = plan.problem._replace(graph=graph(np.zeros((0, 2), dtype=np.int64), mass))
     vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True, limit=THRUST)] * n, 0.0)
-    flight = fleet.flight(vehicles, start=0.0, h=PERIOD, steps=1)
+    flight = fleet.ideal_flight(vehicles, start=0.0, h=PERIOD, steps=1)
     work = workspace(n, 0)
-    state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)
+    state = fleet.initial_state(flight, np.zeros((n, fleet.STATES)), work)
     given = {"radius": 0.5 * APART} | given
     radius = given.pop("radius") * mass
-    a = avoidance(
+    a = avoidance_arrays(
         period=PERIOD, b=THRUST * mass, lift=THRUST * mass, mass=mass, g=0.0, radius=radius, **given,
     )  # fmt: skip
     return problem, work, flight, state, a
@@ -187,7 +187,7 @@ def swap(
         state.force[:] = asked(r, v, -start)
         state.work.law_time[0] = t
         begun = time.process_time()
-        if not sampled.avoid(problem, work, flight, state, a):
+        if not sampled.guard_forces(problem, work, flight, state, a):
             raise SystemExit("too many neighbours")
         took = time.process_time() - begun
         c = state.force.copy()
@@ -229,7 +229,7 @@ def layers(n: int = 30, repeats: int = 5) -> tuple[float, float, float]:
             state.seen[:, :3], state.seen[:, 3:] = r, v
             state.force[:] = asked(r, v, -states[0][0])
             begun = time.process_time()
-            sampled.avoid(problem, work, flight, state, a)
+            sampled.guard_forces(problem, work, flight, state, a)
             cost += time.process_time() - begun
         found.append(1e6 * cost / (repeats * len(states) * n))
     return found[0], found[1] - found[0], found[2] - found[0]

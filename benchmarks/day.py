@@ -159,12 +159,12 @@ def missions(_: Path) -> Iterator[Line]:
 
 def pages(folder: Path) -> Iterator[Line]:
     """The report of sixty vehicles with drill and aborts, printed."""
-    scenes = [show_draft.scene(shape, 60, 2.0) for shape in ("sphere", "helix")]
+    scenes = [show_draft.shape_scene(shape, 60, 2.0) for shape in ("sphere", "helix")]
     file, out, home, drill = (
         str(folder / name) for name in ("sixty.toml", "sixty", "home", "sixty-drill")
     )
     Path(file).write_text(
-        show_draft.show("sixty", scenes, agents=60, spacing=2.0), encoding="utf-8"
+        show_draft.show_text("sixty", scenes, agents=60, spacing=2.0), encoding="utf-8"
     )
     ran("run", file, "--no-figures", "--quiet", "--out", out)
     ran("check", file, "--abort", "--out", home)

@@ -25,10 +25,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from crowds import PERIOD, THRUST, kernel, on_parabolas
 
-from rigidfleet.kernel.avoidance import candidates, sight
+from rigidfleet.kernel.avoidance import candidates, initial_sight
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.packing import Packed, pack
-from rigidfleet.solids.records import Solids, ball, join, single
+from rigidfleet.solids.records import Solids, ball, join, one_solid
 from rigidfleet.typing import Floats
 
 #: Speeds of vehicles, and greatest speeds of obstacles [m/s].
@@ -44,7 +44,7 @@ SETTLE, SHARE, HELD, SPARE, AHEAD, LOOK = 0.3, 0.6, 1.5, 0.1, 6.0, 0.04
 NEAR = 1.5
 #: Time for which a flight goes on after its slots have arrived [s].
 LATER = 12.0
-#: Methods: what `kernel.avoidance.avoidance` is asked for.
+#: Methods: what `kernel.avoidance.avoidance_arrays` is asked for.
 METHODS = {
     "flow": {"flow": True, "guarded": False, "filtered": False},
     "barriers, guard": {},
@@ -146,7 +146,7 @@ def solids(given: Scene) -> Solids:
     ends = np.array([0.0, 60.0])
     return join(
         [
-            single(ball(place, BALL), ends, np.outer(ends, w))
+            one_solid(ball(place, BALL), ends, np.outer(ends, w))
             for place, w in zip(given.place, given.velocity, strict=True)
         ]
     )
@@ -157,7 +157,7 @@ def prepared(given: Scene, method: str) -> tuple[Any, list[Packed]]:
     things = solids(given)
     problem, work, flight, state, a = kernel(
         len(given.slots), radius=RADIUS, solids=things, separation=0.1, clearance=0.05,
-        seen=sight(things, RANGE, NOISE, SWERVE), **METHODS[method],
+        seen=initial_sight(things, RANGE, NOISE, SWERVE), **METHODS[method],
     )  # fmt: skip
     law = [pack(problem), pack(work)]
     a.law[:] = [each.address for each in law]

@@ -80,16 +80,16 @@ def passage(h: float) -> tuple[float, float, np.ndarray]:
     agents, state, spent, path = mission.agents, None, 0.0, []
     now = PhaseState(0.0, np.array(agents.position), np.array(agents.velocity))
     vehicles = fleet.quadrotors([VEHICLE] * len(now.r), G)
-    flight = fleet.flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
-    S = fleet.hovering(vehicles, now.r, now.v)
+    flight = fleet.ideal_flight(vehicles, start=0.0, h=h, steps=round(1.0 / (RATE * h)))
+    S = fleet.hover_states(vehicles, now.r, now.v)
     for phase in mission.phases:
         plan = plan_phase(mission, leg_of(mission, phase, now))
         m = len(plan.edges)
         work = workspace(len(S), m, solver=plan.problem.law.solver)
-        integral = plan.state()[6 * len(S) : 6 * len(S) + m]
+        integral = plan.initial_state()[6 * len(S) : 6 * len(S) + m]
         if state is None:
-            state = fleet.begin(flight, S, work)
-        state = fleet.under_problem(state, work, integral)
+            state = fleet.initial_state(flight, S, work)
+        state = fleet.state_under_problem(state, work, integral)
         times = plan.start + 0.1 * np.arange(1, round(10.0 * (plan.t_end - plan.start)) + 1)
         call = fleet.segment(len(S), m, plan.t_end, times)
         begun_at = time.process_time()

@@ -15,13 +15,13 @@ from matplotlib.patches import Circle, FancyArrowPatch, FancyBboxPatch, Rectangl
 from rigidfleet import physics, simulate
 from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.formation.shapes import slots
-from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, bernstein
+from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, bernstein_basis
 from rigidfleet.math import attitude, pid
 from rigidfleet.math.constraint_jacobian import filter_factors
 from rigidfleet.math.rigid_body import kabsch
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.abort import Aborts
-from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.losses import legs_from
 from rigidfleet.planning.preview import preview
 from rigidfleet.planning.timing import complete_times
@@ -481,7 +481,7 @@ def way_home() -> Figure:
     for ax, to in zip(fig.subplots(1, 2, sharey=True), ("any", "own"), strict=True):
         data = load_mission("change-of-picture").to_dict() | {"abort": {"to": to}}
         mission = complete_times(Mission.from_dict(data))
-        aborts = Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
+        aborts = Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
         abort = aborts.at(19.0)
         before = aborts.plan.at(np.linspace(16.0, abort.begins, 20))
         t = abort.begins
@@ -530,9 +530,9 @@ def monitor() -> Figure:
     )
     ax = fig.add_axes((0.58, 0.17, 0.4, 0.73))
     points, x = np.array([3.1, 1.5, 1.1, 2.3, 2.6]), np.linspace(0.0, 1.0, 200)
-    ax.plot(x, bernstein(x) @ points, color=BLUE, linewidth=2, label="value over a step")
+    ax.plot(x, bernstein_basis(x) @ points, color=BLUE, linewidth=2, label="value over a step")
     for half, label in ((0.0, "control points of its halves"), (1.0, None)):
-        part = FROM_KNOTS @ (bernstein((KNOTS + half) / 2.0) @ points)
+        part = FROM_KNOTS @ (bernstein_basis((KNOTS + half) / 2.0) @ points)
         ax.plot(
             (KNOTS + half) / 2.0,
             part,

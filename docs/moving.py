@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 import rigidfleet as rf
 from rigidfleet.plotting.space import camera
-from rigidfleet.plotting.style import FAINT, GREY, INK, agent_colours, settings
+from rigidfleet.plotting.style import FAINT, GREY, INK, agent_colours, apply_style
 
 IMAGE = Path(__file__).parent / "images" / "narrow-passage.gif"
 MISSION, END = "narrow-passage", 85.0  # [s]
@@ -182,7 +182,7 @@ def reduced(picture: Image.Image, palette: np.ndarray) -> Image.Image:
 
 def main() -> None:
     """Fly, draw, write."""
-    with settings():
+    with apply_style():
         film = Film(rf.simulate(MISSION))
         pictures = []
         for t in np.arange(0.0, END, SPEED / RATE):

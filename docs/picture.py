@@ -21,7 +21,7 @@ from rigidfleet.formation import outlines
 from rigidfleet.formation.point_files import Points
 from rigidfleet.mission import Mission, show_draft
 from rigidfleet.plotting import encode_figure
-from rigidfleet.plotting.style import settings
+from rigidfleet.plotting.style import apply_style
 from rigidfleet.simulation.trajectories import of_curves
 from rigidfleet.sweep import Sweep, fly
 from rigidfleet.sweep.figures import map_over_two, shares
@@ -43,9 +43,9 @@ def flight() -> None:
 def show() -> None:
     """The pictures of a show, made as its page makes it."""
     letters = outlines.slots_on_outlines(outlines.text_outlines("HI"), 100, 2.0)
-    scenes = [show_draft.scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
+    scenes = [show_draft.shape_scene(shape, 100, 2.0) for shape in ("sphere", "helix")]
     scenes.append(show_draft.points_scene("logo", Points(letters, None), "logo.csv"))
-    text = show_draft.show("my-show", scenes, agents=100, spacing=2.0)
+    text = show_draft.show_text("my-show", scenes, agents=100, spacing=2.0)
     result = rf.simulate(Mission.from_toml(text))
     with TemporaryDirectory() as folder:
         paths = rf.plot(result, folder, formats=["png"], names=["formations", "operation"])
@@ -57,7 +57,9 @@ def words() -> None:
     """A word in single strokes, as the page of shows writes it."""
     letters = outlines.slots_on_outlines(outlines.stroke_outlines("FLY"), 60, 2.0)
     scenes = [show_draft.points_scene("FLY", Points(letters, None), "strokes:FLY")]
-    result = rf.simulate(Mission.from_toml(show_draft.show("fly", scenes, agents=60, spacing=2.0)))
+    result = rf.simulate(
+        Mission.from_toml(show_draft.show_text("fly", scenes, agents=60, spacing=2.0))
+    )
     with TemporaryDirectory() as folder:
         (path,) = rf.plot(result, folder, formats=["png"], names=["formations"])
         _save_with_few_colours(path, "fly")
@@ -108,7 +110,7 @@ def drill() -> None:
     sweep = Sweep.load(IMAGES.parents[1] / "examples" / "market_square.toml")
     with TemporaryDirectory() as folder:
         table = fly(sweep, folder, workers=2)
-    with settings():
+    with apply_style():
         figure = shares(table)
         assert figure is not None
         picture = encode_figure(figure, ["png"])["png"]
@@ -152,7 +154,7 @@ def drawings() -> None:
     """The drawings, letters as outlines: they are read on screens without our fonts."""
     for draw in (*DIAGRAMS, *SHAPES):
         buffer = io.StringIO()
-        with settings(), matplotlib.rc_context({"svg.fonttype": "path"}):
+        with apply_style(), matplotlib.rc_context({"svg.fonttype": "path"}):
             draw().savefig(buffer, format="svg", metadata={"Date": None})
         name = draw.__name__.replace("_", "-")
         # Lines without blanks at their ends, as in any text that is kept.

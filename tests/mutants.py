@@ -448,7 +448,7 @@ def fly_with(plain: str) -> None:
     compiler: Any = jit
 
     def copied(function: Any, name: str, **instead: Any) -> Any:
-        return jit._copy(function, name, instead)
+        return jit._copy_function(function, name, instead)
 
     compiler.compiled_copy = copied
     from rigidfleet.kernel import guard, monitor, obstacles
@@ -459,7 +459,7 @@ def fly_with(plain: str) -> None:
         native.library().record(*of, segment, out)
 
     def bound_moves(watch: Any, problem: Any, state: Any) -> None:
-        monitor.bound_moves(problem, state, watch.monitor)
+        monitor.bound_changes(problem, state, watch.monitor)
 
     def distances(watch: Any, problem: Any, state: Any, first: int, end: int) -> None:
         monitor.watch_distances(first, end, problem, state, watch.monitor)
@@ -478,7 +478,7 @@ def fly_with(plain: str) -> None:
         flight, state, avoidance = (of[x] for x in addresses[:3])
         problem, work = (of[int(x)] for x in avoidance.law)
         with np.errstate(all="ignore"):
-            return int(guard.avoid(problem, work, flight, state, avoidance))
+            return int(guard.guard_forces(problem, work, flight, state, avoidance))
 
     watching: Any = native.Watch
     watching.clearances = clearances

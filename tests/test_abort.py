@@ -15,7 +15,7 @@ import rigidfleet as rf
 from rigidfleet.cli.app import main
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.abort import Aborts, _levels
-from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.losses import legs_from
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.preflight.aborts import check_aborts
@@ -30,7 +30,7 @@ def show(**abort: Any) -> Mission:
 
 def aborts_of(mission: Mission) -> Aborts:
     """Its aborts."""
-    return Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
+    return Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
 
 
 def random_mission(seed: int, *, rotors: bool = False) -> tuple[Mission, int]:
@@ -91,8 +91,8 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
     assert at is not None
     gone = mission.lost_at <= begins
     complete = complete_times(mission)
-    legs = legs_from(complete, at_start(complete), complete.phases)
-    abort = Aborts(complete, legs, gone if gone.any() else None).at(at)
+    legs = legs_from(complete, state_at_start(complete), complete.phases)
+    abort = Aborts(complete, legs, gone if gone.any() else None).abort_at(at)
     left = [i for i in range(mission.n_agents) if i != lost]
     i, j = np.array(list(itertools.combinations(left, 2))).T
 
@@ -112,7 +112,7 @@ def flown_apart(seed: int, *, rotors: bool = False) -> float:
         data = mission.to_dict()
         assert apart(Mission.from_dict(data | {"abort": {}, "disturbances": {}}), 0.0) < 0.3
         return np.inf
-    return apart(mission, begins) - abort.least.separation
+    return apart(mission, begins) - abort.certificate.separation
 
 
 #: A shipped mission, to where, and when: whose steps back once broke a limit of acceleration, who are pushed or lag.
@@ -133,7 +133,7 @@ def test_shipped_missions_pass_after_an_abort_and_keep_its_promise(
     """The verdict passes, and compares the least distance, that of samples, with the one that the abort promises."""
     data = load_mission(name).to_dict()
     mission = Mission.from_dict(data | {"abort": {"at": T, "to": to}})
-    promised = aborts_of(complete_times(mission)).at(T).least.separation
+    promised = aborts_of(complete_times(mission)).abort_at(T).certificate.separation
     result = rf.simulate(mission)
     verdict = rf.assess(result)
     assert verdict.passed, verdict.summary
@@ -190,11 +190,11 @@ def test_every_second_has_a_way_home_and_no_two_come_nearer(to: str) -> None:
     aborts = aborts_of(show(to=to))
     start = aborts.mission.fleet.position
     i, j = np.triu_indices(len(start), 1)
-    for abort in aborts.every():
+    for abort in aborts.all_aborts():
         assert abort.way, abort.reason
-        r = abort.at(np.linspace(abort.begins, abort.end, 1500))
+        r = abort.positions_at(np.linspace(abort.begins, abort.end, 1500))
         least = float(np.linalg.norm(r[:, i] - r[:, j], axis=2).min()) - 2.0 * 0.15
-        proved = abort.least.separation
+        proved = abort.certificate.separation
         assert least >= proved - 1e-9
         own = min(x.least.separation for x in abort.steps[1:]) if abort.steps[1:] else proved
         if own == proved:  # not from the plan, whose other seconds count, too
@@ -213,7 +213,7 @@ def test_slowing_down_is_the_plan_at_another_clock() -> None:
     plain = rf.simulate(mission, times=np.linspace(0.0, 24.0, 4801))
     result = rf.simulate(show(at=19.0))
     begins = 19.5
-    step = aborts_of(mission).at(19.0).steps[0]
+    step = aborts_of(mission).abort_at(19.0).steps[0]
     during = (result.time >= begins) & (result.time <= begins + step.duration)
     at = progress(begins, step.duration, result.time[during])
     k = np.searchsorted(plain.time, at)
@@ -268,7 +268,9 @@ def test_files_of_vehicles_lead_home_from_every_second(tmp_path: Path, name: str
         steps = table["ways"][str(abort["ways"])]
         end = abort["stops_s"] + sum(x["duration_s"] for x in steps)
         assert end == pytest.approx(ends[abort["ordered_s"]]["ends_s"], abs=1e-9)
-        assert steps[-1]["to_m"] == pytest.approx(planned.at(np.array([end]))[0, 0], abs=1e-5)
+        assert steps[-1]["to_m"] == pytest.approx(
+            planned.positions_at(np.array([end]))[0, 0], abs=1e-5
+        )
         for step in (x for x in steps if "back_to_s" in x):  # where the plan was then
             back += 1
             was = aborts_of(check.mission).plan.at(np.array([step["back_to_s"]]))[0, 0]
@@ -290,7 +292,7 @@ def test_slowing_down_into_a_phase_without_slots_is_proved_too() -> None:
         "agents": {"position": [[0, 0, 0.2], [3, 0, 0.2], [1.5, 2.5, 0.2]], "mass": 1.0, "radius": 0.2},
         "obstacles": [{"kind": "ground"}],
     }  # fmt: skip
-    step = aborts_of(complete_times(Mission.from_dict(data))).at(15.49).steps[0]
+    step = aborts_of(complete_times(Mission.from_dict(data))).abort_at(15.49).steps[0]
     r = step.way.at(np.linspace(0.0, step.duration, 2000))
     i, j = np.triu_indices(3, 1)
     least = np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.4
@@ -303,11 +305,11 @@ def test_what_follows_if_one_does_not_hear() -> None:
     """The nearest of a vehicle that flies on is that of a search of all vehicles, at fine samples."""
     aborts = aborts_of(show())
     plain = rf.simulate(aborts.mission, times=np.linspace(0.0, 24.0, 4801))
-    abort = aborts.at(7.0)
-    each = aborts.if_not_heard(abort)
+    abort = aborts.abort_at(7.0)
+    each = aborts.nearness_if_not_heard(abort)
     told = min(each)
     t = plain.time[(plain.time > abort.begins) & (plain.time < min(abort.end, 24.0))]
-    r, on = abort.at(t), plain.position[np.searchsorted(plain.time, t)]
+    r, on = abort.positions_at(t), plain.position[np.searchsorted(plain.time, t)]
     n = aborts.mission.n_agents
     best = np.full(n, np.inf)
     for i in range(n):
@@ -405,11 +407,13 @@ def test_some_leave_and_the_others_fly_on(agents: list[int], T: float) -> None:
             a, b = (np.interp(t, x.time, x.position[:, i, q]) for x in (plain, result))
             assert np.abs(a - b).max() < 1e-2
     assert np.abs(result.position[-1] - plain.position[-1]).max() < 0.02
-    abort = aborts_of(mission).at(T)
+    abort = aborts_of(mission).abort_at(T)
     i, j = np.triu_indices(12, 1)
-    r = abort.at(np.linspace(abort.begins, abort.end, 3000))
-    assert np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.3 >= abort.least.separation - 1e-9
-    away = abort.at(np.array([abort.stops]))[0] - r[0]
+    r = abort.positions_at(np.linspace(abort.begins, abort.end, 3000))
+    assert (
+        np.linalg.norm(r[:, i] - r[:, j], axis=2).min() - 0.3 >= abort.certificate.separation - 1e-9
+    )
+    away = abort.positions_at(np.array([abort.stop_time]))[0] - r[0]
     assert all(np.abs(away[k - 1]).max() > 0.01 for k in agents) or T < 10.0
 
 
@@ -420,7 +424,7 @@ def test_what_stands_in_the_way_is_named() -> None:
     data["phases"] = [p for p in data["phases"] if p["kind"] not in ("takeoff", "land")]
     data["agents"]["position"] = [[x, y, 12.0] for x, y, _ in data["agents"]["position"]]
     aborts = aborts_of(complete_times(Mission.from_dict(data | legs)))
-    abort = aborts.at(2.0)
+    abort = aborts.abort_at(2.0)
     assert not abort.way
     assert "there is no ground to land on" in abort.reason
     roof = {
@@ -431,7 +435,7 @@ def test_what_stands_in_the_way_is_named() -> None:
         "zone": True,
     }
     mission = complete_times(Mission.from_dict(data | {"obstacles": [{"kind": "ground"}, roof]}))
-    abort = aborts_of(mission).at(2.0)
+    abort = aborts_of(mission).abort_at(2.0)
     assert not abort.way
     assert "'roof' stands in the way" in abort.reason
     result = rf.simulate(Mission.from_dict(mission.to_dict() | {"abort": {"at": 2.0}}))
@@ -443,9 +447,9 @@ def test_what_stands_in_the_way_is_named() -> None:
 def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
     """A ball of 0.6 m at 30 m/s that crosses the way down of a vehicle leaves it no such way, if it hits it."""
     data = show().to_dict()
-    abort = aborts_of(show()).at(12.0)
+    abort = aborts_of(show()).abort_at(12.0)
     down = abort.end - 0.5 * abort.steps[-1].duration
-    x, y, z = abort.at(np.array([down]))[0, 6].tolist()
+    x, y, z = abort.positions_at(np.array([down]))[0, 6].tolist()
     hits = set()
     for late in (0.0, 0.5, 2.0, 3.5):
         waypoints = [[x - 60.0, y, z], [x + 60.0, y, z]]
@@ -453,9 +457,9 @@ def test_what_flies_past_fast_is_seen_between_slow_samples() -> None:
         ball = {"kind": "sphere", "radius": 0.6, "waypoints": waypoints, "times": times}
         ball["name"], ball["appears"], ball["vanishes"] = "ball", times[0] + 1.5, times[0] + 2.5
         every = {"obstacles": [*data["obstacles"], ball]}
-        planned = aborts_of(Mission.from_dict(data | every)).at(12.0)
+        planned = aborts_of(Mission.from_dict(data | every)).abort_at(12.0)
         t = np.linspace(times[0] + 1.5, times[0] + 2.5, 2001)
-        r = abort.at(t)
+        r = abort.positions_at(t)
         centre = np.linspace(x - 15.0, x + 15.0, 2001)
         far = r - np.column_stack([centre, 0.0 * t + y, 0.0 * t + z])[:, None]
         hit = np.linalg.norm(far, axis=2).min() < 0.6 + 0.15
@@ -486,9 +490,11 @@ def test_ways_home_stay_within_fences() -> None:
         aborts = aborts_of(complete_times(Mission.from_dict(data | more)))
         entered.append(0)
         for t in (21.0, 24.0, 28.0):
-            abort = aborts.at(t)
+            abort = aborts.abort_at(t)
             assert abort.way
-            x, y, z = np.moveaxis(abort.at(np.linspace(abort.begins, abort.end, 3000)), 2, 0)
+            x, y, z = np.moveaxis(
+                abort.positions_at(np.linspace(abort.begins, abort.end, 3000)), 2, 0
+            )
             entered[-1] += bool(((x > 3.0) & (x < 6.0) & (np.abs(y) < 1.5) & (z < 6.0)).any())
     assert entered[0] > 0
     assert entered[1] == 0
@@ -497,16 +503,16 @@ def test_ways_home_stay_within_fences() -> None:
 def test_equal_stopped_places_are_planned_once() -> None:
     """Orders while all hold share the number of their ways."""
     aborts = aborts_of(show())
-    numbers = [aborts.at(t).home.number for t in (8.0, 8.25, 8.5, 8.75, 9.0)]
+    numbers = [aborts.abort_at(t).home.number for t in (8.0, 8.25, 8.5, 8.75, 9.0)]
     assert len(set(numbers)) < 5
 
 
 def test_ways_are_made_again_and_not_kept() -> None:
     """Aborts keep less than a quarter of the size of their ways, which are the same each time, and end where said."""
     aborts = aborts_of(show(step=0.25))
-    aborts.at(3.0)  # what all share
+    aborts.abort_at(3.0)  # what all share
     tracemalloc.start()
-    every = list(aborts.every())
+    every = list(aborts.all_aborts())
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     steps = [step for abort in every for step in abort.steps]
@@ -577,4 +583,4 @@ def test_a_thousand_come_home_from_every_second(to: str) -> None:
     )
     assert len(check.aborts) == 81
     assert all(x.way for x in check.aborts)
-    assert check.least >= 0.8
+    assert check.least_separation >= 0.8

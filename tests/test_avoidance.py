@@ -13,10 +13,10 @@ from vehicle_samples import planned
 import rigidfleet as rf
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import avoidance
+from rigidfleet.kernel.avoidance import avoidance_arrays
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import half_space, single
+from rigidfleet.solids.records import half_space, one_solid
 
 G = 9.81
 
@@ -198,17 +198,17 @@ def test_barriers_change_accelerations_as_exact_solvers_do(seed, solve):
     u = r[edges[:, 0]] - r[edges[:, 1]]
     work.u[:] = u / np.linalg.norm(u, axis=1, keepdims=True)
     points = [fleet.VehicleDynamics(x, point=True) for x in m]
-    flight = fleet.flight(fleet.quadrotors(points, 0.0), start=0.0, h=0.02, steps=1)
-    state = fleet.begin(flight, np.zeros((n, fleet.STATES)), work)
-    a = avoidance(
+    flight = fleet.ideal_flight(fleet.quadrotors(points, 0.0), start=0.0, h=0.02, steps=1)
+    state = fleet.initial_state(flight, np.zeros((n, fleet.STATES)), work)
+    a = avoidance_arrays(
         period=0.02, b=b, lift=np.full(n, 1e3), mass=m, g=0.0, radius=np.full(n, D / 2), rate=rate, share=share,
-        solids=single(half_space(ground)), guarded=False, edges=len(edges),
+        solids=one_solid(half_space(ground)), guarded=False, edges=len(edges),
     )  # fmt: skip
     state.seen[:, :3], state.seen[:, 3:] = r, v
     for ask in (20.0 * (r.mean(axis=0) - r), wanted):
         a.hold[:], state.force[:] = hold, m[:, None] * ask
         assert (a.last > 0.0).any() == (ask is wanted)  # the search begins with other pushes
-        assert sampled.avoid(problem, work, flight, state, a)
+        assert sampled.guard_forces(problem, work, flight, state, a)
     # The same problem from its definition
     rows, needed, most = [], [], []
     for e, (i, j) in enumerate(edges):

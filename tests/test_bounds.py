@@ -12,7 +12,7 @@ from rigidfleet.errors import MissionError
 from rigidfleet.mission import Mission, json_schema, mission_names, mission_text
 from rigidfleet.mission import bounds as limits
 from rigidfleet.mission.bounds import excess
-from rigidfleet.mission.formations import coincident
+from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.planning import filters
 from rigidfleet.preflight.check import check
 
@@ -191,18 +191,18 @@ def test_points_at_one_place_are_found():
         p[n // 2] = p[0] + [3e-7, 0, 0]
         apart = np.linalg.norm(p[:, None] - p, axis=2) + np.tri(n).T
         close = (apart < 5e-7).any()
-        found = coincident(p)
+        found = coincident_pairs(p)
         assert bool(found) == close
         assert all(i < j and np.linalg.norm(p[i] - p[j]) < 2e-6 for i, j in found)
-    assert coincident(np.zeros((100_000, 3)))[-1] == (0, 99_999)
+    assert coincident_pairs(np.zeros((100_000, 3)))[-1] == (0, 99_999)
 
 
 def test_short_steps_of_slow_gusts_stay_gusts():
     """Dryden's transverse gusts of step 1e-6 tau grow apart as their spectrum says: 2 - 2 rho(t) = 3 t / tau."""
     white = np.random.default_rng(0).standard_normal((100_001, 2))
-    steps = np.diff(filters.second_order(white, 1e-6, 1.0))
+    steps = np.diff(filters.dryden_gust(white, 1e-6, 1.0))
     assert np.mean(steps**2) / 3e-6 == pytest.approx(1.0, abs=0.03)
-    assert np.isfinite(filters.second_order(white[:10], 1e-12, 1.0)).all()
+    assert np.isfinite(filters.dryden_gust(white[:10], 1e-12, 1.0)).all()
 
 
 # -- what takes long ---------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ def base(tmp_path, monkeypatch) -> Iterator[Path]:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
     monkeypatch.setattr(native, "_compile", lambda _: [code(OWN)])
     monkeypatch.setattr(native, "_loaded", {})
-    file = native._file("flight")
+    file = native._cache_file("flight")
     file.write_bytes(objects.concatenate([code(PLANTED)]))
     file.chmod(0o600)
     forget()
@@ -214,15 +214,17 @@ def test_what_is_made_is_private(tmp_path, monkeypatch):
 def test_writers_at_the_same_time(base):
     """However many write the machine code at the same time, who reads it finds one of them whole."""
     ours = [[bytes([k]) * 200_000] for k in range(4)]
-    native._write(ours[0], "flight")
+    native._cache_code(ours[0], "flight")
     writers = [
-        threading.Thread(target=lambda k=k: [native._write(ours[k], "flight") for _ in range(50)])
+        threading.Thread(
+            target=lambda k=k: [native._cache_code(ours[k], "flight") for _ in range(50)]
+        )
         for k in range(4)
     ]
     for writer in writers:
         writer.start()
     while any(writer.is_alive() for writer in writers):
-        assert native._read("flight") in ours
+        assert native._read_cached_code("flight") in ours
     assert [file.name for file in place(base).iterdir()] == [planted(base).name]
 
 
@@ -372,14 +374,14 @@ def test_workers_compile_nothing_that_cannot_be_kept(base, monkeypatch):
     (base / "rigidfleet").chmod(0o777)
     with pytest.warns(RuntimeWarning):
         assert native.library().integrate(0, 0, 0, 0) == OWN
-    given = pickle.loads(pickle.dumps(native.bequeath()))
+    given = pickle.loads(pickle.dumps(native.code_to_inherit()))
     forget()
     monkeypatch.setattr(native, "_loaded", {})
     monkeypatch.setattr(native, "_compile", refused)
     native.inherit(given)
     assert native.library().integrate(0, 0, 0, 0) == OWN
     assert jit.jit(lambda x: 3.0 * x)(1.0) == 3.0  # and do not warn again
-    assert native.bequeath() == given
+    assert native.code_to_inherit() == given
 
 
 @pytest.mark.long

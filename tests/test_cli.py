@@ -21,7 +21,7 @@ from rich.console import Console
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes, console
 from rigidfleet.errors import FlightError
-from rigidfleet.formation.graphs import neighbours
+from rigidfleet.formation.graphs import neighbour_edges
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.formation.shapes import slots as slots_of
 from rigidfleet.mission import mission_names, mission_text
@@ -480,7 +480,7 @@ def test_design_by_a_named_graph(capsys):
     found = json.loads(capsys.readouterr().out)
     graph = found["graphs"]["neighbours"]
     slots = slots_of("shells", 2.0, 300)
-    ends = spectrum(slots, neighbours(slots, 1.8), np.ones(300))
+    ends = spectrum(slots, neighbour_edges(slots, 1.8), np.ones(300))
     assert graph["index"] == pytest.approx(ends.index)
     assert graph["condition"] == pytest.approx(ends.condition)
     form = tomllib.loads(found["toml"])["formations"]["shells"]
@@ -1062,7 +1062,7 @@ def test_progress_leaves_compiling_out(monkeypatch):
     monkeypatch.setattr(console, "perf_counter", lambda: now)
     monkeypatch.setattr(console, "_SELDOM", 1e9)
     watch = console.FlightWatch()
-    watch.compiling()
+    watch.announce_compilation()
     watch.update(Progress(0.0, 90.0, "WP0", 0.1))
     now = 12.0
     watch.update(Progress(10.0, 90.0, "WP0", 12.0))
@@ -1089,7 +1089,7 @@ def test_progress_on_a_terminal(monkeypatch):
 
     with watch:
         assert "Starting: 0 s" in drawn()
-        watch.compiling()
+        watch.announce_compilation()
         now = 7.0
         assert f"{console.COMPILING}: 7 s" in drawn()
         watch.update(Progress(0.0, 90.0, "[WP0]", 1.0))

@@ -17,7 +17,7 @@ from rigidfleet.cli.app import main
 from rigidfleet.sweep import Sweep, faults, figures, fly, load
 from rigidfleet.sweep.faults import Drill, GeometricFault, Show
 from rigidfleet.sweep.run import fly_runs
-from rigidfleet.sweep.summary import borne, summarise
+from rigidfleet.sweep.summary import fault_rates, summarise
 
 log = log_file  # the fixture
 #: Least distance of the shows here, and radius of their vehicles [m].
@@ -226,9 +226,9 @@ def test_a_show_that_is_turned_as_a_whole_is_judged_by_its_fence_alone(tmp_path)
 def test_in_turn_every_vehicle_has_a_fault():
     """In n / k trials, each of n vehicles is among the k of a fault exactly once, if k divides n."""
     for count in (1, 3, 4):
-        some = [faults.some_of(5, 12, count, trial) for trial in range(12 // count)]
+        some = [faults.vehicles_of(5, 12, count, trial) for trial in range(12 // count)]
         assert sorted(np.concatenate(some).tolist()) == list(range(12))
-    again = [faults.some_of(5, 12, 4, trial).tolist() for trial in range(6)]
+    again = [faults.vehicles_of(5, 12, 4, trial).tolist() for trial in range(6)]
     assert again[:3] != again[3:]
     assert all(len(set(who)) == 4 for who in again)
 
@@ -287,7 +287,7 @@ def test_the_worst_run_of_each_fault_is_drawn(drilled):
     figure = figures.worst_runs(table)
     assert figure is not None
     worst = {}
-    for case in (case for case in borne(table) if case.worst):
+    for case in (case for case in fault_rates(table) if case.worst):
         known = worst.setdefault(case.fault, case)
         worst[case.fault] = min(known, case, key=lambda x: x.separation or 0.0)
     axes = [ax for ax in figure.axes if ax.lines]

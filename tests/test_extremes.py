@@ -10,7 +10,7 @@ import pytest
 
 from rigidfleet.assessment import assess
 from rigidfleet.errors import FlightError
-from rigidfleet.kernel.records import FIRST_ROW, STAYED, TRAILED, bernstein
+from rigidfleet.kernel.records import FIRST_ROW, STAYED, TRAILED, bernstein_basis
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.proximity import headroom, obstacle_clearances
@@ -27,7 +27,7 @@ class Steps:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.rows: list[tuple[float, float, np.ndarray]] = []
-        take = watching.Extremes.take
+        take = watching.Extremes.take_steps
 
         def spy(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
             seen = int(extremes.monitor.monitor.count[STAYED])
@@ -37,7 +37,7 @@ class Steps:
                 self.rows.append((t, h, state.trail.points[row].copy()))
             take(extremes, problem, work, state, last=last)
 
-        monkeypatch.setattr(watching.Extremes, "take", spy)
+        monkeypatch.setattr(watching.Extremes, "take_steps", spy)
 
     def positions(self, n: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         """Times (K,) and positions (K, N, 3) of agents in all steps; of the inertial formulation."""
@@ -279,7 +279,7 @@ def test_no_distance_changes_more_than_its_bound(formulation, monkeypatch):
     call, found, mission = watching.native.Watch.bound_moves, [], a_crowd(formulation)
     n = mission.n_agents
     i, j = np.triu_indices(n, 1)
-    basis = bernstein(np.linspace(0.0, 1.0, 9))
+    basis = bernstein_basis(np.linspace(0.0, 1.0, 9))
 
     def spy(watch: Any, problem: Any, state: Any) -> None:
         call(watch, problem, state)
@@ -435,7 +435,7 @@ def test_to_watch_a_large_formation_does_not_change_its_flight(form, monkeypatch
     def pass_over(extremes: Any, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         state.count[TRAILED] = 0
 
-    monkeypatch.setattr(watching.Extremes, "take", pass_over)
+    monkeypatch.setattr(watching.Extremes, "take_steps", pass_over)
     alone = simulate(mission)
     assert not alone.phases[0].extremes
     assert (watched.position == alone.position).all()
@@ -457,7 +457,7 @@ def test_extremes_of_a_large_formation_depend_on_no_pause_and_no_sample(monkeypa
 def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, monkeypatch):
     """Another thread, while the flight goes on, or this one, while it waits: the same to the bit."""
     mission = a_sphere(solver)
-    threads, take = set(), watching.Extremes.take
+    threads, take = set(), watching.Extremes.take_steps
 
     def spy(*given: Any, **options: Any) -> None:
         threads.add(threading.get_ident())
@@ -471,7 +471,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
                 flight.contact()
         return flight.finish()
 
-    monkeypatch.setattr(watching.Extremes, "take", spy)
+    monkeypatch.setattr(watching.Extremes, "take_steps", spy)
     aside, looked = simulate(mission), flown()
     assert len(threads) > 1, "each phase's last steps are taken here"
 
@@ -486,7 +486,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
 
 def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
     """Where the other thread is slow and the flight stops often, to the bit what is found while the flight waits."""
-    mission, take = a_sphere(), watching.Extremes.take
+    mission, take = a_sphere(), watching.Extremes.take_steps
     here = threading.get_ident()
 
     def flown() -> list[Any]:
@@ -504,7 +504,7 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
         extremes.take(problem, work, state, last=False)
 
-    monkeypatch.setattr(watching.Extremes, "take", take_slowly)
+    monkeypatch.setattr(watching.Extremes, "take_steps", take_slowly)
     aside = flown()
     monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
     assert aside == flown()
@@ -512,7 +512,7 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
 
 def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
     """An error ends the flight; Ctrl-C while it is waited for ends it with what was flown and found."""
-    mission, take = a_sphere(), watching.Extremes.take
+    mission, take = a_sphere(), watching.Extremes.take_steps
     here = threading.get_ident()
 
     def fail(*given: Any, **options: Any) -> None:
@@ -521,7 +521,7 @@ def test_what_goes_wrong_in_the_thread_that_watches_is_raised(monkeypatch):
         take(*given, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(watching.Extremes, "take", fail)
+        patch.setattr(watching.Extremes, "take_steps", fail)
         with pytest.raises(MemoryError, match="no more of it"):
             simulate(mission)
     done, wait = [], watching.Extremes.wait

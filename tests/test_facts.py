@@ -18,7 +18,7 @@ from test_sweep import everything
 import rigidfleet as rf
 from rigidfleet import plotting
 from rigidfleet._common.facts import Fact, FactTable, Line, Row, Sheet, value, worst_values
-from rigidfleet._common.text import all_hold
+from rigidfleet._common.text import all_hold_in_words
 from rigidfleet.cli import app, console
 from rigidfleet.math.margins import Margins
 from rigidfleet.mission import mission_names
@@ -134,7 +134,7 @@ def test_consoles_notebooks_and_pages_show_the_same_rows(what, flights):
     """Each row of each table (name, values, units, level) is the same on a console, in a notebook and on a page."""
     thing = SHOWN[what](flights)
     sheet = thing.facts()
-    tables = [part for part in sheet.shown if isinstance(part, FactTable)]
+    tables = [part for part in sheet.shown_parts if isinstance(part, FactTable)]
     notebook = rows_of(thing._repr_html_())
     page = [row for table in tables for row in rows_of(table.html("kind"))]
     assert page == notebook
@@ -146,7 +146,7 @@ def test_consoles_notebooks_and_pages_show_the_same_rows(what, flights):
         assert len(body) == len(table.rows) > 0
         for row, cells in zip(body, table.texts, strict=True):
             assert row in lines or plain(" ".join(cells[1:])) in lines, row
-    sentences = [part.text for part in sheet.shown if isinstance(part, Line)]
+    sentences = [part.text for part in sheet.shown_parts if isinstance(part, Line)]
     words = plain(html.unescape(thing._repr_html_().replace("<br>", " ")))
     assert all(plain(text) in words for text in sentences)
     assert all(plain(text) in plain(" ".join(lines)) for text in sentences)
@@ -162,7 +162,7 @@ def test_a_verdict_shows_what_its_json_holds(flights, which):
     """Name, value, unit and level of each check in JSON stand in a row, and no other rows do."""
     verdict = rf.assess(flights[which])
     data = json.loads(verdict.json())
-    head, *rows = rows_of(verdict.facts().shown[-len(verdict.notes) - 2].html())
+    head, *rows = rows_of(verdict.facts().shown_parts[-len(verdict.notes) - 2].html())
     assert head.startswith("check worst limit")
     checks = [c for c in data["checks"] if c["worst"] is not None or c["when"] is not None]
     for c, row in zip(checks, rows, strict=True):
@@ -175,7 +175,7 @@ def test_a_verdict_shows_what_its_json_holds(flights, which):
             assert not c["unit"] or words[1] == c["unit"], row
         assert words[-1] == level if level else words[-1] not in ("ok", "FAILED"), row
     for phase, row in zip(
-        data["phases"], rows_of(verdict.facts().shown[0].html())[1:], strict=True
+        data["phases"], rows_of(verdict.facts().shown_parts[0].html())[1:], strict=True
     ):
         numbers = row.removeprefix(phase["name"]).split()
         values = {k: e["value"] for k, e in phase["worst"].items()}
@@ -207,7 +207,7 @@ def test_a_check_shows_what_its_json_holds(name):
         *(("width of a gap", "m", g, "wide_m") for g in paths["gaps"]),
         *(("clearance", "m", c, "clearance_m") for c in paths["clearance"]),
     ]  # fmt: skip
-    tables = [part for part in ahead.facts().shown if isinstance(part, FactTable)]
+    tables = [part for part in ahead.facts().shown_parts if isinstance(part, FactTable)]
     every = rows_of(next(table for table in tables if table.heads[0] == "planned").html())
     rows = [row for row in every[1:] if not row.startswith(("spacing", "reserve", "force of"))]
     forces = [v for k, v in (data["disturbances"] or {}).items() if k.endswith("_n") and v > 0]
@@ -251,7 +251,7 @@ def test_words_on_a_graph_are_those_of_json(name):
     ahead = check(name)
     data = json.loads(json.dumps(ahead.data()))["formations"]
     table = next(
-        x for x in ahead.facts().shown if isinstance(x, FactTable) and x.heads[0] == "graph"
+        x for x in ahead.facts().shown_parts if isinstance(x, FactTable) and x.heads[0] == "graph"
     )
     names = [column for column, *_ in table.columns]
     rows = {row[0]: dict(zip(names, row, strict=True)) for row in table.texts}
@@ -275,7 +275,7 @@ def test_words_on_a_graph_are_those_of_json(name):
 def numbers_shown(ahead: Any) -> dict[tuple[str, str], list[str]]:
     """Numbers in the tables of a check but for worst values: by table and row, in the order of the columns."""
     shown = {}
-    for table in ahead.facts().shown[1:]:
+    for table in ahead.facts().shown_parts[1:]:
         if isinstance(table, FactTable) and not table.bare and table.heads[0] != "planned":
             graph = table.heads[0] == "graph"  # of whose words there is a test
             for row, *cells in table.texts:
@@ -322,7 +322,7 @@ def test_the_page_has_the_tables_of_its_objects(flights):
     tables = re.findall(r"<table.*?</table>", page, flags=re.DOTALL)
     rows = [row for table in tables for row in rows_of(table)]
     for sheet in (flights[0].mission.facts(), rf.assess(flights[0]).facts()):
-        for part in sheet.shown:
+        for part in sheet.shown_parts:
             if isinstance(part, FactTable):
                 assert all(row in rows for row in rows_of(part.html()))
 
@@ -383,7 +383,7 @@ def test_numbers_have_three_digits(x, text):
 )
 def test_checks_that_hold_are_counted_in_words(count, words):
     """One, two and more checks are told as one says them."""
-    assert all_hold(count) == words
+    assert all_hold_in_words(count) == words
 
 
 # -- width ---------------------------------------------------------------------------------------------

@@ -199,12 +199,12 @@ def test_a_full_disk_while_machine_code_is_kept(tmp_path, monkeypatch):
     """Nothing is left of machine code that could not be written, but a warning."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     native.warned.clear()
-    file = native._file("flight")
+    file = native._cache_file("flight")
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (16, limit[1]))
     try:
         with pytest.warns(RuntimeWarning, match="File too large"):
-            assert not native._write([b"machine code"], "flight")
+            assert not native._cache_code([b"machine code"], "flight")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert not any(file.parent.iterdir())

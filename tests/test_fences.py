@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 import rigidfleet as rf
 from rigidfleet.errors import MissionError
 from rigidfleet.math import falls
-from rigidfleet.math.bernstein import greatest_of
+from rigidfleet.math.bernstein import greatest_by_measure
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import boundaries, fences
 from rigidfleet.mission.geojson import read_geojson
@@ -22,7 +22,7 @@ from rigidfleet.mission.schema import GeodeticOrigin
 from rigidfleet.plotting.areas import falls_of
 from rigidfleet.reporting import html_page
 from rigidfleet.simulation.together import simulate_together
-from rigidfleet.solids.polygons import Region, some_cross
+from rigidfleet.solids.polygons import Region, edges_cross
 
 L_SHAPE = np.array([[0, 0], [10, 0], [10, 4], [4, 4], [4, 10], [0, 10]], dtype=float)
 HOLE = np.array([[1, 1], [1, 3], [3, 3], [3, 1]], dtype=float)
@@ -76,15 +76,15 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
     region, sign = Region.of_rings(RINGS, 2.0, 7.0), 1.0 if outside else -1.0
     for points in curves(30):
         dense = (sign * signed(region, along(points, np.linspace(0, 1, 20_001)))).max()
-        value, bound = (x[0] for x in region.most(points[None], outside=outside))
+        value, bound = (x[0] for x in region.depth(points[None], outside=outside))
         assert value <= dense + 1e-9
         assert bound >= dense - 1e-9
 
         def measure(p, _):
-            value, bound = region.most(p, outside=outside)
+            value, bound = region.depth(p, outside=outside)
             return value, np.full(len(p), 0.5), bound
 
-        worst = greatest_of(points[None], measure, lambda _: 1e-3)
+        worst = greatest_by_measure(points[None], measure, lambda _: 1e-3)
         assert dense - 1e-3 <= worst.value <= dense + 1e-3
         place = along(points, np.array([worst.place]))
         assert sign * signed(region, place)[0] == pytest.approx(worst.value, abs=1e-9)
@@ -92,9 +92,9 @@ def test_the_worst_of_a_curve_is_between_no_samples(outside):
 
 def test_edges_that_cross_are_known():
     """Of a bow tie, not of a triangle, and of edges that lie on each other."""
-    assert some_cross(Region.of_rings([np.array([[0, 0], [4, 4], [4, 0], [0, 4.0]])]).edges)
-    assert not some_cross(Region.of_rings([np.array([[0, 0], [4, 0], [0, 4.0]])]).edges)
-    assert some_cross(Region.of_rings([np.array([[0, 0], [4, 0], [1, 0], [1, 4.0]])]).edges)
+    assert edges_cross(Region.of_rings([np.array([[0, 0], [4, 4], [4, 0], [0, 4.0]])]).edges)
+    assert not edges_cross(Region.of_rings([np.array([[0, 0], [4, 0], [0, 4.0]])]).edges)
+    assert edges_cross(Region.of_rings([np.array([[0, 0], [4, 0], [1, 0], [1, 4.0]])]).edges)
 
 
 def test_a_fall_without_drag_is_a_parabola():
@@ -103,7 +103,7 @@ def test_a_fall_without_drag_is_a_parabola():
     tau = falls.fall_time(h, v[:, 2], np.zeros(50), 0.0, 9.81)
     expected = (v[:, 2] + np.sqrt(v[:, 2] ** 2 + 2 * 9.81 * h)) / 9.81
     assert tau == pytest.approx(expected, abs=1e-12)
-    place = falls.landing(np.zeros((50, 3)), v, tau, np.zeros(50), np.array([5.0, 0, 0]))
+    place = falls.landing_places(np.zeros((50, 3)), v, tau, np.zeros(50), np.array([5.0, 0, 0]))
     assert place == pytest.approx(v[:, :2] * expected[:, None], abs=1e-11)
 
 
@@ -124,7 +124,7 @@ def test_a_fall_with_drag_solves_its_differential_equation(k):
         solved = solve_ivp(rates, [0, 500], start, rtol=1e-12, atol=1e-12, events=ground)
         tau = falls.fall_time(np.array(60.0), np.array(v[2]), np.array(k), wind[2], g)
         assert tau == pytest.approx(solved.t_events[0][0], rel=1e-9)
-        place = falls.landing(np.array(start[:3]), np.array(v), tau, np.array(k), wind)
+        place = falls.landing_places(np.array(start[:3]), np.array(v), tau, np.array(k), wind)
         assert place == pytest.approx(solved.y_events[0][0][:2], abs=1e-6)
         places = falls.places(np.array(start[:3]), np.array(v), solved.t, k, wind, g)
         assert places == pytest.approx(solved.y[:3].T, abs=1e-6)
@@ -259,7 +259,7 @@ def test_the_nearest_fall_is_that_of_all_instants_and_heights():
         t = np.linspace(0, 1, 1000)
         r, v = way.states(t, 2)
         nearest = min(
-            region.across(own.landings(r, v, level).reshape(-1, 2)).min()
+            region.distance(own.landings(r, v, level).reshape(-1, 2)).min()
             for level in np.linspace(0, 2, 30)
         )
         nearest -= mission.agents.radius[0]
@@ -432,7 +432,7 @@ def test_an_island_in_a_hole_is_inside():
     points = RNG.uniform(-110.0, 110.0, (400, 2))
     rings = area.rings(mission.geodetic_origin)
     around = sum(Outline(x).contains_points(points).astype(int) for x in rings)
-    inside = area.region(mission.geodetic_origin, 0.0).across(points) < 0.0
+    inside = area.region(mission.geodetic_origin, 0.0).distance(points) < 0.0
     assert np.array_equal(inside, around % 2 == 1)
     assert 50 < inside.sum() < 350
 

@@ -715,7 +715,7 @@ def test_everything_in_space_is_in_the_picture(flight):
     view = space.scene(result)
     spatial, above = figure.axes
     points = np.concatenate(
-        [result.position.reshape(-1, 3), *(shape.ends for shape in view.shapes)]
+        [result.position.reshape(-1, 3), *(shape.extent for shape in view.shapes)]
     )
     inside = space._on_screen(spatial, points) / figure.bbox.size
     assert (inside > [0, 0.05]).all()
@@ -996,7 +996,7 @@ def test_words_at_a_point_are_on_the_page(width):
             ax.plot(result.time, dip)
             at = style.places_around(result.time[k], dip[k])
             style.annotate(ax, f"-0.228 m at {result.time[k]:.2f} s, agents 11 and 12", at)
-            style.place_words(figure)
+            style.place_annotations(figure)
         box = ax.texts[-1].get_window_extent()
         assert ax.bbox.x0 - 1 <= box.x0 < box.x1 <= ax.bbox.x1 + 1
 
@@ -1111,7 +1111,7 @@ def test_axes_keep_clear_of_one_another(name, cube):
     assert widest < 0.02 * figure.bbox.width, "no room is wasted"
     places = []
     for _ in range(2):
-        with style.settings():
+        with style.apply_style():
             figure.draw_without_rendering()
         places.append([ax.get_position().bounds for ax in figure.axes])
     np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-6)  # of the page

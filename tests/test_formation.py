@@ -422,11 +422,11 @@ def test_neighbours_reach_so_many_spacings():
     p = np.stack(np.meshgrid(3.0 * side, 3.0 * side, 3.0 * side, indexing="ij"), axis=-1)
     p = p.reshape(-1, 3)
     for reach, lengths in ((1.1, [1]), (1.5, [1, 2]), (1.9, [1, 2, 3])):
-        edges = graphs.neighbours(p, reach)
+        edges = graphs.neighbour_edges(p, reach)
         squares = np.unique((distance_geometry.distances(p, edges) / 3.0).round(9) ** 2)
         np.testing.assert_allclose(squares, lengths)
         assert len(np.unique(edges, axis=0)) == len(edges)
-    degree = np.bincount(graphs.neighbours(p, 1.9).ravel())
+    degree = np.bincount(graphs.neighbour_edges(p, 1.9).ravel())
     assert degree.max() == 26
 
 
@@ -482,7 +482,7 @@ def test_shells_are_two_spheres_one_size_apart(n):
     assert 2.0 - 0.1 < radius[jump + 1] - radius[jump] < 2.6
     if n == 300:
         one = shapes.slots("sphere", 2.0, n)
-        two, single = (spectrum(x, graphs.neighbours(x), np.ones(n)).index for x in (p, one))
+        two, single = (spectrum(x, graphs.neighbour_edges(x), np.ones(n)).index for x in (p, one))
         assert two > 1.4 * single
 
 

@@ -18,13 +18,13 @@ from rigidfleet.kernel.avoidance import (
     GUARD,
     OBSTACLE,
     PAIR,
-    avoidance,
+    avoidance_arrays,
     candidates,
-    sight,
+    initial_sight,
 )
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, box, half_space, join, single
+from rigidfleet.solids.records import ball, box, half_space, join, one_solid
 
 #: Period of the commands [s].
 T = 0.1
@@ -55,8 +55,8 @@ class Crowd:
             self.problem = self.problem._replace(graph=graph(np.array(edges), every["mass"]))
             self.work = workspace(n, len(edges))
             S = np.zeros((n, fleet.STATES))
-            self.state = fleet.begin(self.flight, S, self.work)
-        self.a = avoidance(g=g, edges=len(edges), **every)
+            self.state = fleet.initial_state(self.flight, S, self.work)
+        self.a = avoidance_arrays(g=g, edges=len(edges), **every)
 
     def __call__(self, r: Any, v: Any, asked: Any, t: float = 0.0) -> np.ndarray:
         """Accelerations (N, 3) that are given at t [s] for some asked for."""
@@ -64,7 +64,7 @@ class Crowd:
         s.seen[:, :3], s.seen[:, 3:] = r, v
         s.force[:] = a.weight[:, None] * (np.asarray(asked) + [0.0, 0.0, a.g])
         s.work.law_time[0] = t
-        assert sampled.avoid(self.problem, self.work, self.flight, s, a)
+        assert sampled.guard_forces(self.problem, self.work, self.flight, s, a)
         return s.force / a.weight[:, None] - [0.0, 0.0, a.g]
 
 
@@ -109,7 +109,7 @@ LOW, HIGH, MIDDLE, SIZE, GROUND = (
     0.6,
     -1.3,
 )
-WALLS = join([single(box(LOW, HIGH)), single(ball(MIDDLE, SIZE)), single(half_space(GROUND))])  # fmt: skip
+WALLS = join([one_solid(box(LOW, HIGH)), one_solid(ball(MIDDLE, SIZE)), one_solid(half_space(GROUND))])  # fmt: skip
 
 
 def from_walls(x: np.ndarray) -> list[np.ndarray]:
@@ -233,7 +233,7 @@ def test_who_passes_beside_another_is_left_alone(seed):
 
 def test_margins_are_the_least_so_far_and_the_first_that_is_lost():
     """Of two that come nearer and part, and of one beside a ball: the least margin, and the first negative one."""
-    things = single(ball([0.0, 0, 5.0], 1.0))
+    things = one_solid(ball([0.0, 0, 5.0], 1.0))
     crowd = Crowd(2, solids=things, filtered=False, separation=0.2, clearance=0.1)
     gaps, heights = [1.2, 0.75, 0.5, 0.9], [3.4, 3.8, 3.3, 3.75]
     for k, (gap, z) in enumerate(zip(gaps, heights, strict=True)):
@@ -251,7 +251,7 @@ def test_margins_are_the_least_so_far_and_the_first_that_is_lost():
 def test_who_is_nearer_to_an_obstacle_than_it_should_be_comes_no_nearer(seed):
     """Past a ball, with less room than should be kept, and asked to fly into it: the stop segment keeps what it has."""
     rng = np.random.default_rng(seed)
-    crowd = Crowd(1, solids=single(ball(np.zeros(3), 0.7)), clearance=0.3, filtered=False)
+    crowd = Crowd(1, solids=one_solid(ball(np.zeros(3), 0.7)), clearance=0.3, filtered=False)
     n = rng.normal(size=3)
     n /= np.linalg.norm(n)
     t = np.cross(n, rng.normal(size=3))
@@ -333,7 +333,7 @@ def test_beside_a_ball_that_moves_the_relative_motion_keeps_the_distance(seed, d
         asked = rng.normal(0.0, 6.0, 3)
         if k % 3 == 0:  # straight at the vehicle, too fast to brake
             w = w + 3.5 * way / np.linalg.norm(way)
-        thing = single(ball(np.zeros(3), Beside.size), ends, np.outer(ends, w))
+        thing = one_solid(ball(np.zeros(3), Beside.size), ends, np.outer(ends, w))
         crowd = Crowd(1, solids=thing, clearance=0.1, drag=drag, filtered=False)
         (took,) = crowd([r], [v], [asked])
         of = Beside(r, v, w, drag)
@@ -364,8 +364,8 @@ def test_beside_a_ball_that_moves_the_relative_motion_keeps_the_distance(seed, d
 def test_of_two_balls_the_one_that_leaves_less_room_is_the_threat(turned):
     """Both come too fast to brake in time; braking is then relative to the worse one, whatever their order."""
     ends, n = np.array([0.0, 60.0]), np.array([0.6, 0.0, 0.8])
-    fast = single(ball(-3.0 * n, 0.5), ends, np.outer(ends, 5.3 * n))
-    slow = single(ball(3.0 * n, 0.5), ends, np.outer(ends, -5.0 * n))
+    fast = one_solid(ball(-3.0 * n, 0.5), ends, np.outer(ends, 5.3 * n))
+    slow = one_solid(ball(3.0 * n, 0.5), ends, np.outer(ends, -5.0 * n))
     crowd = Crowd(1, solids=join([fast, slow][:: -1 if turned else 1]), filtered=False)
     crowd([[0.0, 0, 0]], np.zeros((1, 3)), np.zeros((1, 3)))
     short = {5.3: 0.0, 5.0: 0.0}
@@ -475,9 +475,11 @@ def test_beside_a_ball_a_vehicle_is_pushed_as_much_as_its_barrier_asks(seed, mov
     ends = np.array([0.0, 60.0])
     place = rng.normal(size=3)
     thing = (
-        single(ball(place, size), ends, np.outer(ends, w)) if moves else single(ball(place, size))
+        one_solid(ball(place, size), ends, np.outer(ends, w))
+        if moves
+        else one_solid(ball(place, size))
     )
-    seen = sight(thing, 50.0, noise * moves, seed=seed)
+    seen = initial_sight(thing, 50.0, noise * moves, seed=seed)
     crowd = Crowd(
         1, solids=thing, seen=seen, clearance=clearance, rate=rate, lag=lag, guarded=False
     )
@@ -529,7 +531,7 @@ def test_rigid_edges_pass_a_push_on_to_all(seed):
     way = np.cumsum(rng.normal(size=(n, 3)) * 0.5 + [3.0, 0, 0], axis=0)
     edges = [(i, i + 1) for i in range(n - 1)] + [(i, i + 2) for i in range(n - 2)]
     m = np.array([0.0, 0, 1.0])
-    thing = single(ball(way[0] - (gap + 0.5 + RADIUS) * m, 0.5))
+    thing = one_solid(ball(way[0] - (gap + 0.5 + RADIUS) * m, 0.5))
     crowd = Crowd(n, mass=mass, edges=edges, solids=thing, rate=rate, guarded=False)
     x = np.array([way[i] - way[j] for i, j in edges])
     crowd.work.u[:] = x / np.linalg.norm(x, axis=1)[:, None]
@@ -555,7 +557,7 @@ def test_rigid_edges_pass_a_push_on_to_all(seed):
 def test_edges_let_go_as_they_are_pushed_and_take_hold_again():
     """The share to which edges hold falls with the push, by its part of half the braking, and returns to all."""
     release = 0.5
-    crowd = Crowd(1, solids=single(half_space(0.0)), guarded=False, release=release, mass=2.0)
+    crowd = Crowd(1, solids=one_solid(half_space(0.0)), guarded=False, release=release, mass=2.0)
     hold = 1.0
     for k in range(3):
         (took,) = crowd([[0.0, 0, 0.8]], [[0.0, 0, -1.6]], np.zeros((1, 3)), t=k * T)
@@ -612,7 +614,7 @@ def test_thrust_is_limited_in_its_own_direction():
     expected = thrust * np.minimum(1.0, lift / np.linalg.norm(thrust, axis=1))[:, None] - [0, 0, g]
     assert np.linalg.norm(thrust[0]) > lift
     assert crowd.a.wanted == pytest.approx(expected, abs=1e-9)
-    near = single(ball([0.0, 0.0, -2.2], 1.0))
+    near = one_solid(ball([0.0, 0.0, -2.2], 1.0))
     crowd = Crowd(2, g=g, lift=lift, solids=near, flow=True, guarded=False, filtered=False)
     took = crowd(r, np.zeros((2, 3)), asked)
     assert not np.allclose(took[0], expected[0], atol=0.1)
@@ -622,7 +624,7 @@ def test_thrust_is_limited_in_its_own_direction():
 def test_a_push_that_asks_for_too_much_thrust_is_limited():
     """Pushed aside with all its thrust up already, a vehicle has the direction of both, at the limit."""
     g, lift = 9.81, 14.0
-    crowd = Crowd(1, g=g, lift=lift, solids=single(ball([2.0, 1.0, 0.0], 0.5)), guarded=False)
+    crowd = Crowd(1, g=g, lift=lift, solids=one_solid(ball([2.0, 1.0, 0.0], 0.5)), guarded=False)
     n = np.array([-2.0, -1.0, 0.0]) / math.sqrt(5.0)
     u, asked = 3.5, np.array([0.0, 0.0, 4.0])
     (took,) = crowd([[0.0, 0, 0]], [-u * n], [asked])
@@ -691,7 +693,7 @@ def test_the_point_that_is_led_obeys_at_once():
 
 def test_a_quadrotor_that_is_overruled_follows_with_its_lag():
     """Beside a wall, the command follows the guard's choice by T / (T + s) of what is left, and then what is asked."""
-    wall = single(box([0.75, -9, -9], [2.0, 9, 9]))
+    wall = one_solid(box([0.75, -9, -9], [2.0, 9, 9]))
     crowd = quadrotors(1, solids=wall, filtered=False)
     asked, s = np.array([[6.0, 0.0, 0.0]]), AHEAD[:, 2]
     for k in range(2):  # nothing is near: it is commanded what is asked for
@@ -832,7 +834,13 @@ def test_sweeps_push_all_and_then_those_that_push_until_little_changes(ask):
         pull=np.zeros(m), hold=np.ones(n),
     )  # fmt: skip
     sweep = as_python(
-        barriers, "relative", "shove", "edge_softness", "relax", "relax_edges", "sweep"
+        barriers,
+        "difference_along",
+        "push_apart",
+        "edge_softness",
+        "relax_barrier",
+        "relax_edges",
+        "sweep_gauss_seidel",
     )
     x, right = np.r_[np.zeros(count), rng.normal(size=m)], np.r_[missing, np.zeros(m)]
     a.pull[:], a.shift[:] = x[count:], (np.repeat(inverse, 3) * (x @ J)).reshape(n, 3)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from rigidfleet.kernel.compiler.simd import (
+    as_lanes,
     fill_lanes,
-    in_vectors,
     pack,
     rough_inverse,
     total_or_worst,
@@ -66,7 +66,7 @@ def test_blocks_are_a_view_of_eight_states_each():
 
     @numba.njit
     def double(x):
-        y = in_vectors(x)
+        y = as_lanes(x)
         for k in range(y.shape[1]):
             y[1, k] = 2.0 * y[0, k]
         return y.shape[1]
@@ -85,7 +85,7 @@ def test_an_error_is_a_sum_of_one_flight_and_the_worst_of_eight():
 
     @numba.njit
     def error(x):
-        y = in_vectors(x)
+        y = as_lanes(x)
         squares = fill_lanes(0.0)
         for k in range(y.shape[0]):
             squares += y[k] * y[k]
@@ -104,7 +104,7 @@ def test_a_rough_inverse_has_four_digits():
 
     @numba.njit
     def weights(x):
-        y = in_vectors(x)
+        y = as_lanes(x)
         for k in range(y.shape[0]):
             y[k] = rough_inverse(y[k])
 

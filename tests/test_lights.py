@@ -12,7 +12,7 @@ from sample_flights import WORD, bitmap, swarm, word
 
 from rigidfleet import plotting
 from rigidfleet.interchange import FORMATS, export
-from rigidfleet.result.lights import lights, seen_from, view
+from rigidfleet.result.lights import lights, plane_view, view_angles
 from rigidfleet.web.replay import html_page
 
 AMBER = np.array([255, 176, 0]) / 255
@@ -97,7 +97,7 @@ UPRIGHT = np.array([[0, 0, 0], [3, 0, 0], [0, 0, 2], [3, 0.2, 2], [1, 0, 1]], dt
 )
 def test_the_viewer_faces_the_plane(points, azimuth, steep):
     """A flat formation is seen along its normal, from the side on which x or y points to the right."""
-    turn, elevation = np.degrees(seen_from(points))
+    turn, elevation = np.degrees(plane_view(points))
     assert turn == pytest.approx(azimuth, abs=3)
     assert elevation == pytest.approx(90) if steep else 0 < elevation < 10
 
@@ -108,7 +108,7 @@ def test_the_viewer_turns_with_the_formation():
     turned = made.position @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     half = math.sqrt(0.5)
     attitude = np.tile([half, 0, 0, half], (len(made.time), 1))
-    azimuth, _ = view(replace(made, position=turned, attitude=attitude))
+    azimuth, _ = view_angles(replace(made, position=turned, attitude=attitude))
     assert math.degrees(azimuth) == pytest.approx(0.0, abs=1.0)
 
 

@@ -126,7 +126,7 @@ def test_stays_rigid():
         if k % 8 == 0:
             pilot.steer(rng.normal(size=3), 0.4 * rng.normal(size=3))
         if k == 60:
-            pilot.change("line")
+            pilot.change_formation("line")
         records.append(pilot.step())
     assert pilot.formation == "line"
     assert worst(records, "constraint") < 1e-6
@@ -146,15 +146,15 @@ def test_levels_and_clears_the_ground():
 def test_one_change_after_another():
     """A change of formation waits until the one before is over; asking for the present one cancels it."""
     pilot = Pilot(TRIANGLE)
-    pilot.change("line")
+    pilot.change_formation("line")
     pilot.step()
-    assert (pilot.formation, pilot.waiting, pilot.busy) == ("triangle", "line", True)
+    assert (pilot.formation, pilot.waiting, pilot.is_changing) == ("triangle", "line", True)
     flown(pilot, 4.1)
-    assert (pilot.formation, pilot.waiting, pilot.busy) == ("line", None, True)
-    pilot.change("triangle")
-    pilot.change("line")
+    assert (pilot.formation, pilot.waiting, pilot.is_changing) == ("line", None, True)
+    pilot.change_formation("triangle")
+    pilot.change_formation("line")
     flown(pilot, 5.0)
-    assert (pilot.formation, pilot.busy) == ("line", False)
+    assert (pilot.formation, pilot.is_changing) == ("line", False)
     assert [p.name for p in pilot.flight.phases] == ["establish triangle", "change to line"]
 
 
@@ -178,7 +178,7 @@ def test_gust():
     """A gust displaces the vehicles one after the other and loads the edges; then all is as before."""
     pilot = Pilot(TRIANGLE)
     flown(pilot, 8.0)
-    pilot.gust(np.array([2.0, 0.0, 0.0]), 3.0)
+    pilot.send_gust(np.array([2.0, 0.0, 0.0]), 3.0)
     hit = flown(pilot, 3.0)
     assert max(map(slot_error, hit)) > 0.2
     assert worst(hit, "multiplier") > 0.3
@@ -280,11 +280,11 @@ def test_a_ball_is_avoided_and_kept():
     """Vehicles give way to a ball that flies at one of them; the record has it: when, where, how it moved."""
     pilot = settled()
     start, appeared = places(pilot)[0] + [9.0, 0.0, 0.0], pilot.t
-    ball = pilot.push_in(start, 0.8, np.array([-2.0, 0.0, 0.0]))
+    ball = pilot.add_ball(start, 0.8, np.array([-2.0, 0.0, 0.0]))
     flown(pilot, 7.0)
     gone = pilot.t
     np.testing.assert_allclose(ball.place, start - [14.0, 0.0, 0.0], atol=1e-9)
-    pilot.take_out(ball.slot)
+    pilot.remove_ball(ball.slot)
     flown(pilot, 1.0)
     assert pilot.flight.ending == ""
     result = pilot.result()
@@ -309,7 +309,7 @@ def test_without_the_guard_contact_ends_the_flight():
     """Points that nothing guards meet the ball; the flight ends, and says who met what and when."""
     pilot = Pilot(mission())
     flown(pilot, 7.0)
-    ball = pilot.push_in(places(pilot)[1] + [0.0, 0.0, 5.0], 1.0, np.array([0.0, 0.0, -2.0]))
+    ball = pilot.add_ball(places(pilot)[1] + [0.0, 0.0, 5.0], 1.0, np.array([0.0, 0.0, -2.0]))
     flown(pilot, 4.0)
     met = 7.0 + (5.0 - 1.25) / 2.0  # the surfaces
     assert pilot.flight.ending.startswith("agent 2 met 'ball 1' at 8.")
@@ -327,22 +327,22 @@ def test_a_ball_is_drawn():
     """A ball follows where it is drawn to, no faster than allowed, and stays where it is let go."""
     pilot = settled()
     start = places(pilot).mean(axis=0) + [0.0, 12.0, 0.0]
-    ball = pilot.push_in(start, 0.5, np.zeros(3))
-    pilot.pull(ball.slot, start + [6.0, 0.0, 0.0])
+    ball = pilot.add_ball(start, 0.5, np.zeros(3))
+    pilot.pull_ball(ball.slot, start + [6.0, 0.0, 0.0])
     before = ball.place
     for _ in range(20):
         pilot.step()
         assert np.linalg.norm(ball.place - before) <= balls.FASTEST * TICK + 1e-12
         before = ball.place
     assert ball.place[0] > start[0] + 2.0
-    pilot.pull(ball.slot, None)
+    pilot.pull_ball(ball.slot, None)
     flown(pilot, 0.5)
     np.testing.assert_array_equal(ball.place, before)
     result = pilot.result()
     thing = kept(result, -1)
     assert thing.vanishes is None
     np.testing.assert_allclose(thing.waypoints[-1], before)
-    pilot.pull(ball.slot, start)
+    pilot.pull_ball(ball.slot, start)
     flown(pilot, 4.0)
     np.testing.assert_allclose(ball.place, start, atol=2e-3)
 
@@ -361,7 +361,7 @@ def test_balls_have_limits(radius, velocity, away, words):
     pilot = settled()
     place = places(pilot)[0] + [-away, 0.0, 0.0]
     with pytest.raises(ValueError, match=re.escape(words)) as refused:
-        pilot.push_in(place, radius, np.array([velocity, 0.0, 0.0]))
+        pilot.add_ball(place, radius, np.array([velocity, 0.0, 0.0]))
     assert "\n" not in str(refused.value)
     assert pilot.balls == []
 
@@ -371,15 +371,15 @@ def test_eight_balls_at_once():
     pilot = settled()
     up = places(pilot).max(axis=0) + [0.0, 0.0, 10.0]
     for k in range(balls.AT_ONCE):
-        assert pilot.push_in(up + [k, 0.0, 0.0], 0.3, np.zeros(3)).slot == k
+        assert pilot.add_ball(up + [k, 0.0, 0.0], 0.3, np.zeros(3)).slot == k
     with pytest.raises(ValueError, match="remove one first"):
-        pilot.push_in(up, 0.3, np.zeros(3))
+        pilot.add_ball(up, 0.3, np.zeros(3))
     pilot.step()
-    pilot.take_out(3)
+    pilot.remove_ball(3)
     with pytest.raises(ValueError, match="gone"):
-        pilot.pull(3, up)
-    assert pilot.push_in(up, 0.3, np.zeros(3)).name == "ball 9"
-    assert [ball.slot for ball in pilot.flying].count(3) == 1
+        pilot.pull_ball(3, up)
+    assert pilot.add_ball(up, 0.3, np.zeros(3)).name == "ball 9"
+    assert [ball.slot for ball in pilot.flying_balls].count(3) == 1
 
 
 def test_the_target_stays_out_of_obstacles():
@@ -412,7 +412,7 @@ def test_a_formation_without_room_is_refused():
     pilot = settled(obstacles=[{"kind": "ground"}, wall])
     assert pilot.flight.ending == ""
     with pytest.raises(ValueError, match=r"'line' has no room here: agent 3 would meet 'wall'"):
-        pilot.change("line")
+        pilot.change_formation("line")
     assert pilot.waiting is None
 
 
@@ -471,7 +471,9 @@ def by_hand(pilot: Pilot, seconds: float, change: float = math.inf) -> list:
         if k % 8 == 0:
             pilot.steer(rng.normal(size=3) + [0.0, 0.0, 0.7], 0.3 * rng.normal(size=3))
         if k == round(change / TICK) if math.isfinite(change) else False:
-            pilot.change(next(name for name in pilot.formations if name != pilot.formation))
+            pilot.change_formation(
+                next(name for name in pilot.formations if name != pilot.formation)
+            )
         records.append(pilot.step())
     return records
 
@@ -561,7 +563,7 @@ def test_again_and_again():
     """A formation taken twice is two phases of two names."""
     pilot = Pilot(TRIANGLE)
     for name in ("line", "triangle", "line"):
-        pilot.change(name)
+        pilot.change_formation(name)
         flown(pilot, 5.0)
     names = [p.name for p in pilot.result().mission.phases]
     assert names == [
@@ -650,7 +652,7 @@ def test_samples_are_the_flight():
     thread.start()
     time.sleep(0.3)
     assert session.result.time[-1] == pytest.approx(TICK)  # nobody looks: it waits
-    messages = session.join()
+    messages = session.add_page()
     name, data = told(messages)
     assert name == "story"
     assert json.loads(data)["formation"] == "triangle"
@@ -672,7 +674,7 @@ def test_real_time():
     """A flight takes as long as it lasts, and at twice the speed half of it."""
     session = Session(TRIANGLE)
     thread = threading.Thread(target=session.run)
-    messages = session.join()
+    messages = session.add_page()
     thread.start()
     marks = []
     for speed in (1, 2):
@@ -687,7 +689,7 @@ def test_real_time():
         assert session.pilot.t == t
         session.command({"pause": False})
     session.stop()
-    session.leave(messages)
+    session.remove_page(messages)
     thread.join(5)
     assert marks == pytest.approx([1.0, 2.0], rel=0.35)
 
@@ -700,7 +702,7 @@ def test_last_page_closed(monkeypatch):
     thread.start()
     time.sleep(0.5)
     assert thread.is_alive()  # the first page is still awaited
-    session.leave(session.join())
+    session.remove_page(session.add_page())
     thread.join(3)
     assert not thread.is_alive()
 

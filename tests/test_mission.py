@@ -364,8 +364,8 @@ def test_graphs_have_names():
     """'neighbours', 'henneberg' and 'henneberg-multilevel' are the graphs that the functions of those names make."""
     p = shapes.slots("sphere", 2.0, 30)
     for form, want in (
-        ({"edges": "neighbours"}, graphs.neighbours(p)),
-        ({"edges": "neighbours", "reach": 1.2}, graphs.neighbours(p, 1.2)),
+        ({"edges": "neighbours"}, graphs.neighbour_edges(p)),
+        ({"edges": "neighbours", "reach": 1.2}, graphs.neighbour_edges(p, 1.2)),
         ({"edges": "henneberg"}, graphs.henneberg(p)),
         ({"edges": "henneberg-multilevel"}, graphs.henneberg_multilevel(p)),
     ):

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 import rigidfleet as rf
 from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
-from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, Trail, bernstein
+from rigidfleet.kernel.records import FROM_KNOTS, KNOTS, Trail, bernstein_basis
 from rigidfleet.mission import Mission, load_mission
 
 #: Times within a step at which curves are sampled.
 FINE = np.linspace(0.0, 1.0, 2001)
-BASIS = bernstein(FINE)
+BASIS = bernstein_basis(FINE)
 #: A box, and a fence round everything.
 BOX = np.array([[0.5, -0.4, -0.3, 1.4, 0.5, 0.6]])
 FENCE = np.array([[-3.0, -3.1, -3.2, 3.3, 3.4, 3.5]])

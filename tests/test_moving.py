@@ -9,10 +9,10 @@ from vehicle_samples import planned
 
 import rigidfleet as rf
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import KNOWN, UNKNOWN, avoidance, sight
+from rigidfleet.kernel.avoidance import KNOWN, UNKNOWN, avoidance_arrays, initial_sight
 from rigidfleet.kernel.engine import sampled
 from rigidfleet.kernel.problem import graph, workspace
-from rigidfleet.solids.records import ball, box, half_space, join, single
+from rigidfleet.solids.records import ball, box, half_space, join, one_solid
 
 #: Period of the commands [s].
 T = 0.02
@@ -26,28 +26,28 @@ class One:
         edges, mass = np.zeros((0, 2), dtype=np.int64), np.ones(1)
         self.problem, self.work = plan[0]._replace(graph=graph(edges, mass)), workspace(1, 0)
         points = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)], 0.0)
-        self.flight = fleet.flight(points, start=0.0, h=T, steps=1)
-        self.state = fleet.begin(self.flight, np.zeros((1, fleet.STATES)), self.work)
+        self.flight = fleet.ideal_flight(points, start=0.0, h=T, steps=1)
+        self.state = fleet.initial_state(self.flight, np.zeros((1, fleet.STATES)), self.work)
         seen = {
             key: options.pop(key) for key in ("reach", "noise", "swerve", "seed") if key in options
         }
-        self.a = avoidance(
+        self.a = avoidance_arrays(
             period=T, b=5.0 * mass, lift=50.0 * mass, mass=mass, g=0.0, radius=0.3 * mass, solids=solids,
-            seen=sight(solids, **seen), **options,
+            seen=initial_sight(solids, **seen), **options,
         )  # fmt: skip
 
     def __call__(self, t, r, v, force):
         """The acceleration (3,) that is given at t [s] for one asked for."""
         self.state.seen[0, :3], self.state.seen[0, 3:], self.state.force[0] = r, v, force
         self.state.work.law_time[0] = t
-        assert sampled.avoid(self.problem, self.work, self.flight, self.state, self.a)
+        assert sampled.guard_forces(self.problem, self.work, self.flight, self.state, self.a)
         return self.state.force[0].copy()
 
 
 def passing(place, velocity, radius=0.7):
     """A ball of constant velocity."""
     ends = np.array([0.0, 60.0])
-    return single(ball(place, radius), ends, np.outer(ends, velocity))
+    return one_solid(ball(place, radius), ends, np.outer(ends, velocity))
 
 
 # -- the filter ---------------------------------------------------------------------------------------
@@ -57,7 +57,7 @@ def passing(place, velocity, radius=0.7):
 def test_the_filter_is_the_conditional_mean(swerve):
     """Estimate and variance are those of the Gaussian of all places and velocities, given all measurements at once."""
     noise, ticks, velocity = 0.05, 30, np.array([1.0, -2.0, 0.5])
-    things = join([single(half_space(-90.0)), passing([5.0, 0, 0], velocity)])
+    things = join([one_solid(half_space(-90.0)), passing([5.0, 0, 0], velocity)])
     fly = One(things, reach=50.0, noise=noise, swerve=swerve, seed=3)
     for k in range(ticks):
         fly(k * T, np.zeros(3), np.zeros(3), np.zeros(3))
@@ -157,7 +157,7 @@ def test_a_vehicle_steers_past_what_would_pass_too_near(seed):
 def test_nobody_steers_round_a_wall():
     """A wide plate that comes from afar asks for nothing: there is no way past it, and braking suffices later."""
     ends, plate = np.array([0.0, 60.0]), box([6.0, -4.5, -4.5], [6.01, 4.5, 4.5])
-    fly = One(single(plate, ends, np.outer(ends, [-2.5, 0, 0])), guarded=False)
+    fly = One(one_solid(plate, ends, np.outer(ends, [-2.5, 0, 0])), guarded=False)
     given = fly(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
     assert given == pytest.approx(np.zeros(3), abs=1e-12)
 

@@ -11,7 +11,7 @@ from rigidfleet._common.toml import to_toml
 from rigidfleet.errors import MissionError
 from rigidfleet.kernel import fleet
 from rigidfleet.kernel.engine import native, sampled
-from rigidfleet.kernel.mail import LOST, assign_edges
+from rigidfleet.kernel.mail import LOST, give_edges_to_links
 from rigidfleet.kernel.problem import ITERATED, workspace
 from rigidfleet.kernel.records import FINISHED
 from rigidfleet.planning.legs import leg_of
@@ -21,7 +21,7 @@ from rigidfleet.planning.vehicles import TickTables, YawTurn, network_of, sample
 from rigidfleet.plotting.messages import oldest_messages
 from rigidfleet.typing import Floats
 from rigidfleet.web.live.session import Session
-from rigidfleet.web.replay.scene import observe
+from rigidfleet.web.replay.scene import page_samples
 
 CUBE = np.array(
     [[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0], [0, 0, 4], [4, 0, 4], [4, 4, 4], [0, 4, 4.0]]
@@ -64,10 +64,12 @@ def laid_out(m: rf.Mission, r: Floats | None = None, *, h: float | None = None) 
     if h is not None:
         flight = flight._replace(h=h)
     work = workspace(m.n_agents, len(plan.edges), solver=plan.problem.law.solver)
-    S = fleet.hovering(flight.vehicles, now.r if r is None else r, now.v)
+    S = fleet.hover_states(flight.vehicles, now.r if r is None else r, now.v)
     law = plan.problem.law
-    state = fleet.begin(flight, S, work, iterations=law.iterations if law.solver == ITERATED else 1)
-    assign_edges(flight.network, state.mail, plan.edges, state.integral)
+    state = fleet.initial_state(
+        flight, S, work, iterations=law.iterations if law.solver == ITERATED else 1
+    )
+    give_edges_to_links(flight.network, state.mail, plan.edges, state.integral)
     return plan.problem, work, flight, state
 
 
@@ -372,7 +374,7 @@ def test_a_result_has_what_its_links_did():
     assert sent == 2 * len(EDGES) * 500
     assert lost == 2 * 100
     assert 0 < sent - heard - lost <= 2 * len(EDGES) * 3  # under way at the end
-    silent = observe(result, np.arange(len(EDGES)), 1.0)["silent"].values
+    silent = page_samples(result, np.arange(len(EDGES)), 1.0)["silent"].values
     np.testing.assert_allclose(silent[out, edge], np.minimum((result.time[out] - 3.98) / 0.5, 1.0))
     words = " ".join(rf.assess(result).notes)
     assert "edges that let go for want of messages, first at 4.50 s: 1-2." in words + "."

@@ -18,10 +18,10 @@ from rigidfleet.planning.preview import preview
 from rigidfleet.planning.vehicles import vehicle_lags
 from rigidfleet.preflight.linear_flight import LinearFlight
 from rigidfleet.preflight.network import (
-    growth_at,
+    greatest_stable_loss,
+    growth_at_delay,
     last_stable_delay,
     linear_flights,
-    loss_borne,
     mean_square_growth,
 )
 from rigidfleet.typing import Bools, Floats
@@ -177,7 +177,7 @@ def wrong_delays(count: int, least: float, seconds: float) -> list[tuple[int, in
         tables = random_formation(seed)
         linear = linear_flight(still({}, **tables))
         last = last_stable_delay(linear)
-        if (growth := growth_at(linear, last + 1)) < least:
+        if (growth := growth_at_delay(linear, last + 1)) < least:
             continue
         seen += 1
         wrong += [(seed, last)] if last and grows(tables, last, seconds) else []
@@ -197,7 +197,9 @@ def test_the_greatest_growth_is_that_of_the_whole_map(seed, delay):
     _, x = linear.fly(start, sent, 1, delay, lambda k, news: news(0))
     tick = np.concatenate([x, np.roll(sent, -1, axis=0).reshape(-1, whole)])
     radius = np.abs(np.linalg.eigvals(tick)).max()
-    assert growth_at(linear, delay) == pytest.approx(np.log(radius) / linear.radio.tick, abs=1e-4)
+    assert growth_at_delay(linear, delay) == pytest.approx(
+        np.log(radius) / linear.radio.tick, abs=1e-4
+    )
 
 
 @pytest.mark.parametrize("late", [0.0, 0.05])
@@ -212,8 +214,8 @@ def test_motions_of_the_whole_formation_do_not_count(late):
     )
     linear = linear_flight(still({"delay": 0.04}, phases=[hold], **noise))
     assert linear.is_free
-    assert growth_at(linear, 1) < -1.0
-    assert growth_at(linear, 7) > 1.0
+    assert growth_at_delay(linear, 1) < -1.0
+    assert growth_at_delay(linear, 7) > 1.0
 
 
 @pytest.mark.parametrize("seed", [2, 48])
@@ -221,7 +223,7 @@ def test_the_last_stable_delay_is_the_last_one(seed):
     """Found roughly first, it is where the accurate growth begins: none at it, some at one tick more."""
     linear = linear_flight(still({}, **random_formation(seed)))
     last = last_stable_delay(linear)
-    assert growth_at(linear, last) < GROWTH <= growth_at(linear, last + 1)
+    assert growth_at_delay(linear, last) < GROWTH <= growth_at_delay(linear, last + 1)
 
 
 def test_the_last_stable_delay_flies():
@@ -338,7 +340,7 @@ def grown(count: int, flights: int, seconds: float) -> Bools:
         tables = random_formation(seed)
         linear = linear_flight(still({}, **tables))
         if last_stable_delay(linear):
-            loss = loss_borne(linear)
+            loss = greatest_stable_loss(linear)
             squares = squares_flown(still({"loss": loss}, **tables), flights, seconds, 50)
             flown.append(squares.max(axis=1) > (100.0 * SMALL) ** 2)
     return np.concatenate(flown)
@@ -364,7 +366,7 @@ def test_check_says_what_the_network_is_beside_what_is_borne():
     """Broadcasts a second, last stable delay, loss in mean square, and the mission's own; also as data."""
     cube = checked({"delay": 0.06, "loss": 0.3})
     (table,) = (
-        x for x in cube.facts().shown if isinstance(x, FactTable) and x.heads[0] == "network"
+        x for x in cube.facts().shown_parts if isinstance(x, FactTable) and x.heads[0] == "network"
     )
     (row,) = (dict(zip(table.heads, texts, strict=False)) for texts in table.texts)
     assert (row["network"], row["broadcasts [/s]"]) == ("cube", "400")

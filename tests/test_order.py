@@ -14,7 +14,7 @@ from rigidfleet.planning.body_layer import Detour, least_distance, nearest_accel
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock
 from rigidfleet.simulation.leading import Leader, LeaderState
-from rigidfleet.web.replay.scene import observe
+from rigidfleet.web.replay.scene import page_samples
 
 #: A ball that crosses the path of the formation just ahead of it, from the side, and one that never comes near.
 CROSSING = {
@@ -81,7 +81,7 @@ def test_the_clock_follows_three_lags_and_never_runs_backwards_or_faster(steps):
     clock, state = VirtualClock(), np.array([0.0, 1.0, 0.0, 0.0])
     elapsed = 0.0
     for target, duration, omega in steps:
-        clock.lead(target, omega)
+        clock.aim(target, omega)
         k = clock.omega
 
         def law(_, y, k=k, target=target):
@@ -89,7 +89,7 @@ def test_the_clock_follows_three_lags_and_never_runs_backwards_or_faster(steps):
 
         found = solve_ivp(law, (0.0, duration), state, rtol=1e-10, atol=1e-12)
         times = np.linspace(0.0, duration, 9)
-        _, rate, slope, _ = clock.ahead(times)
+        _, rate, slope, _ = clock.progress_in(times)
         assert (rate >= -1e-9).all()
         assert (rate <= 1.0 + 1e-9).all()
         assert (abs(slope) <= STEEPEST * k + 1e-9).all()
@@ -125,13 +125,13 @@ def led(phase, deviation, clock):
 def test_a_path_at_the_clock_s_time_obeys_the_chain_rule(phase):
     """What is flown is r(tau(t)): its velocity and acceleration are the differences of its places, to rounding."""
     clock = VirtualClock()
-    clock.lead(0.0, 2.0)
+    clock.aim(0.0, 2.0)
     clock.advance(0.9)
     leader = led(phase, Detour(), clock)
     h = 0.1
-    problem = leader._piece(5.0, h, np.zeros(7))
+    problem = leader._moved_problem(5.0, h, np.zeros(7))
     times = 5.0 + np.linspace(0.0, h, 5)
-    tau = 5.0 - clock.delay + clock.ahead(times - 5.0)[0]
+    tau = 5.0 - clock.delay + clock.progress_in(times - 5.0)[0]
     wanted = slot_derivatives(leader.problem.reference, leader.problem.motion, tau, 1)[:, 0]
     flown = slot_derivatives(problem.reference, problem.motion, times, 3)
     assert 0.2 < clock.rate[0] < 0.9
@@ -140,7 +140,7 @@ def test_a_path_at_the_clock_s_time_obeys_the_chain_rule(phase):
     e = 1e-3
 
     def place(t):
-        tau = 5.0 - clock.delay + clock.ahead(t - 5.0)[0]
+        tau = 5.0 - clock.delay + clock.progress_in(t - 5.0)[0]
         return slot_derivatives(leader.problem.reference, leader.problem.motion, tau, 1)[:, 0]
 
     before, now, after = place(times - e), place(times), place(times + e)
@@ -191,9 +191,9 @@ def test_a_deviation_moves_as_its_derivatives_say(dt):
     given_ = Detour(
         np.array([[0.5, 0.1, 0.0], [0.3, -0.2, 0.1], [0.1, 0.2, -0.4]]),
         np.eye(3), np.array([[0.2, 0.3, -0.1], [0.5, 0.1, 0.2]]), np.array([1.1, 0.1, -0.3]),
-    ).at(0.1, np.full(7, 0.3), 0.1)  # fmt: skip
+    ).state_after(0.1, np.full(7, 0.3), 0.1)  # fmt: skip
     asked, e = np.linspace(-1.0, 1.0, 7), 1e-4
-    before, now, after = (given_.at(dt + k * e, asked, 0.1) for k in (-1, 0, 1))
+    before, now, after = (given_.state_after(dt + k * e, asked, 0.1) for k in (-1, 0, 1))
     for part in range(3):
         x, y, z = (each.series()[part] for each in (before, now, after))
         np.testing.assert_allclose(y[1], (z[0] - x[0]) / (2 * e), atol=1e-3)
@@ -316,10 +316,10 @@ def test_the_verdict_and_the_page_tell_which_layer_acted():
     slow = np.where(layers(result).rate < 0.99, 1.0, 0.0)
     share = float(np.trapezoid(slow, result.time)) / result.time[-1]
     assert f"the clock slowed {100 * share:.2g} %" in notes
-    columns = observe(result, np.arange(3), 1.0)
+    columns = page_samples(result, np.arange(3), 1.0)
     np.testing.assert_array_equal(columns["clock"].values, layers(result).rate)
     assert not columns["acts"].values.any()
     evades = rf.simulate(triangle(CROSSING, clock=False, body=False))
-    acts = observe(evades, np.arange(3), 1.0)["acts"].values
+    acts = page_samples(evades, np.arange(3), 1.0)["acts"].values
     np.testing.assert_array_equal(acts > 0.0, layers(evades).acts > 0)
-    assert "clock" not in observe(rf.simulate("square"), np.arange(0), 1.0)
+    assert "clock" not in page_samples(rf.simulate("square"), np.arange(0), 1.0)

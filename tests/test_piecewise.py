@@ -45,7 +45,7 @@ def test_values_and_derivatives_are_those_of_scipy():
         np.testing.assert_allclose(curve.jumps(3)[order], jump, rtol=1e-9, atol=1e-9)
     shares = np.array([0.1, 0.8])
     at = (TIME[:-1, None] + np.diff(TIME)[:, None] * shares).ravel()
-    np.testing.assert_allclose(curve.within(shares).reshape(16, 2, 3), known(at), atol=1e-10)
+    np.testing.assert_allclose(curve.at_shares(shares).reshape(16, 2, 3), known(at), atol=1e-10)
 
 
 def test_the_piece_at_a_time():
@@ -94,7 +94,7 @@ def test_a_uniform_b_spline_is_that_of_scipy():
 def test_control_points_are_those_of_bernstein():
     """They give the curve in SciPy's Bernstein basis, and the curve comes back from them."""
     curve = a_curve(5)
-    points = curve.bernstein()
+    points = curve.control_points()
     known = BPoly(np.moveaxis(points, -1, 0), TIME)
     np.testing.assert_allclose(curve.at(INSIDE), known(INSIDE), atol=1e-10)
     np.testing.assert_allclose(Piecewise.of_bernstein(TIME, points).pieces, curve.pieces, atol=1e-9)
@@ -103,11 +103,11 @@ def test_control_points_are_those_of_bernstein():
 def test_cuts_parts_and_later_ones_are_the_same_curve():
     """With further knots, within a span, on other knots and begun later, values at all times are those of before."""
     curve = a_curve()
-    cut = curve.cut(np.array([0.0, 5.0, TIME[3] + 1e-7, 99.0]), 1e-6)
+    cut = curve.insert_knots(np.array([0.0, 5.0, TIME[3] + 1e-7, 99.0]), 1e-6)
     np.testing.assert_array_equal(cut.time, np.union1d(TIME, [5.0]))
     part = curve.between(TIME[2] - 0.1, TIME[5])
     np.testing.assert_array_equal(part.time, [TIME[2] - 0.1, *TIME[2:6]])
-    for other in (cut, part, curve.on(np.union1d(TIME, [1.0, 20.0]))):
+    for other in (cut, part, curve.refine(np.union1d(TIME, [1.0, 20.0]))):
         t = np.linspace(other.time[0], other.time[-1], 60)[:-1]  # at its end the next one begins
         np.testing.assert_allclose(other.at(t), curve.at(t), rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(curve.later(2.0).at(INSIDE + 2.0), curve.at(INSIDE), atol=1e-10)

@@ -204,7 +204,7 @@ def test_words_are_words(page, hostile, quick):
 def test_events_are_lines():
     """No word of a user can end an event of the live flight's stream and begin another."""
     session = Session(mission(lambda place: f'{place}\u2028\u0085"event: end</script>'))
-    message = session.join().get()
+    message = session.add_page().get()
     assert message is not None
     event = message.decode()
     assert re.fullmatch(r"event: story\ndata: [^\n\r]*\n\n", event)

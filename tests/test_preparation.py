@@ -84,7 +84,7 @@ def examples() -> list:
     state = records.integrator(rng.normal(size=21), 1.5, rtol=1e-8, atol=np.ones(21))
     times = np.linspace(0.0, 1.0, 7)
     return [
-        workspace(3, 3), state, records.recorder(7, 3, 3), packing.examples()[0],
+        workspace(3, 3), state, records.new_record(7, 3, 3), packing.examples()[0],
         records.Segment(2.5, True, 9, times, np.ones((7, 21)), np.ones(21)),
     ]  # fmt: skip
 

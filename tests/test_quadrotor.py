@@ -37,7 +37,7 @@ NO_AIR = {"rotor_drag": (0, 0), "lift": 0.0, "c": (0, 0, 0)}
 
 
 def derivative(vehicle: fleet.VehicleDynamics, S, command, wind) -> np.ndarray:
-    flight = fleet.flight(fleet.quadrotors([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1)
+    flight = fleet.ideal_flight(fleet.quadrotors([vehicle] * len(S), G), start=0.0, h=1e-3, steps=1)
     return sampled.derivatives(flight, np.array(S), np.array(command), np.array(wind))
 
 

@@ -229,7 +229,7 @@ def test_a_store_of_an_earlier_version_is_read_and_goes_on(tmp_path):
     """A metric that it lacks is not known of its runs; more runs have it, and keep what was there."""
     sweep = Sweep.of(rf.Mission.from_dict(POINTS), ["agents.radius.* *= uniform(0.1, 1)"], runs=2)
     codes = [
-        tuple(c.variation.code(v) for c, v in zip(sweep.columns, sweep.values(k), strict=True))
+        tuple(c.variation.encode(v) for c, v in zip(sweep.columns, sweep.values(k), strict=True))
         for k in (0, 1)
     ]
     rows = [

@@ -5,7 +5,7 @@ from contextlib import closing
 
 import pytest
 
-from rigidfleet._common.renamed import RENAMED, successor
+from rigidfleet._common.renamed import RENAMED, rename_hint
 from rigidfleet.cli import app as cli
 from rigidfleet.cli import codes
 from rigidfleet.errors import MissionError, ResultError, SweepError
@@ -82,7 +82,12 @@ def test_old_options(capsys):
 
 def test_words_that_are_not_old():
     """Other words have no successor, whatever they are."""
-    assert successor("control", "open") == successor("edges", [[1, 2]]) == successor("runs") == ""
+    assert (
+        rename_hint("control", "open")
+        == rename_hint("edges", [[1, 2]])
+        == rename_hint("runs")
+        == ""
+    )
     assert not set(RENAMED.values()) & {key[1] for key in RENAMED if isinstance(key, tuple)}
 
 

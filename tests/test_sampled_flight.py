@@ -74,8 +74,8 @@ def everything(rows: int = 0) -> tuple[Any, ...]:
             rng.random((84, n)) < 0.1,
         ),
     )  # fmt: skip
-    S = fleet.hovering(vehicles, load_mission("cube-passage").agents.position, np.zeros((n, 3)))
-    return problem, work, flight, fleet.begin(flight, S, work, rows=rows)
+    S = fleet.hover_states(vehicles, load_mission("cube-passage").agents.position, np.zeros((n, 3)))
+    return problem, work, flight, fleet.initial_state(flight, S, work, rows=rows)
 
 
 def test_a_pause_changes_no_bit():
@@ -147,13 +147,13 @@ def test_samples_and_trail_follow_the_flight():
     np.testing.assert_allclose(a.S[..., :3], b.S[..., :3], rtol=0, atol=1e-10)
     assert (
         a.S[0].tobytes()
-        == fleet.hovering(coarse[2].vehicles, a.S[0, :, :3], 0 * a.S[0, :, :3]).tobytes()
+        == fleet.hover_states(coarse[2].vehicles, a.S[0, :, :3], 0 * a.S[0, :, :3]).tobytes()
     )
     trail = coarse[3].trail
     for c in range(2, 5):
         row = int(np.searchsorted(trail.clock[:200, 0], times[c], side="right")) - 1
         start, h = trail.clock[row]
-        path = records.bernstein((times[c] - start) / h) @ trail.points[row]
+        path = records.bernstein_basis((times[c] - start) / h) @ trail.points[row]
         np.testing.assert_allclose(path[:24].reshape(8, 3), b.S[c, :, :3], rtol=0, atol=1e-10)
         np.testing.assert_allclose(path[24:].reshape(8, 3), b.S[c, :, 3:6], rtol=0, atol=1e-7)
     np.testing.assert_allclose(a.dS[..., :3], a.S[..., 3:6], rtol=0, atol=1e-15)
@@ -237,7 +237,7 @@ def test_measurements_are_late_noisy_and_rare():
             last=100, noise_r=noise[0], noise_v=noise[1], dropped=dropped
         ),
     )
-    state = fleet.begin(flight, state.S, work)
+    state = fleet.initial_state(flight, state.S, work)
     times = np.asarray(flight.start + 2e-3 * np.arange(101))
     call = fly(problem, work, flight, state, times[-1], times)
     true = call.S[..., :6]
@@ -338,7 +338,7 @@ def test_the_body_law_and_its_frame():
     plan = plan_phase(mission, leg_of(mission, mission.phases[1], now))
     assert plan.frame is not None
     assert plan.problem.control.kind == BODY
-    y = plan.state()
+    y = plan.initial_state()
     work = workspace(3, 3, solver=plan.problem.law.solver)
     state = records.integrator(y, 6.0, rtol=1e-10, atol=np.full(len(y), 1e-10))
     native.integrate(
@@ -347,10 +347,10 @@ def test_the_body_law_and_its_frame():
     apart, turned = [], []
     for h in (8e-3, 4e-3, 2e-3):
         fleet_ = fleet.quadrotors([POINT] * 3, G)
-        flight = fleet.flight(fleet_, start=6.0, h=h, steps=1)
-        S = fleet.hovering(fleet_, now.r, now.v)
+        flight = fleet.ideal_flight(fleet_, start=6.0, h=h, steps=1)
+        S = fleet.hover_states(fleet_, now.r, now.v)
         q = attitude.quaternion_from_dcm(plan.frame)
-        sampled_state = fleet.begin(flight, S, work, frame=q)
+        sampled_state = fleet.initial_state(flight, S, work, frame=q)
         call = fly(plan.problem, work, flight, sampled_state, 12.0, [12.0])
         apart.append(np.abs(call.S[0, :, :3].ravel() - state.y[:9]).max())
         turned.append(attitude.angle_between(call.frame[0], state.y[21:25]))
@@ -420,12 +420,12 @@ def test_points_do_not_load_the_code_of_quadrotors():
 
 def test_code_that_cannot_be_kept_is_given_to_child_processes(monkeypatch):
     """Where nothing can be kept, a child process gets the second library's code, too."""
-    code = native._read("sampled")
+    code = native._read_cached_code("sampled")
     assert code is not None
     others = {part: x for part, x in native._loaded.items() if part != "sampled"}
-    made = native._link("sampled", *native._of_objects(code), code)
+    made = native._link("sampled", *native._link_objects(code), code)
     monkeypatch.setattr(native, "_loaded", others | {"sampled": made})
-    given = native.bequeath()
+    given = native.code_to_inherit()
     monkeypatch.setattr(native, "_loaded", others)
     native.inherit(given)
     assert native.library("sampled").unkept == code
@@ -440,7 +440,7 @@ def test_a_flight_goes_on_under_another_problem():
     assert m != len(work.c)
     with pytest.raises(ValueError, match=r"fleet\.under_problem"):
         sampled.fly_ticks(other, wide, flight, state, fleet.segment(8, m, flight.start + 0.2))
-    state = fleet.under_problem(state, wide, np.full(m, 0.01))
+    state = fleet.state_under_problem(state, wide, np.full(m, 0.01))
     fly(other, wide, flight, state, flight.start + 0.2)
     assert state.count[fleet.TICKS] == 100
     np.testing.assert_allclose(state.integral[0], 0.01, rtol=0, atol=5e-3)
@@ -490,7 +490,7 @@ def flown_by_us(vehicle: fleet.VehicleDynamics, t: np.ndarray, *wanted: np.ndarr
     n = wanted[0].shape[1]
     problem, work, flight, state = begun([vehicle] * n, wanted[0][0], h=2e-3, steps=5)
     state.S[:, 3:6] = wanted[1][0]
-    state = fleet.begin(flight, state.S, work)
+    state = fleet.initial_state(flight, state.S, work)
     flown = np.empty_like(wanted[0])
     for k in range(len(t)):
         flown[k] = state.S[:, :3]

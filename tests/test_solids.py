@@ -38,7 +38,7 @@ WHERE = RNG.normal(size=(3, 300)) * 1.6
 
 def of(form: records.Form, points) -> np.ndarray:
     """Signed distances (K,) of points (3, K)."""
-    return proximity.distances(*np.asarray(points, dtype=float), records.single(form))
+    return proximity.distances(*np.asarray(points, dtype=float), records.one_solid(form))
 
 
 def to_half_spaces(A, b, points) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_a_height_map_is_as_far_as_the_nearest_of_its_prisms():
 @pytest.mark.parametrize("name", FORMS)
 def test_a_normal_is_the_gradient_and_leads_to_the_surface(name):
     """Against differences of the distance; a step against it, of the distance, ends on the surface."""
-    s = records.single(FORMS[name])
+    s = records.one_solid(FORMS[name])
     r = np.array(distance.own_axes(*WHERE, 0, s))
     d = np.asarray(distance.signed_distance(*r, 0, s))
     n = np.array(distance.outward_normal(*r, 0, s))
@@ -176,13 +176,13 @@ def test_the_kernel_compiles_the_same_distances():
     from rigidfleet.kernel import obstacles
 
     s = records.join(
-        [records.single(f, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]]) for f in FORMS.values()]
+        [records.one_solid(f, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]]) for f in FORMS.values()]
     )
     where = WHERE[:, :60]
     for b, form in enumerate(FORMS.values()):
-        alone = records.single(form, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]])
+        alone = records.one_solid(form, [1.0, 3.0], [[0, 0, 0], [1, 2, 3]])
         expected = proximity.distances(*where, alone, 2.0)
-        own = np.array([obstacles.into_own_axes(*x, 2.0, b, s) for x in where.T])
+        own = np.array([obstacles.point_in_axes(*x, 2.0, b, s) for x in where.T])
         found = [obstacles.tangent_of_solid(*x, b, -1, s)[0] for x in own]
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
@@ -190,7 +190,7 @@ def test_the_kernel_compiles_the_same_distances():
 def test_a_solid_is_where_its_waypoints_say():
     """Straight between waypoints, at rest before the first and after the last."""
     times, ways = np.array([1.0, 2.0, 5.0]), RNG.normal(size=(3, 3))
-    s, t = records.single(FORMS["box"], times, ways), np.linspace(0, 6, 61)
+    s, t = records.one_solid(FORMS["box"], times, ways), np.linspace(0, 6, 61)
     found = np.array(distance.displacement(t, 0, s))
     expected = [np.interp(t, times, ways[:, q]) for q in range(3)]
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14)
@@ -200,7 +200,7 @@ def test_a_solid_is_where_its_waypoints_say():
 def test_an_outline_lies_on_the_surface_within_the_extent(name):
     """What is drawn has distance 0, but for chords of round things and sides of terrain, and fits what is measured."""
     form = FORMS[name]
-    s = records.single(form)
+    s = records.one_solid(form)
     drawn = outline(s)
     points = np.concatenate([drawn.triangles.reshape(-1, 3), drawn.lines.reshape(-1, 3)])
     low, high = records.extent(s)
@@ -493,8 +493,8 @@ def test_figures_draw_every_kind(tmp_path):
     np.testing.assert_allclose(moving.at[[0, -1]], [[0, 0, 2], [4, 0, 2]], atol=1e-12)
     assert [s.zone for s in view.shapes] == [False, False, True, False, False]
     for shape in view.shapes:
-        assert (shape.ends[0] >= view.low - 1e-9).all()
-        assert (shape.ends[1] <= view.high + 1e-9).all()
+        assert (shape.extent[0] >= view.low - 1e-9).all()
+        assert (shape.extent[1] <= view.high + 1e-9).all()
     assert plot(result, tmp_path, formats=["svg"], names=["trajectory"])
 
 

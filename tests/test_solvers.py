@@ -47,7 +47,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
     order = None
     if eliminated:
         steps = solvers.elimination_steps(len(p), edges)
-        order = None if steps is None else ordering.order(steps, edges)
+        order = None if steps is None else ordering.prepare_order(steps, edges)
     setup = Setup(order, solvers.Dissection(p, edges), tolerance)
     return LargeSolver(vehicles, edges.astype(np.uint32), law, work, setup)
 
@@ -101,7 +101,7 @@ def test_elimination_finds_the_force_before_the_multipliers(rng):
         J / np.repeat(masses, 3) @ force, b, rtol=0, atol=1e-11 * np.abs(b).max()
     )
     for _ in range(2):  # asked for once or twice
-        solver.pull()
+        solver.find_multipliers()
         assert (w.f_C.ravel() == force).all()
         np.testing.assert_allclose(
             J.T @ w.multiplier, force, rtol=0, atol=1e-9 * np.abs(force).max()
@@ -112,7 +112,7 @@ def test_elimination_finds_the_force_before_the_multipliers(rng):
 def test_vertex_graph_is_the_damped_law_of_redundant_edges(reach, rng):
     """Iterated Tikhonov on the vertex graph is its definition in edge space, of unequal masses."""
     p = lattice(5)
-    edges, masses = graphs.neighbours(p, reach), rng.uniform(0.5, 2.0, len(p))
+    edges, masses = graphs.neighbour_edges(p, reach), rng.uniform(0.5, 2.0, len(p))
     b, mbar, mu = rng.normal(size=len(edges)), masses.mean(), 0.03
     regular = mbar * gram(p, edges, masses) + mu * np.eye(len(edges))
     y = np.zeros(len(edges))
@@ -125,7 +125,7 @@ def test_vertex_graph_is_the_damped_law_of_redundant_edges(reach, rng):
 def test_factor_is_kept_while_the_formation_turns(rng):
     """One factor serves a formation turned by any angle; one that has changed its shape gets a new one."""
     p = shapes.slots("sphere", 1.0, 200)
-    edges = graphs.neighbours(p)
+    edges = graphs.neighbour_edges(p)
     solver = solver_of(p, edges, np.ones(200), ITERATED, tolerance=1e-10)
     b = rng.normal(size=len(edges))
     before = solved(solver, b)
@@ -148,7 +148,7 @@ def test_factor_is_kept_while_the_formation_turns(rng):
 def test_a_solve_starts_from_the_best_of_past_solutions(rng):
     """What past solutions span is found at once, though they repeat themselves; of others what is nearest to it."""
     p = lattice(4)
-    edges, masses = graphs.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
+    edges, masses = graphs.neighbour_edges(p, 1.5), rng.uniform(0.5, 2.0, 64)
     u, mbar, mu = directions(p, edges), masses.mean(), 0.03
     J = jacobian(p, edges)
     K = mbar * J.T @ J + mu * np.diag(np.repeat(masses, 3))
@@ -158,10 +158,10 @@ def test_a_solve_starts_from_the_best_of_past_solutions(rng):
     wanted = 3.0 * past[0] + 0.5 * past[1]
     x, gram = np.full((64, 3), np.nan), np.empty((4, 6))
     g = (K @ wanted.ravel()).reshape(64, 3)
-    block_cholesky.project(u, edges, masses, mbar, mu, g, past, gram, x)
+    block_cholesky.project_on_solutions(u, edges, masses, mbar, mu, g, past, gram, x)
     np.testing.assert_allclose(x, wanted, atol=1e-9)
     g = rng.normal(size=(64, 3))
-    block_cholesky.project(u, edges, masses, mbar, mu, g, past, gram, x)
+    block_cholesky.project_on_solutions(u, edges, masses, mbar, mu, g, past, gram, x)
     rest = g - (K @ x.ravel()).reshape(64, 3)
     np.testing.assert_allclose((past * rest).sum(axis=(1, 2)), 0.0, atol=1e-9)
 
@@ -169,7 +169,7 @@ def test_a_solve_starts_from_the_best_of_past_solutions(rng):
 def test_solves_along_a_motion_take_fewer_iterations(rng):
     """As a formation bends smoothly, past solutions leave less for conjugate gradients to find."""
     p = shapes.slots("sphere", 1.0, 200)
-    edges, b = graphs.neighbours(p), rng.normal(size=len(graphs.neighbours(p)))
+    edges, b = graphs.neighbour_edges(p), rng.normal(size=len(graphs.neighbour_edges(p)))
     taken = {}
     for past in (True, False):
         solver = solver_of(p, edges, np.ones(200), ITERATED, tolerance=1e-8)
@@ -186,7 +186,7 @@ def test_solves_along_a_motion_take_fewer_iterations(rng):
 def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
     """Where a complete factor would fill up, an incomplete one preconditions, with more iterations."""
     p = lattice(6)
-    edges, masses = graphs.neighbours(p, 1.5), np.ones(216)
+    edges, masses = graphs.neighbour_edges(p, 1.5), np.ones(216)
     b = rng.normal(size=len(edges))
     full = solver_of(p, edges, masses, ITERATED)
     want = solved(full, b)
@@ -202,8 +202,8 @@ def test_pattern_without_fill_solves_as_well(rng, monkeypatch):
 def test_factor_is_that_of_the_matrix(rng):
     """L L^T is K, block by block, in the order of the dissection."""
     p = lattice(4)
-    edges, masses = graphs.neighbours(p, 1.5), rng.uniform(0.5, 2.0, 64)
-    found = ordering.pattern(64, edges, solvers.dissection(p, edges), 1e9)
+    edges, masses = graphs.neighbour_edges(p, 1.5), rng.uniform(0.5, 2.0, 64)
+    found = ordering.fill_pattern(64, edges, solvers.dissection(p, edges), 1e9)
     blocks, at = np.empty((len(found.row), 9)), np.empty(64, dtype=np.int64)
     u = directions(p, edges)
     block_cholesky.assemble(
@@ -248,7 +248,7 @@ def test_a_lost_pivot_falls_back_and_is_counted(rng):
 def test_what_is_not_finite_has_no_solution(rng):
     """NaN goes in, NaN comes out, and the next solve is none the worse."""
     p = lattice(4)
-    edges = graphs.neighbours(p, 1.5)
+    edges = graphs.neighbour_edges(p, 1.5)
     solver = solver_of(p, edges, np.ones(64), ITERATED)
     b = rng.normal(size=len(edges))
     want = solved(solver, b)
@@ -276,9 +276,9 @@ def test_solve_is_chosen_by_size_law_and_graph(n, count, law, method):
     made = {
         "complete": lambda: graphs.complete_graph(n),
         "henneberg": lambda: graphs.henneberg(p),
-        "neighbours": lambda: graphs.neighbours(p, 1.5),
+        "neighbours": lambda: graphs.neighbour_edges(p, 1.5),
     }
-    assert solvers.choose(n, made[count](), law) == method
+    assert solvers.choose_method(n, made[count](), law) == method
 
 
 def test_order_of_the_sweep_is_found_whatever_the_numbers(rng):
@@ -308,7 +308,7 @@ def flight(law: str, kind: str, **integrator) -> Mission:
     """64 agents on a lattice, 2 cm off, that turn and are pushed."""
     p = lattice(4, seed=2)
     rest = np.rint(p)
-    edges = graphs.henneberg(rest) if kind == "henneberg" else graphs.neighbours(rest, 1.5)
+    edges = graphs.henneberg(rest) if kind == "henneberg" else graphs.neighbour_edges(rest, 1.5)
     return Mission.from_dict(
         {
             "schema_version": 1,
@@ -348,7 +348,11 @@ def test_the_memory_of_a_phase_is_free_when_the_next_one_flies():
         assert active.solver is not None
         kept = [weakref.ref(x) for x in (active.solver, active.workspace.r.base)]
         kept += [
-            weakref.ref(x) for x in (active.solver.aside, active.solver.aside.workspace.r.base)
+            weakref.ref(x)
+            for x in (
+                active.solver.solver_for_thread,
+                active.solver.solver_for_thread.workspace.r.base,
+            )
         ]
         kept.append(weakref.ref(active.state.K.base))
         del active
@@ -370,7 +374,7 @@ def test_flights_are_the_same_whatever_the_solve(law, kind, method, monkeypatch)
     """A flight by elimination, and one on the vertex graph, is the one with dense factors, and says which it was."""
     found = {}
     for each in ("dense", method):
-        monkeypatch.setattr(solvers, "choose", lambda *_, each=each: each)
+        monkeypatch.setattr(solvers, "choose_method", lambda *_, each=each: each)
         found[each] = simulate(flight(law, kind))  # a new mission: plans are kept with one
     assert found["dense"].statistics["solvers"] == {}
     counts = found[method].statistics["solvers"][method]

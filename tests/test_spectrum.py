@@ -7,12 +7,14 @@ from rigidfleet.formation import graphs, shapes
 from rigidfleet.rigidity import analyse, jacobian, spectrum
 
 
-@pytest.mark.parametrize("edges", [graphs.neighbours, graphs.henneberg])
+@pytest.mark.parametrize("edges", [graphs.neighbour_edges, graphs.henneberg])
 def test_spectrum_is_that_of_the_dense_analysis(edges):
     """Lanczos finds the smallest and the largest eigenvalue of mbar A, of unequal masses."""
     rng = np.random.default_rng(4)
     p, masses = rng.normal(size=(40, 3)), rng.uniform(0.5, 2.0, 40)
-    graph = graphs.complete_graph(40)[::2] if edges is graphs.neighbours else graphs.henneberg(p)
+    graph = (
+        graphs.complete_graph(40)[::2] if edges is graphs.neighbour_edges else graphs.henneberg(p)
+    )
     found, dense = spectrum(p, graph, masses), analyse(p, graph, masses=masses)
     assert found.free == 0
     assert found.w == pytest.approx(dense.w, rel=1e-6)
@@ -30,11 +32,11 @@ def test_flexible_formations_are_found():
     """A cubic lattice with edges along its axes alone shears in three ways, and in more at its sides."""
     side = np.arange(5.0)
     p = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
-    loose = spectrum(p, graphs.neighbours(p, 1.1), np.ones(125))
+    loose = spectrum(p, graphs.neighbour_edges(p, 1.1), np.ones(125))
     assert loose.w == 0
     assert loose.free > 0
     assert loose.condition == np.inf
-    assert spectrum(p, graphs.neighbours(p, 1.5), np.ones(125)).free == 0
+    assert spectrum(p, graphs.neighbour_edges(p, 1.5), np.ones(125)).free == 0
 
 
 def test_a_crowd_of_free_motions_is_told_in_time():
@@ -46,7 +48,7 @@ def test_a_crowd_of_free_motions_is_told_in_time():
     assert found.free > 0
 
 
-@pytest.mark.parametrize("graph", [graphs.neighbours, graphs.henneberg_multilevel])
+@pytest.mark.parametrize("graph", [graphs.neighbour_edges, graphs.henneberg_multilevel])
 def test_no_eigenvalue_of_a_shell_is_missed(graph):
     """Next to the six of rigid motions, which are equal, the lowest is found: that of the dense matrix."""
     p = shapes.slots("sphere", 2.0, 300)

@@ -477,7 +477,7 @@ def test_a_group_is_never_split():
 
     under_way = _Sweeping(sweep(runs=100), Gaps(), None, np.ones(100, bool))  # ty: ignore[invalid-argument-type]
     under_way.pace = 1e-6
-    taken = [under_way.take(1) for _ in range(2)]
+    taken = [under_way.take_chunk(1) for _ in range(2)]
     assert taken == [[*range(8), *range(40, 48)], [96, 97, 98, 99]]
     assert GROUP == 8
 

@@ -223,7 +223,7 @@ def test_the_code_of_eight_problems_is_the_kernel(name: str, phase: int):
             flight.begin()
             flight.advance()
         flight.begin()
-        plans.append((flight.plan, flight.plan.state()))
+        plans.append((flight.plan, flight.plan.initial_state()))
     problems = [plan.problem for plan, _ in plans]
     assert batch.fit_together(problems)
     begin, end = plans[0][0].start, plans[0][0].t_end
@@ -274,7 +274,7 @@ def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
     """The steps of a trail join, and end where its flight is when it flies alone, in wind and noise."""
     missions = varied("windy-passage", windy)
     ends: dict[int, list[np.ndarray]] = {}
-    take = Extremes.take
+    take = Extremes.take_steps
 
     def kept(self: Extremes, problem: Any, work: Any, state: Any, *, last: bool) -> None:
         rows = (state.count[FIRST_ROW] + np.arange(state.count[TRAILED])) % len(state.trail.clock)
@@ -286,7 +286,7 @@ def test_each_flight_side_by_side_has_its_own_trail(monkeypatch):
             ends.setdefault(id(self), []).append(here)
         take(self, problem, work, state, last=last)
 
-    monkeypatch.setattr(Extremes, "take", kept)
+    monkeypatch.setattr(Extremes, "take_steps", kept)
     simulate_together(missions)
     monkeypatch.undo()
     assert len(ends) == 8

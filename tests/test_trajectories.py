@@ -11,7 +11,7 @@ from scipy.interpolate import BPoly, CubicSpline
 from scipy.spatial.distance import pdist
 
 import rigidfleet as rf
-from rigidfleet.math.bernstein import greatest
+from rigidfleet.math.bernstein import greatest_convex_value
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Mission
 from rigidfleet.simulation.trajectories import of_curve
@@ -193,8 +193,8 @@ def test_greatest_of_curves():
     """The greatest length of random curves is that of dense samples, and not less."""
     rng = np.random.default_rng(5)
     c, h = rng.normal(size=(40, 3, 6)), rng.uniform(0.2, 2.0, 40)
-    points = Piecewise(np.append(0.0, np.cumsum(h)), c).bernstein()
-    found = greatest(points, lambda x: np.linalg.norm(x, axis=-1))
+    points = Piecewise(np.append(0.0, np.cumsum(h)), c).control_points()
+    found = greatest_convex_value(points, lambda x: np.linalg.norm(x, axis=-1))
     x = np.linspace(0, 1, 20_001)[:, None] * h
     dense = np.linalg.norm(
         np.stack([sum(c[:, q, p] * x**p for p in range(6)) for q in range(3)], -1), axis=-1

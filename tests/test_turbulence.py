@@ -18,11 +18,11 @@ def white(shape, seed=1):
 
 
 def second(e, step, tau):
-    return filters.second_order(e, step, tau)
+    return filters.dryden_gust(e, step, tau)
 
 
 def first(e, step, tau):
-    return filters.first_order(e[:, 0], step, tau)
+    return filters.gauss_markov(e[:, 0], step, tau)
 
 
 PROCESSES = {
@@ -71,12 +71,12 @@ def test_the_second_process_has_drydens_spectrum():
 def test_low_altitude_values_of_the_specification():
     """At 200 ft in a wind of 30 kn: L_w = 200 ft, L_u = 200 / 0.3416^1.2 ft; sigma_w = 3 kn, sigma_u 1.54 times it."""
     knot, foot = 0.514444, 0.3048
-    sigma, length = tb.low_altitude(200 * foot, 30 * knot)
+    sigma, length = tb.low_altitude_gusts(200 * foot, 30 * knot)
     np.testing.assert_allclose(sigma[2], 3 * knot)
     np.testing.assert_allclose(sigma[:2], 3 * knot / 0.3416**0.4)
     np.testing.assert_allclose(length, np.array([200 / 0.3416**1.2] * 2 + [200]) * foot)
     # Where the layer ends, at 1000 ft, the lengths are alike.
-    np.testing.assert_allclose(tb.low_altitude(1000 * foot, 1.0)[1], 1000 * foot, rtol=1e-9)
+    np.testing.assert_allclose(tb.low_altitude_gusts(1000 * foot, 1.0)[1], 1000 * foot, rtol=1e-9)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
@@ -113,7 +113,7 @@ def test_recursions_are_followed_along_rows(backward):
     x, a = white((7, 4)), white(7, seed=2)
     L = np.eye(7) - np.diag(a[:-1] if backward else a[1:], 1 if backward else -1)
     expected = np.linalg.solve(L, x)
-    native.follow(x, a, backward=backward)
+    native.recurse(x, a, backward=backward)
     np.testing.assert_allclose(x, expected, rtol=1e-12, atol=1e-12)
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from rigidfleet import assess, check, simulate
-from rigidfleet._common.progress import watched_by
+from rigidfleet._common.progress import report_steps_to
 from rigidfleet.errors import MissionError
 from rigidfleet.math import proximity
 from rigidfleet.math.attitude import dcm_from_rotation_vector
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning import ways
-from rigidfleet.planning.clearance import closest, greatest_speeds, pace
+from rigidfleet.planning.clearance import closest, greatest_speeds, speed_bounds
 from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.lattice import FreeSpace, keeps_room
 from rigidfleet.planning.preview import preview
@@ -284,7 +284,7 @@ def test_the_least_clearance_is_between_samples():
     data["phases"][1] = {"kind": "fly", "position": [12, 0, 8], "duration": 4.0}
     mission = Mission.from_dict(data)
     planned = preview(mission)[0][1]
-    found = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 40001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
     out = np.maximum(np.maximum([-0.001, -1, 0] - r, r - [0.001, 1, 7.0]), 0.0)
@@ -311,7 +311,7 @@ def test_the_least_clearance_of_many_is_between_samples(at_once, monkeypatch):
     monkeypatch.setattr("rigidfleet.planning.clearance._AT_ONCE", at_once)
     mission = past_a_ball(1000)
     planned = preview(mission)[0][0]
-    found = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     assert found.proved == found.clearance - 1e-3
     t = np.linspace(found.time - 0.3, found.time + 0.3, 6001)
     near = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0, found.agent]
@@ -329,7 +329,7 @@ def test_what_a_check_has_no_time_to_prove_is_told(monkeypatch):
     monkeypatch.setattr("rigidfleet.planning.clearance._IN_ALL", 10_000)
     mission = past_a_ball(1000)
     planned = preview(mission)[0][0]
-    found = closest(planned, mission.obstacles[0], mission.fleet.radius, pace(planned))
+    found = closest(planned, mission.obstacles[0], mission.fleet.radius, speed_bounds(planned))
     t = np.linspace(planned.time[0], planned.time[-1], 4001)
     r = slot_derivatives(planned.leg.reference, planned.leg.motion, t, 1)[:, 0]
     dense = float(np.linalg.norm(r - [300.31, 0.43, 10.07], axis=-1).min()) - 0.12
@@ -350,9 +350,9 @@ def test_a_fence_is_compared_exactly():
     looks = []
 
     class Counting(FreeSpace):
-        def apart(self, r, radius, most):
+        def room_beside_obstacles(self, r, radius, most):
             looks.append(len(r))
-            return super().apart(r, radius, most)
+            return super().room_beside_obstacles(r, radius, most)
 
     space, radius, need = Counting([], fence), np.full(3, 0.1), 0.2
     share = np.linspace(0.0, 1.0, 2001)
@@ -382,7 +382,7 @@ def test_a_fence_is_compared_exactly():
 def test_a_search_says_what_it_looks_for(monkeypatch):
     """Whoever watches hears the phase and the search, of a way and of automatic times."""
     heard: list[str] = []
-    with watched_by(heard.append):
+    with report_steps_to(heard.append):
         complete_times(load_mission("narrow-passage-found"))
     assert any("looking for a way of '" in step and "round obstacles" in step for step in heard)
 

@@ -106,11 +106,11 @@ def begun(
     """Vehicles that hover side by side, or at r (N, 3), under a problem without edges that balances their weight."""
     fleet_ = fleet.quadrotors(vehicles, G)
     n = len(vehicles)
-    flight = fleet.flight(fleet_, start=0.0, h=h, steps=steps)
+    flight = fleet.ideal_flight(fleet_, start=0.0, h=h, steps=steps)
     problem, work = open_problem(fleet_), workspace(n, 0)
     problem.control.force[:, 2] = fleet_.m * G
-    S = fleet.hovering(fleet_, 10.0 * np.eye(n, 3) if r is None else r, np.zeros((n, 3)))
-    return problem, work, flight, fleet.begin(flight, S, work, rows=rows)
+    S = fleet.hover_states(fleet_, 10.0 * np.eye(n, 3) if r is None else r, np.zeros((n, 3)))
+    return problem, work, flight, fleet.initial_state(flight, S, work, rows=rows)
 
 
 def planned(
@@ -123,10 +123,10 @@ def planned(
     plan = plan_phase(mission, leg_of(mission, mission.phases[index], now))
     n = len(now.r)
     fleet_ = fleet.quadrotors([vehicle] * n, plan.problem.vehicles.g)
-    flight = fleet.flight(fleet_, start=plan.start, h=h, steps=steps, every=every)
+    flight = fleet.ideal_flight(fleet_, start=plan.start, h=h, steps=steps, every=every)
     work = workspace(n, len(plan.edges), solver=plan.problem.law.solver)
-    S = fleet.hovering(fleet_, now.r, now.v)
-    return plan.problem, work, flight, fleet.begin(flight, S, work, rows=rows)
+    S = fleet.hover_states(fleet_, now.r, now.v)
+    return plan.problem, work, flight, fleet.initial_state(flight, S, work, rows=rows)
 
 
 def random_states(vehicle: fleet.VehicleDynamics, n: int, seed: int) -> tuple[np.ndarray, ...]:
@@ -162,7 +162,7 @@ def rotorpy_derivative(
 
 def random_inputs(vehicle: fleet.VehicleDynamics) -> tuple[np.ndarray, np.ndarray]:
     """A hovering state (17,) and commands (50, 4), each held for 20 ms."""
-    S = fleet.hovering(fleet.quadrotors([vehicle], G), np.zeros((1, 3)), np.zeros((1, 3)))[0]
+    S = fleet.hover_states(fleet.quadrotors([vehicle], G), np.zeros((1, 3)), np.zeros((1, 3)))[0]
     scatter = np.random.default_rng(5).uniform(0.9, 1.1, size=(50, 4))
     return S, S[13:] * scatter
 

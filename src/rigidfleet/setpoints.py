@@ -102,16 +102,16 @@ def at_times(samples: Setpoints, wanted: Floats) -> Setpoints:
 
 def ways_of(samples: Setpoints, agents: slice) -> Piecewise:
     """The ways of n agents: pieces (k, n, 4, 8) of x, y, z [m] and yaw [rad], of degree 7 (yaw: 3)."""
-    first, knots = intervals(samples.time)
+    first, knots = sample_intervals(samples.time)
     state = samples.state[:, :, agents].swapaxes(0, 1)
     yaw = np.stack([samples.yaw[:, agents], samples.yaw_rate[:, agents]])[..., None]
     position, turned = (
         Piecewise.of_ends(knots, x[:, first], x[:, first + 1]) for x in (state, yaw)
     )
-    return position.beside(turned)
+    return position.stack(turned)
 
 
-def intervals(time: Floats) -> tuple[Ints, Floats]:
+def sample_intervals(time: Floats) -> tuple[Ints, Floats]:
     """Samples (k,) that begin an interval, which the next one ends, and the knots (k + 1,) [s] between intervals.
 
     Two samples that are one representable number apart, as at a switch of phases, are one knot with two states.

@@ -171,7 +171,7 @@ def test_a_ball_is_put_drawn_and_removed(page, session):
     assert ball.place[2] == pytest.approx(before[2], abs=1e-2)
     page.wait(f"const f = () => {{ {at} }}; const p = f(); return p && p[0] > {x} + 20")
     page.click("#remove-ball")
-    until(lambda: not session.pilot.flying)
+    until(lambda: not session.pilot.flying_balls)
     page.wait("return Number.isNaN(replay.scene.state.balls[0])")
     assert page.run("return document.getElementById('remove-ball').disabled")
     assert page.heard() == []

@@ -25,7 +25,7 @@ def as_path(value: object) -> Path:
     raise wrong_type("a path (a string or a Path)", value)
 
 
-def numbers(name: str, values: ArrayLike) -> Floats:
+def as_numbers(name: str, values: ArrayLike) -> Floats:
     """An array of numbers as a function takes it; ``name`` says of what.
 
     Raises

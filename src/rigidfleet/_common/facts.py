@@ -220,7 +220,7 @@ class Fact(NamedTuple):
     interval: tuple[float, float] | None = None
 
     @property
-    def doubt(self) -> str:
+    def interval_text(self) -> str:
         """From what to what the true value is; "" if it is known."""
         return "" if self.interval is None else " to ".join(map(value, self.interval))
 
@@ -237,7 +237,7 @@ class Fact(NamedTuple):
         """The fact as a row of a table."""
         worst = None if self.value is None else value(self.value, self.unit)
         when = None if self.when is None else f"{self.when:.2f}"
-        return Row((self.name, worst, self.doubt, self.bound, when, self.who), self.level)
+        return Row((self.name, worst, self.interval_text, self.bound, when, self.who), self.level)
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], words: Collection[str] = ()) -> FactTable:
@@ -261,19 +261,19 @@ class Sheet:
     parts: Sequence[FactTable | Line]
 
     @property
-    def shown(self) -> list[FactTable | Line]:
+    def shown_parts(self) -> list[FactTable | Line]:
         """The parts, without tables in which nothing stands."""
         return [part for part in self.parts if isinstance(part, Line) or part.rows]
 
     @property
-    def blocks(self) -> list[Any]:
+    def printed_blocks(self) -> list[Any]:
         """What is printed: the head, and the parts with blank lines around tables."""
         from rich.text import Text
 
         head = Text.assemble((self.name, "bold"), f": {self.title}" * bool(self.title))
         begin: list[Any] = [head] if self.name else []
         blocks = [*begin]
-        for part, before in zip(self.shown, [Line(""), *self.shown], strict=False):
+        for part, before in zip(self.shown_parts, [Line(""), *self.shown_parts], strict=False):
             apart = isinstance(part, FactTable) or isinstance(before, FactTable)
             blocks += ["", part] if apart and blocks != begin else [part]
         return blocks
@@ -281,12 +281,12 @@ class Sheet:
     def __rich__(self) -> RenderableType:
         from rich.console import Group
 
-        return Group(*self.blocks)
+        return Group(*self.printed_blocks)
 
     def html(self) -> str:
         """Show the sheet in a notebook. All text is escaped."""
         head = f"<p><strong>{html.escape(self.name)}</strong> {html.escape(self.title)}".rstrip()
-        parts = (part.html() for part in self.shown)
+        parts = (part.html() for part in self.shown_parts)
         return f"<div>{head}</p>{''.join(parts)}</div>"
 
 

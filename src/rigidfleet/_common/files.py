@@ -15,7 +15,7 @@ from rigidfleet.errors import ResultError
 
 
 @contextmanager
-def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]]:
+def replace_atomically(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]]:
     """Open a new file that replaces the old one once all data are written.
 
     Parameters
@@ -49,7 +49,7 @@ def replacing(path: str | Path, *, private: bool = False) -> Generator[IO[bytes]
 
 
 @contextmanager
-def replacing_folder(path: Path, ours: re.Pattern[str]) -> Generator[Path]:
+def replace_folder_atomically(path: Path, ours: re.Pattern[str]) -> Generator[Path]:
     """Make a new folder that replaces the old one once all its files are written.
 
     Parameters
@@ -81,7 +81,7 @@ def replacing_folder(path: Path, ours: re.Pattern[str]) -> Generator[Path]:
             target.rename(old)
         part.rename(target)
     except OSError as error:
-        raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error
+        raise ResultError(f"{path}: {os_error_in_words(error, 'written', path)}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
         if old.exists() and not target.exists():
@@ -100,10 +100,10 @@ def write_file(path: Path, data: bytes, *, parents: bool = False) -> None:
     try:
         if parents:
             path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as file:
+        with replace_atomically(path) as file:
             file.write(data)
     except OSError as error:
-        raise ResultError(f"{path}: {why_not(error, 'written', path)}") from error
+        raise ResultError(f"{path}: {os_error_in_words(error, 'written', path)}") from error
 
 
 def make_folder(folder: Path) -> None:
@@ -117,16 +117,16 @@ def make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise unwritable(folder, error) from error
+        raise unwritable_error(folder, error) from error
 
 
-def unwritable(path: Path, error: OSError) -> ResultError:
+def unwritable_error(path: Path, error: OSError) -> ResultError:
     """Error about a folder that cannot be written."""
     why = (error.strerror or str(error)).lower()
     return ResultError(f"{path}: cannot be written ({why}). Choose another folder by --out.")
 
 
-def why_not(error: OSError, done: str, path: Path) -> str:
+def os_error_in_words(error: OSError, done: str, path: Path) -> str:
     """Cause and remedy of a file that cannot be ``done`` ("read", "written")."""
     match error:
         case IsADirectoryError():

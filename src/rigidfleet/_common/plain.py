@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 
 
-def plain(value: Any) -> Any:
+def to_json_data(value: Any) -> Any:
     """Convert a value to plain JSON data: arrays to lists, NumPy scalars to numbers, non-finite numbers to None."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_data(item) for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain(item) for item in value]
+        return [to_json_data(item) for item in value]
     return value
 
 
-def plain_text(value: Any) -> str:
-    """Return a value as JSON text (`plain`)."""
-    return json.dumps(plain(value), ensure_ascii=False, allow_nan=False)
+def to_json_text(value: Any) -> str:
+    """Return a value as JSON text (`to_json_data`)."""
+    return json.dumps(to_json_data(value), ensure_ascii=False, allow_nan=False)

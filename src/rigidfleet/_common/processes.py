@@ -14,7 +14,7 @@ def cores() -> int:
 
 
 @contextmanager
-def safe_path() -> Generator[None]:
+def keep_folder_off_path() -> Generator[None]:
     """Keep the current folder off the module path of Python processes that are started in this context."""
     name = "PYTHONSAFEPATH"
     before = os.environ.get(name)

@@ -10,7 +10,7 @@ _watcher: ContextVar[Callable[[str], None] | None] = ContextVar("watcher", defau
 
 
 @contextmanager
-def watched_by(update: Callable[[str], None]) -> Generator[None]:
+def report_steps_to(update: Callable[[str], None]) -> Generator[None]:
     """Let ``update`` hear of each step that is reported in this context."""
     before = _watcher.set(update)
     try:

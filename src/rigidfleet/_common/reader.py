@@ -50,8 +50,8 @@ class Array:
     optional: bool
 
 
-def attribute(file: h5py.File, name: str, kind: Any) -> Any:
-    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`of_type`).
+def read_attribute(file: h5py.File, name: str, kind: Any) -> Any:
+    """Return an attribute as ``int`` or ``str``, or the JSON in it as any other type (`as_type`).
 
     Raises
     ------
@@ -80,10 +80,10 @@ def attribute(file: h5py.File, name: str, kind: Any) -> Any:
         plain = json.loads(value)
     except (ValueError, RecursionError) as error:
         raise DamagedError(f"attribute {name} is not valid JSON ({error})") from None
-    return of_type(plain, kind, f"attribute {name}")
+    return as_type(plain, kind, f"attribute {name}")
 
 
-def of_type(value: Any, kind: Any, where: str) -> Any:
+def as_type(value: Any, kind: Any, where: str) -> Any:
     """Check plain data against a type and return it.
 
     Types are dataclasses, typed dictionaries, lists, tuples, literals, text, integers and finite numbers. A dataclass
@@ -99,10 +99,10 @@ def of_type(value: Any, kind: Any, where: str) -> Any:
     if kind is Any:
         return value
     if origin is Annotated:  # A is the type in Python, B the type in a file
-        return None if value is None else of_type(value, inner[1], where)
+        return None if value is None else as_type(value, inner[1], where)
     if origin in (Union, UnionType):  # every union here is `X | None`
         some = next(k for k in inner if k is not NoneType)
-        return None if value is None else of_type(value, some, where)
+        return None if value is None else as_type(value, some, where)
     if origin is Literal and isinstance(value, str) and value in inner:
         return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
@@ -112,12 +112,12 @@ def of_type(value: Any, kind: Any, where: str) -> Any:
         if kind is not str or _is_text(value):
             return value
     elif origin is list and isinstance(value, list):
-        return [of_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
+        return [as_type(item, inner[0], f"{where}[{k + 1}]") for k, item in enumerate(value)]
     elif origin is tuple and isinstance(value, list) and len(value) == len(inner):
-        return [of_type(item, k, where) for item, k in zip(value, inner, strict=True)]
+        return [as_type(item, k, where) for item, k in zip(value, inner, strict=True)]
     elif isinstance(value, dict):
         if origin is dict:
-            return {key: of_type(item, inner[1], f"{where}.{key}") for key, item in value.items()}
+            return {key: as_type(item, inner[1], f"{where}.{key}") for key, item in value.items()}
         hints = get_type_hints(kind, include_extras=True)
         needed = getattr(kind, "__required_keys__", None)
         if needed is None:  # a dataclass
@@ -129,7 +129,7 @@ def of_type(value: Any, kind: Any, where: str) -> Any:
         known = hints.keys() - {"__others__"}
         if needed <= value.keys() and ("__others__" in hints or value.keys() <= known):
             made = {
-                key: of_type(item, hints.get(key, Any), f"{where}.{key}")
+                key: as_type(item, hints.get(key, Any), f"{where}.{key}")
                 for key, item in value.items()
             }
             return kind(**made)
@@ -153,7 +153,7 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def arrays(
+def read_arrays(
     file: h5py.File, declared: Mapping[str, Array], sizes: Mapping[str, int], size: int
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file by name. Optional arrays may be missing.

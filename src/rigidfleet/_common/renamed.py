@@ -26,7 +26,7 @@ RENAMED: dict[str | tuple[str, str], str] = {
 }
 
 
-def successor(key: object, value: object = None) -> str:
+def rename_hint(key: object, value: object = None) -> str:
     """Return a remedy that gives the new name of a key, an option or a value of a key; '' if it was not renamed."""
     new = RENAMED.get(str(key) if value is None else (str(key), str(value)))
     return f"it is now called '{new}'" if new is not None else ""
@@ -37,7 +37,7 @@ def with_earlier_names(**new: str) -> Callable[[_C], _C]:
 
     def give(kind: _C) -> _C:
         for old in new:
-            setattr(kind, old, property(partial(_member_of_now, new=new, old=old)))
+            setattr(kind, old, property(partial(_current_member, new=new, old=old)))
         return kind
 
     return give
@@ -45,10 +45,10 @@ def with_earlier_names(**new: str) -> Callable[[_C], _C]:
 
 def earlier_names(module: str, **new: str) -> Callable[[str], Any]:
     """The `__getattr__` of a module that has functions by earlier names, too: each with the name of now."""
-    return partial(_member_of_now, sys.modules[module], new)
+    return partial(_current_member, sys.modules[module], new)
 
 
-def _member_of_now(owner: Any, new: Mapping[str, str], old: str) -> Any:
+def _current_member(owner: Any, new: Mapping[str, str], old: str) -> Any:
     """A member of a class or a module by its earlier name, with a warning."""
     if old not in new:
         raise AttributeError(f"module {owner.__name__!r} has no attribute {old!r}")

@@ -92,7 +92,7 @@ class TextTable:
         self, data: bytes, unnamed: Mapping[int, list[str]], words: Mapping[str, str] | None = None
     ) -> None:
         self.texts, self.words = _lines(data), words or {}
-        self.line, start, self.names, below, self.separator, width = _head(self.texts)
+        self.line, start, self.names, below, self.separator, width = _find_head(self.texts)
         rows = _rows(self.texts, start, width, self.separator, self.line)
         self.lines, self.columns, self._faults = rows
         self.named, self.decimal = bool(self.names), ""
@@ -145,7 +145,7 @@ class TextTable:
             raise fault(f"has units for some columns of {dimension} only: {name!r}", "Give all")
         return known[0][1]
 
-    def place(self, *kinds: str, who: str = "") -> list[int]:
+    def find(self, *kinds: str, who: str = "") -> list[int]:
         """Columns of some quantities; empty unless all are there."""
         columns = [self.places.get((kind, who), -1) for kind in kinds]
         return [] if -1 in columns else columns
@@ -158,7 +158,7 @@ class TextTable:
         ContentError
             Names of directions contradict the axes.
         """
-        if place := self.place(*"xyz", who=who):
+        if place := self.find(*"xyz", who=who):
             return place, axes or "enu"
         ways = [kind for kind, own in self.places if kind in DIRECTIONS and own == who]
         named = "".join(DIRECTIONS[way] for way in ways)
@@ -166,13 +166,13 @@ class TextTable:
             return [], axes or "enu"
         if sorted(axes or named) != sorted(named):
             raise fault(f"has columns {', '.join(ways)}, but the axes are {axes}", "Remove one")
-        return self.place(*ways, who=who), named
+        return self.find(*ways, who=who), named
 
-    def missing(self, *kinds: str) -> ContentError:
+    def missing_error(self, *kinds: str) -> ContentError:
         """The error of a table without some quantities."""
-        if self.place("latitude"):
+        if self.find("latitude"):
             return fault("has latitude and longitude", "Give metres from an origin: x_m, y_m, z_m")
-        missing = ", ".join(kind for kind in kinds if not self.place(kind))
+        missing = ", ".join(kind for kind in kinds if not self.find(kind))
         why = f"has no column for {missing} among {', '.join(self.names)[:80]}"
         return fault(why, "Name columns x_m, y_m and z_m, and time_s for trajectories")
 
@@ -194,7 +194,7 @@ class TextTable:
         """
         factors, values = [self.factor(k) for k in which], np.zeros((len(self.lines), len(which)))
         faults = {fault.line: fault for fault in self._faults}
-        odd = [i for i, k in enumerate(which) if not _put_numbers(self.columns[k], values[:, i])]
+        odd = [i for i, k in enumerate(which) if not _parse_numbers(self.columns[k], values[:, i])]
         if odd and not self.decimal:
             columns = [self.columns[k].tolist() for k in self.places.values()]
             every = [_REMARK.sub("", x) for column in columns for x in column]
@@ -221,7 +221,7 @@ class TextTable:
         return values * factors
 
 
-def _put_numbers(fields: np.ndarray, values: Floats) -> bool:
+def _parse_numbers(fields: np.ndarray, values: Floats) -> bool:
     """Whether all fields are plain finite numbers, which are put into ``values``."""
     try:
         values[:] = fields.astype(np.float64)
@@ -289,7 +289,7 @@ def _lines(data: bytes) -> list[str]:
     return text.split("\n")
 
 
-def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
+def _find_head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     """Line of the names, number of lines before the rows, names, units in a row below them, separator, and width."""
     head = [k for k, line in enumerate(texts[:_HEAD]) if line.strip()]
     if long := next((k + 1 for k in head if len(texts[k]) > _LONGEST), 0):
@@ -298,13 +298,13 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     most = {k: max((sum(map(is_number, x)), len(x)) for x in fields) for k, fields in split.items()}
     rows = {k: count for k, (count, _) in most.items() if count > 1}
     plain = [k for k in rows if texts[k][0] != "#"]
-    start, names, own = _names(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
+    start, names, own = _find_names(texts, [k for k in head if 2 * most[k][0] <= most[k][1]], plain)
     if not names:
         # Before rows without names, a line that begins with # may be one of them.
         start = min(rows, default=len(texts))
     below = [x for x in texts[start : start + _HEAD] if x.strip()]
     below = ([x for x in below if x[0] != "#"] or below)[:_SAMPLE]
-    fits = {s: _fitting(below, len(names), s) for s in SEPARATORS}
+    fits = {s: _count_fitting_rows(below, len(names), s) for s in SEPARATORS}
     separator = max(SEPARATORS, key=lambda s: (fits[s][0], s == own))
     width, line = len(names) or fits[separator][1], start + (not names)
     row = [x.strip("[]()") for x in split_fields(below[0], separator)] if below else []
@@ -323,7 +323,7 @@ def _head(texts: list[str]) -> tuple[int, int, list[str], list[str], str, int]:
     return line, start, names, units, separator, width
 
 
-def _names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
+def _find_names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, list[str], str]:
     """Line, from 1, names and separator: of the lines before the first row below names, the one understood best."""
     best, names = (False, 0.0), (0, [], "")
     for k in head:
@@ -342,7 +342,7 @@ def _names(texts: list[str], head: list[int], rows: list[int]) -> tuple[int, lis
     return names
 
 
-def _fitting(lines: list[str], width: int, separator: str) -> tuple[int, int]:
+def _count_fitting_rows(lines: list[str], width: int, separator: str) -> tuple[int, int]:
     """How many lines are rows by a separator, and their width: without names, those of numbers and colours alone."""
     rows = [split_fields(_REMARK.sub("", line), separator) for line in lines]
     colour = re.compile(r"#[0-9a-fA-F]{6}")

@@ -19,7 +19,7 @@ def first_few(things: Sequence[object], most: int = 5, between: str = ", ") -> s
     return between.join(map(str, things[:most])) + more
 
 
-def all_hold(count: int) -> str:
+def all_hold_in_words(count: int) -> str:
     """That all checks hold: "all 4 checks hold", "both checks hold", "the only check holds"."""
     few = {1: "the only check holds", 2: "both checks hold"}
     return few.get(count, f"all {count} checks hold")

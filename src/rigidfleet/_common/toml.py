@@ -23,11 +23,11 @@ def to_toml(data: Mapping[str, Any]) -> str:
     TypeError
         A value has no TOML form.
     """
-    text = tomli_w.dumps(plain_data(data))
+    text = tomli_w.dumps(to_toml_data(data))
     return _NUMBERS.sub(lambda match: f"[{' '.join(match[1].split())[:-1]}]", text)
 
 
-def text_says(text: str, data: Mapping[str, Any]) -> bool:
+def text_has_data(text: str, data: Mapping[str, Any]) -> bool:
     """Whether a text is TOML, and says what data say."""
     try:
         return tomllib.loads(text) == data
@@ -40,7 +40,7 @@ def toml_key(key: str) -> str:
     return tomli_w.dumps({key: 0}).removesuffix(" = 0\n")
 
 
-def plain_data(value: Any) -> Any:
+def to_toml_data(value: Any) -> Any:
     """A copy of data as TOML has it: lists instead of NumPy's arrays and tuples, and no keys whose value is None.
 
     Raises
@@ -54,7 +54,7 @@ def plain_data(value: Any) -> Any:
         case bool() | int() | float() | str():
             return value
         case list() | tuple():
-            return [plain_data(item) for item in value]
+            return [to_toml_data(item) for item in value]
         case Mapping():
-            return {str(key): plain_data(item) for key, item in value.items() if item is not None}
+            return {str(key): to_toml_data(item) for key, item in value.items() if item is not None}
     raise TypeError(f"a {type(value).__name__} has no place in a mission: {value!r}")

@@ -49,7 +49,7 @@ class Alignment(NamedTuple):
     explained: float
 
     @property
-    def late(self) -> Bools:
+    def has_own_offset(self) -> Bools:
         """Vehicles (N,) whose own offset differs from that of all."""
         value, error = self.own
         usual = np.median(value[np.isfinite(value)]) if np.isfinite(value).any() else np.nan
@@ -125,14 +125,14 @@ def _fit(logs: Logs, plan: Plan, start: Floats, free: Bools) -> tuple[Floats, Fl
         step[: int(free[0])] = np.clip(step[: int(free[0])], -0.5, 0.5)
         q[free] += step
         errors[:] = np.nan
-        errors[free] = np.hypot(_errors(A, off - A @ step, time), _FLOOR[free])
+        errors[free] = np.hypot(_standard_errors(A, off - A @ step, time), _FLOOR[free])
         if np.abs(step).max() < 1e-7:
             break
     errors[errors > _UNTOLD] = np.nan
     return q, errors, float(np.sqrt((off**2).sum(axis=1).mean())) if len(off) else np.nan
 
 
-def _errors(A: Floats, left: Floats, time: Floats) -> Floats:
+def _standard_errors(A: Floats, left: Floats, time: Floats) -> Floats:
     """Standard errors of a fit of rows A (M, 3, P) that leaves (M, 3): how it changes without one part of the flight.
 
     Each part has a like share of time and motion together.

@@ -21,7 +21,7 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
     avoidance = measured.mission.avoidance
     if avoidance is None or not avoidance.guard:
         return
-    if lost := _margins(measured, "_lost"):
+    if lost := _least_margins(measured, "_lost"):
         e = min(lost, key=lambda e: e.when)
         words = (
             f"the guarantee of [avoidance] is lost at {e.when:.2f} s, by {e.who}: braking at once would leave them"
@@ -29,8 +29,8 @@ def guarantee_check(measured: Measurements, q: Quantity) -> Iterator[CheckResult
         )
         yield limit_check(q, e, 0.0, words, passed=False)
         return
-    state = "held" if _doubt(measured) else "proved"
-    e = min(_margins(measured), key=lambda e: e.value, default=None)
+    state = "held" if _why_not_proved(measured) else "proved"
+    e = min(_least_margins(measured), key=lambda e: e.value, default=None)
     words = f"the guarantee of [avoidance] is {state}: no vehicle has come near anything"
     if e is not None:
         words = (
@@ -47,8 +47,8 @@ def avoidance_notes(measured: Measurements) -> Iterator[str]:
         return
     if not avoidance.guard:
         yield "[avoidance] without its guard guarantees nothing"
-    elif not _margins(measured, "_lost"):
-        doubt = _doubt(measured)
+    elif not _least_margins(measured, "_lost"):
+        doubt = _why_not_proved(measured)
         yield (
             f"the guarantee of [avoidance] was held at every tick, but is not proved: {doubt}"
             if doubt
@@ -104,7 +104,7 @@ def _body_notes(result: Result) -> Iterator[str]:
         yield f"of the samples, by time: {', '.join(parts)}{aside}"
 
 
-def _margins(measured: Measurements, ending: str = "") -> list[Extreme]:
+def _least_margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     """The least margins of each phase, between vehicles and to obstacles, or the first negative ones ("_lost")."""
     return [
         measured.extreme_of(name + ending, p.extremes[name + ending], p.name)
@@ -114,7 +114,7 @@ def _margins(measured: Measurements, ending: str = "") -> list[Extreme]:
     ]
 
 
-def _doubt(measured: Measurements) -> str:
+def _why_not_proved(measured: Measurements) -> str:
     """Why the guarantee is not proved; empty if it is."""
     from rigidfleet.mission.avoidance import why_unproved
 

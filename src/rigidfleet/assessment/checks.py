@@ -246,8 +246,8 @@ def _touch_down_checks(measured: Measurements, phases: list[PhaseVerdict]) -> It
             continue
         k = measured.parts[i].stop - 1
         down = -measured.result.velocity[k, :, 2]
-        who = np.flatnonzero(measured.left[k] & (measured.close.each[k] <= PAD))
-        who = who[measured.standing(np.full(len(who), k), who).any(axis=0)]
+        who = np.flatnonzero(measured.left[k] & (measured.closeness.each[k] <= PAD))
+        who = who[measured.obstacles_stood_on(np.full(len(who), k), who).any(axis=0)]
         if not len(who):
             yield _check_at_end(p, "touch_down", False, "no vehicle is on the ground")
             continue

@@ -74,9 +74,9 @@ class DrawnWays:
         """The likely flight."""
         return Measurements(self.result)
 
-    def of_check(self, check: CheckResult) -> float:
+    def deviation_of(self, check: CheckResult) -> float:
         """By how much what is judged may differ from what is true, in the unit of the check."""
-        name, order, shifts = _name_of(check), _order_of(check), self.states
+        name, order, shifts = _quantity_name(check), _derivative_order(check), self.states
         q = quantity(name)
         if check.worst is None and name not in _SHAPES:  # it cannot be judged, whatever the noise
             return 0.0
@@ -100,7 +100,7 @@ class DrawnWays:
         if name == "people":  # where one falls depends on its velocity, for the time of a fall
             height, gravity = np.ptp(self.result.position[..., 2]), self.result.mission.gravity
             return most + math.sqrt(2.0 * height / gravity) * _greatest_length(shifts[:, 1])
-        values = -self.measurements.close.each if name == "clearance" else None
+        values = -self.measurements.closeness.each if name == "clearance" else None
         if name in SAMPLED and q.who == "agent":
             values = self.measurements.samples_of(name).rank
         if values is None or values.shape != sizes.shape[1:]:
@@ -129,13 +129,13 @@ def _greatest_length(x: Floats) -> float:
     return float(_lengths(x).max(initial=0.0))
 
 
-def _name_of(check: CheckResult) -> str:
+def _quantity_name(check: CheckResult) -> str:
     return re.sub("_(flight|start|end)$", "", check.check)
 
 
-def _order_of(check: CheckResult) -> int:
+def _derivative_order(check: CheckResult) -> int:
     """Which derivative of positions a check is of."""
-    name = _name_of(check)
+    name = _quantity_name(check)
     return _ORDERS.get(name, quantity(name).order)
 
 
@@ -163,8 +163,8 @@ def verdict_with_doubt(
             why = "vehicles have no common clock"
             check = replace(check, worst=None, first=None)  # noqa: PLW2901
         if deviations and not why and name not in (*_CERTAIN, *_UNSEEN):
-            check = _with_interval(check, deviations.of_check(check), facts["noise_m"])  # noqa: PLW2901
-            check = _unless_reset(check, resets)  # noqa: PLW2901
+            check = _with_interval(check, deviations.deviation_of(check), facts["noise_m"])  # noqa: PLW2901
+            check = _undecided_at_reset(check, resets)  # noqa: PLW2901
         elif why and check.judged and name not in _CERTAIN:
             words = f"{name.replace('_', ' ')} is not judged: {why}"
             check = replace(check, passed=False, undecided=True, message=words)  # noqa: PLW2901
@@ -193,7 +193,7 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     if not keeps_limit(sense, better, limit):
         return replace(check, passed=False)
     # The interval is then to be shorter than the way to the limit, which another log finds a little nearer.
-    less = (_SHORTER * abs(worst - limit) / by) ** (1.0 / _POWERS[_order_of(check)])
+    less = (_SHORTER * abs(worst - limit) / by) ** (1.0 / _POWERS[_derivative_order(check)])
     remedy = f"noise of {value(1e3 * sigma * math.sqrt(less))} mm would decide it"
     if less * _TIMES > 1.0:
         remedy += f", or, if it is white, {math.ceil(1.0 / less)} times the rate"
@@ -202,7 +202,7 @@ def _with_interval(check: CheckResult, by: float, sigma: float) -> CheckResult:
     return replace(check, passed=False, undecided=True, message=f"{words}: undecided; {remedy}")
 
 
-def _unless_reset(check: CheckResult, resets: list[float]) -> CheckResult:
+def _undecided_at_reset(check: CheckResult, resets: list[float]) -> CheckResult:
     """A check, undecided if it is missed where an estimator sets its position anew: no vehicle flew that."""
     near = [t for t in resets if check.when is not None and abs(t - check.when) < _RESET]
     if check.passed or check.undecided or not near:
@@ -211,7 +211,7 @@ def _unless_reset(check: CheckResult, resets: list[float]) -> CheckResult:
     return replace(check, undecided=True, message=words)
 
 
-def facts_of(
+def doubt_facts(
     flown: Result, deviations: DrawnWays | None, estimate: NoiseEstimate, alignment: Alignment | None, clock: str
 ) -> dict[str, Any]:  # fmt: skip
     """What is told of noise, clock, set-up and, beside a plan, of vehicles: how far off their slots, and when."""
@@ -232,7 +232,7 @@ def facts_of(
     columns = {
         "name": flown.statistics["names"], "mean_off_m": size, "mean_error_m": by, "mean_off_xyz_m": mean,
         "worst_off_m": far[worst, each], "worst_at_s": flown.time[worst], "offset_s": alignment.own.T,
-        "off_its_slot": aside, "late": alignment.late,
+        "off_its_slot": aside, "late": alignment.has_own_offset,
     }  # fmt: skip
     rows = zip(*(np.asarray(x).tolist() for x in columns.values()), strict=True)
     vehicles = [dict(zip(columns, row, strict=True)) for row in rows]
@@ -255,19 +255,19 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
     applied = _APPLIED[facts["clock"]]
     if facts["clock"] == "own":
         every = [x["offset_s"] for x in facts["vehicles"]]
-        own = (_lateness(*x) if np.isfinite(x[0]) else "?" for x in every)
+        own = (_lateness_in_words(*x) if np.isfinite(x[0]) else "?" for x in every)
         yield f"against the plan, clocks of vehicles are {', '.join(own)}; {applied}"
     elif explained["offset_s"] is None:
         yield f"the offset of the clock cannot be told, as the plan hardly moves; {applied}"
     else:
-        late = _lateness(*explained["offset_s"])
+        late = _lateness_in_words(*explained["offset_s"])
         yield f"the log is {late} against the plan; {applied}. Positions alone do not tell a clock from a lag"
     turn, scale = explained["turn_deg"], explained["scale"]
     parts = []
     if turn and abs(turn[0]) > _SURE * turn[1]:
-        parts.append(f"turned by {_pair(*turn)} deg about the vertical")
+        parts.append(f"turned by {_with_error(*turn)} deg about the vertical")
     if scale and abs(scale[0] - 1.0) > _SURE * scale[1]:
-        parts.append(f"scaled by {_pair(*scale)}")
+        parts.append(f"scaled by {_with_error(*scale)}")
     if any(x and abs(x[0]) > max(_SURE * x[1], _OFF) for x in explained["shift_m"]):
         parts.append(f"shifted by ({', '.join(value(x[0]) for x in explained['shift_m'])}) m")
     if parts:
@@ -280,16 +280,16 @@ def doubt_notes(facts: dict[str, Any]) -> Iterator[str]:
             off, by = 1e3 * each["mean_off_m"], 1e3 * np.nan_to_num(each["mean_error_m"])
             x, y, z = (value(1e3 * x) for x in each["mean_off_xyz_m"])
             peak = f"{value(1e3 * each['worst_off_m'], 'mm')} at {each['worst_at_s']:.2f} s"
-            yield f"{each['name']!r} is {_pair(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
+            yield f"{each['name']!r} is {_with_error(off, by)} mm off its slot on average, ({x}, {y}, {z}), and {peak}"
         if each["late"]:
-            yield f"{each['name']!r} is {_lateness(*each['offset_s'])} by itself: its clock, or its tracking"
+            yield f"{each['name']!r} is {_lateness_in_words(*each['offset_s'])} by itself: its clock, or its tracking"
 
 
-def _lateness(offset: float, error: float) -> str:
-    return f"{_pair(abs(offset), error)} s {'late' if offset >= 0.0 else 'early'}"
+def _lateness_in_words(offset: float, error: float) -> str:
+    return f"{_with_error(abs(offset), error)} s {'late' if offset >= 0.0 else 'early'}"
 
 
-def _pair(x: float, error: float) -> str:
+def _with_error(x: float, error: float) -> str:
     """A value with its error, to the digits that the error has."""
     digits = max(0, 1 - math.floor(math.log10(error))) if error > 0.0 else 2
     return f"{x:.{digits}f} +- {error:.{digits}f}"

@@ -14,7 +14,7 @@ import numpy as np
 from rigidfleet.formation import distance_geometry
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.constraint_jacobian import jacobian
-from rigidfleet.result.quantities import length
+from rigidfleet.result.quantities import norms
 from rigidfleet.typing import Floats, Ints
 
 #: Slots thinner than this, relative to their length, count as planar or straight. Distances of seven digits
@@ -55,7 +55,7 @@ class Fit(NamedTuple):
     flown: float
     intended: float
     is_mirrored: bool
-    points: list[float]
+    turned_axis: list[float]
     in_order: bool | None
 
 
@@ -66,7 +66,7 @@ def fits_of(
 
     ``greatest_error``: the one that is allowed [m], of the shortest distance of two slots [m].
     """
-    dimension, axis, order, shortest = _shape(slots.tobytes())
+    dimension, axis, order, shortest = _shape_properties(slots.tobytes())
     own, centred = p - p.mean(axis=1, keepdims=True), rigid_body.centred(slots)
     # The decompositions of the sums of p slot^T over the agents.
     u, s, vt = np.linalg.svd(own.swapaxes(1, 2) @ centred)
@@ -74,7 +74,7 @@ def fits_of(
     if len(slots) <= _FEW:
         worst = _worst_pairs_of_few(p, slots)
     else:
-        worst = map(_worst_pair, p, repeat(slots), length(own - centred @ (u @ vt).swapaxes(1, 2)))
+        worst = map(_worst_pair, p, repeat(slots), norms(own - centred @ (u @ vt).swapaxes(1, 2)))
     in_order: list[bool | None] = [None] * len(p)
     if len(order) > 2:
         # They follow each other where they extend most.
@@ -89,7 +89,7 @@ def fits_of(
 
 
 @lru_cache(16)
-def _shape(slots: bytes) -> tuple[int, Floats, list[int], float]:
+def _shape_properties(slots: bytes) -> tuple[int, Floats, list[int], float]:
     """Of slots (N, 3): dimension, axis of `Fit`, order on a line, shortest distance [m]."""
     points = np.frombuffer(slots).reshape(-1, 3)
     centred = rigid_body.centred(points)
@@ -107,7 +107,7 @@ _Worst = tuple[float, int, int, float, float]
 def _worst_pairs_of_few(p: Floats, slots: Floats) -> Iterator[_Worst]:
     """Worst errors of a distance at samples p (G, N, 3), among all pairs; of equal errors the first."""
     i, j = proximity.all_pairs(len(slots))
-    flown, intended = (length(x.take(i, axis=-2) - x.take(j, axis=-2)) for x in (p, slots))
+    flown, intended = (norms(x.take(i, axis=-2) - x.take(j, axis=-2)) for x in (p, slots))
     error = np.abs(flown - intended)
     least = error.max(axis=1, keepdims=True) - _ROUNDING * intended.max()
     k, at = (error >= least).argmax(axis=1), np.arange(len(p))
@@ -130,7 +130,7 @@ def _worst_pair(p: Floats, slots: Floats, off: Floats) -> _Worst:
         if last <= first:
             break
         others = np.sort(order[first:last])
-        flown, intended = length(both.take(others, axis=1) - both[:, i, None])
+        flown, intended = norms(both.take(others, axis=1) - both[:, i, None])
         error = np.abs(flown - intended)
         at = int(error.argmax())
         if (most := float(error[at])) > worst[0]:

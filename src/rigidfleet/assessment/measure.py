@@ -20,7 +20,7 @@ from rigidfleet.result.quantities import (
     SAMPLED,
     Samples,
     closeness,
-    length,
+    norms,
     owner_name,
     samples,
     without_lost,
@@ -58,12 +58,12 @@ class Measurements:
         self._sampled: dict[str, Samples] = {}
 
     @cached_property
-    def close(self) -> proximity.Closeness:
+    def closeness(self) -> proximity.Closeness:
         """Distances to each other and to obstacles at samples."""
         return closeness(self.result)
 
     @cached_property
-    def of_phases(self) -> dict[str, Samples]:
+    def samples_by_name(self) -> dict[str, Samples]:
         """Values at samples of each quantity of which a phase has a worst value."""
         return {q.name: self.samples_of(q.name) for q in QUANTITIES.values() if q.by_phase}
 
@@ -71,7 +71,7 @@ class Measurements:
     def ranks(self) -> dict[tuple[str, int], float]:
         """Greatest rank of each of these quantities at the samples of each phase that has samples."""
         starts, ranks = np.array([self.parts[k].start for k in self.flown]), {}
-        for name, sampled in self.of_phases.items():
+        for name, sampled in self.samples_by_name.items():
             if places := sampled.rank.shape[1]:
                 most = np.maximum.reduceat(sampled.rank.reshape(-1), places * starts).tolist()
                 ranks |= {(name, k): rank for k, rank in zip(self.flown, most, strict=True)}
@@ -86,7 +86,7 @@ class Measurements:
     def samples_of(self, name: str) -> Samples:
         """Values of a quantity at samples."""
         if name not in self._sampled:
-            close = self.close if name in ("separation", "clearance") else None
+            close = self.closeness if name in ("separation", "clearance") else None
             self._sampled[name] = samples(self.result, name, close)
         return self._sampled[name]
 
@@ -137,7 +137,7 @@ class Measurements:
     def worst_by_phase(self) -> list[dict[str, Extreme]]:
         """The worst values of each phase, at its samples or between them, by name."""
         every: list[dict[str, Extreme]] = [{} for _ in self.parts]
-        for name, sampled in self.of_phases.items():
+        for name, sampled in self.samples_by_name.items():
             q, alone = sampled.quantity, name not in self.names_recorded
             for k, (phase, worst) in enumerate(zip(self.result.phases, every, strict=True)):
                 x, rank = phase.extremes.get(name), self.ranks.get((name, k), -math.inf)
@@ -165,14 +165,14 @@ class Measurements:
         the end.
         """
         time = self.result.time
-        clearance, nearest = without_lost(self.result, self.close.each), self.close.nearest
+        clearance, nearest = without_lost(self.result, self.closeness.each), self.closeness.nearest
         stands = (~(clearance[0] > PAD)).any() or (self.left[-1] & ~(clearance[-1] > PAD)).any()
         if not (stands or self.names_recorded & {"clearance_start", "clearance_end"}):
             # No vehicle ever stands on an obstacle.
             return {"clearance_flight": self.worst("clearance")}
         off, beside = clearance > PAD, np.zeros(clearance.shape, dtype=np.bool_)
         near = np.nonzero(clearance <= PAD)
-        below = self.standing(*near)
+        below = self.obstacles_stood_on(*near)
         off[near], beside[near] = ~below.any(axis=0), ~below[nearest[near], np.arange(len(near[0]))]
         first = np.where(off.any(axis=0), off.argmax(axis=0), len(time))
         last = np.where(off.any(axis=0), len(time) - 1 - off[::-1].argmax(axis=0), len(time))
@@ -194,7 +194,7 @@ class Measurements:
             for name, part in parts.items()
         }
 
-    def standing(self, k: Ints, i: Ints) -> Bools:
+    def obstacles_stood_on(self, k: Ints, i: Ints) -> Bools:
         """On which obstacles (B, M) agents i (M,) stand, or may stand if they stay, at samples k (M,)."""
         r, things = self.result.position[k, i], self.mission.obstacles
         return proximity.below(r, self.mission.fleet.radius[i], things, self.result.time[k], PAD)
@@ -208,7 +208,7 @@ class Measurements:
         with np.errstate(invalid="ignore"):  # infinity where there is nothing to be near
             for name in ("separation", "clearance"):
                 if name in vars(result):  # else it would be made of these very positions
-                    stored[name] = getattr(result, name) - getattr(self.close, name)
+                    stored[name] = getattr(result, name) - getattr(self.closeness, name)
         stored["distance"] = np.abs(proximity.lengths(r, result.edges).T - result.distance)
         stored["thrust"] = self.samples_of("thrust").values - result.thrust
         for name, off in stored.items():
@@ -223,7 +223,7 @@ class Measurements:
         for index, phase in enumerate(result.phases):
             part, extremes = self.parts[index], phase.extremes
             if part.stop > part.start and extremes:
-                lacking = (x for x in _DUE if x not in extremes and self.is_due(x, index))
+                lacking = (x for x in _DUE if x not in extremes and self.needs_extreme(x, index))
                 if name := next(lacking, ""):
                     words = f"it lacks the worst '{name}' of phase '{phase.name}' between samples"
                     yield words, float(time[part.start])
@@ -232,10 +232,10 @@ class Measurements:
                 if x is None or rank == -math.inf:
                     continue
                 slack = rounding + share * abs(rank)
-                if rank > self.of_phases[name].quantity.rank(x.value) + slack or not (
+                if rank > self.samples_by_name[name].quantity.rank(x.value) + slack or not (
                     phase.t_start - 1e-9 <= x.time <= phase.t_end + 1e-9
                 ):
-                    sampled = self.worst_sample(self.of_phases[name], part)
+                    sampled = self.worst_sample(self.samples_by_name[name], part)
                     assert sampled is not None
                     words = (
                         f"its worst {name.replace('_', ' ')} of phase '{phase.name}' is given as"
@@ -243,7 +243,7 @@ class Measurements:
                     words += f" {value(x.value)} at {x.time:.2f} s, but a sample shows {value(sampled.value)}"
                     yield words, sampled.when
 
-    def is_due(self, name: str, index: int) -> bool:
+    def needs_extreme(self, name: str, index: int) -> bool:
         """Whether a phase that has samples has a worst value of a quantity between them."""
         if name == "geofence":
             return self.mission.limits.geofence is not None
@@ -254,7 +254,7 @@ class Measurements:
         there = (thing.solid.there[0] for thing in self.mission.obstacles)
         return any(a < phase.t_end - 1e-9 and b > phase.t_start + 1e-9 for a, b in there)
 
-    def phase(self, index: int, record: PhaseRecord) -> PhaseVerdict:
+    def phase_verdict(self, index: int, record: PhaseRecord) -> PhaseVerdict:
         """Numbers of a phase."""
         result, fit, waypoints = self.result, self.fits.get(index), self.waypoints
         finished = index in self.flown and (result.complete or index < len(result.phases) - 1)
@@ -373,7 +373,7 @@ class Measurements:
             aims = [unknown if (aim := x.get(name)) is None else aim for *_, x in due]
             aims = np.reshape(aims, (-1, values.shape[1]))
             turned = name == "attitude"
-            off = att.angle_between(values[at], aims) if turned else length(values[at] - aims)
+            off = att.angle_between(values[at], aims) if turned else norms(values[at] - aims)
             rows.append(np.degrees(off) if turned or name == "rates" else off)
         misses: dict[tuple[int, str], Waypoint] = {}
         for (index, what, _), k, row in zip(due, at, np.transpose(rows).tolist(), strict=True):

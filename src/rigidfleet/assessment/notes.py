@@ -159,8 +159,8 @@ def _turnover_notes(measured: Measurements, phases: list[PhaseVerdict]) -> Itera
             continue
         if not p.finished or fit.error > fit.limit:
             continue
-        normal, since = seen.setdefault(p.formation, (fit.points, p.t_end))
-        if angle_between(normal, fit.points) > FLIPPED:
+        normal, since = seen.setdefault(p.formation, (fit.turned_axis, p.t_end))
+        if angle_between(normal, fit.turned_axis) > FLIPPED:
             yield (
                 f"'{p.formation}' turns over between {since:.2f} s and {p.t_end:.2f} s;"
                 " no attitude is commanded"

@@ -16,9 +16,9 @@ from rigidfleet._common.facts import (
     table_of,
     worst_values,
 )
-from rigidfleet._common.plain import plain
+from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.quantities import QUANTITIES, quantity
-from rigidfleet._common.text import all_hold
+from rigidfleet._common.text import all_hold_in_words
 from rigidfleet._common.waypoints import SHAPE_TOLERANCE, WAYPOINT_TOLERANCE
 from rigidfleet.assessment.outcome import (
     FLIPPED,
@@ -148,12 +148,12 @@ class Verdict(Shown):
         praise_lines = [
             by_check[name].fill(words) for name, words in praise.items() if name in by_check
         ]
-        head = f"Passed: {all_hold(len(judged))}"
+        head = f"Passed: {all_hold_in_words(len(judged))}"
         return (f"{head}; {', '.join(praise_lines)}." if praise_lines else f"{head}.") + self.covers
 
     def to_dict(self) -> dict[str, Any]:
         """The verdict as plain data that JSON can hold; None for what does not apply."""
-        return plain(
+        return to_json_data(
             {
                 "mission": self.mission,
                 "title": self.title,

@@ -81,38 +81,38 @@ def main(tokens: Sequence[str] | None = None) -> int:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     console.prepare_streams()
     try:
-        with run.heeding_interrupts() if tokens is None else nullcontext():
+        with run.raise_interrupts() if tokens is None else nullcontext():
             return app(tokens, console=console.out(), error_console=console.err()) or PASSED
     except (CycloptsError, RigidfleetError) as error:
-        console.complain(_usage(error) if isinstance(error, CycloptsError) else error)
+        console.print_error(_usage(error) if isinstance(error, CycloptsError) else error)
         return BAD_INPUT
     except BrokenPipeError:
-        console.hang_up(sys.stdout)
+        console.discard_output(sys.stdout)
         return PASSED
     except OSError as error:  # a full disk, for example: not a fault of the program
         if error.filename is None:
-            console.hang_up(sys.stdout)
-        console.complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+            console.discard_output(sys.stdout)
+        console.print_error(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return BAD_INPUT
     except KeyboardInterrupt:
         console.err().print("Interrupted", style="yellow")
         return INTERRUPTED
     except MemoryError:
-        console.complain(
+        console.print_error(
             "There is not enough memory. Use fewer agents, edges or samples, or a larger machine."
         )
         return BAD_INPUT
     except Exception as error:
         if sys.flags.dev_mode:
             raise
-        console.complain(_own_fault(error))
+        console.print_error(_internal_error_message(error))
         return BAD_INPUT
     finally:
         if tokens is None:
             gc.freeze()  # the interpreter would search all objects once more before it ends, for 0.1 s
 
 
-def _own_fault(error: Exception) -> str:
+def _internal_error_message(error: Exception) -> str:
     """Message for an unexpected error."""
     *_, at = traceback.extract_tb(error.__traceback__)
     text = f"{type(error).__name__} in {Path(at.filename).name}, line {at.lineno}: {error}"
@@ -124,12 +124,12 @@ def _own_fault(error: Exception) -> str:
 
 def _usage(error: CycloptsError) -> str:
     """Message for an invalid command line."""
-    from rigidfleet._common.renamed import successor
+    from rigidfleet._common.renamed import rename_hint
 
     command = " ".join(("rigidfleet", *(error.command_chain or ()), "--help"))
     text = str(error)
     if isinstance(error, UnusedCliTokensError):
         text = f"Unexpected arguments: {' '.join(error.unused_tokens or ())}."
-    if isinstance(error, UnknownOptionError) and (newer := successor(error.token.keyword)):
+    if isinstance(error, UnknownOptionError) and (newer := rename_hint(error.token.keyword)):
         text = f"Unknown option: {error.token.keyword}; {newer}."
     return f"{text}\n    see `{command}`"

@@ -9,7 +9,7 @@ from typing import Any
 from rigidfleet.errors import RigidfleetError
 
 
-def exact(_type: Any, tokens: Sequence[Any]) -> int:
+def to_whole_number(_type: Any, tokens: Sequence[Any]) -> int:
     """Converter of cyclopts for a whole number, without rounding."""
     return parse_whole(tokens[0].value)
 

@@ -166,11 +166,11 @@ def assess(
             "mission": mission, "separation": separation, "limits": _limits(limits or []) | higher,
             "radius": radius or 0.0, "ground": ground, "name": flight_name(files[0]),
         }  # fmt: skip
-        doubts = _doubts(noise, clock) if noise or plan else None
+        doubts = _stated_doubts(noise, clock) if noise or plan else None
         result, verdict = _judge(read, files[0] if plan else None, doubts, judged)
     made = Files(out, result.mission.name) if out is not None else None
     if made is not None:
-        made.claim(replace=force)
+        made.check_writable(replace=force)
     for part in verdict.read if explain and not json else ():
         for key, value in part.items():
             words = ", ".join(map(str, value)) if isinstance(value, list) else f"{value}"
@@ -186,7 +186,7 @@ def assess(
         write_replay(result, made.replay)
         write_figures(result, made.figures(figures, DRAWN), quiet=json)
         if not json:
-            made.show()
+            made.print_paths()
     return {"passed": PASSED, "failed": FAILED, "undecided": UNDECIDED}[verdict.word]
 
 
@@ -224,7 +224,7 @@ def _judge(
     return judge_log(read, planned, doubts, **judged)
 
 
-def _doubts(noise: str | None, clock: Literal["recorded", "offset", "own"] | None) -> Doubts:
+def _stated_doubts(noise: str | None, clock: Literal["recorded", "offset", "own"] | None) -> Doubts:
     """What is stated of noise and clock.
 
     Raises

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.outputs import keep_existing
+from rigidfleet.cli.outputs import refuse_overwriting
 from rigidfleet.errors import MissionError, RigidfleetError
 
 if TYPE_CHECKING:
@@ -55,18 +55,18 @@ def check(
         Print the result as JSON.
     """
     from rigidfleet._common.files import write_file
-    from rigidfleet._common.progress import watched_by
+    from rigidfleet._common.progress import report_steps_to
     from rigidfleet._common.toml import to_toml
     from rigidfleet.mission import load_mission
     from rigidfleet.planning.timing import complete_times, expand_mission
 
-    keep_existing(expand, force=force, other="give another path")
-    keep_existing(out, force=force, other="give another folder")
+    refuse_overwriting(expand, force=force, other="give another path")
+    refuse_overwriting(out, force=force, other="give another folder")
     if out is not None and not abort:
         raise RigidfleetError("--out says where --abort writes. Add --abort.")
     watch = console.CheckWatch(mission)
     try:
-        with watch, watched_by(watch.update):
+        with watch, report_steps_to(watch.update):
             loaded = load_mission(mission)
             if expand is not None:
                 loaded = expand_mission(loaded)
@@ -91,7 +91,7 @@ def check(
         if json:
             console.print_json({"mission": mission, "right": True} | home.data())
         else:
-            console.show(home.facts())
+            console.print_sheet(home.facts())
         return PASSED
     from rigidfleet.preflight.check import check as preflight
 
@@ -103,15 +103,15 @@ def check(
         judged = {f.name: f.rigidity for f in ahead.formations}
         draw_graphs(loaded, judged, figure)
     if json:
-        console.print_json({"mission": mission, "right": True} | facts(loaded) | ahead.data())
+        console.print_json({"mission": mission, "right": True} | plain_facts(loaded) | ahead.data())
         return PASSED if ahead.passed else FAILED
-    console.show(ahead.facts())
+    console.print_sheet(ahead.facts())
     if expand is not None:
         console.out().print(f"\nMission  {expand}", soft_wrap=True)
     return PASSED if ahead.passed else FAILED
 
 
-def facts(mission: Mission) -> dict[str, object]:
+def plain_facts(mission: Mission) -> dict[str, object]:
     """Describe a mission as plain data."""
     return {
         "name": mission.name,

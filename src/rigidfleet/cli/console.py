@@ -60,7 +60,7 @@ def console(*, stderr: bool, width: int | None = None) -> Console:
         def on_broken_pipe(self) -> None:
             # The reader has closed the pipe, as `head` does: go on without output, the exit code still counts.
             self.quiet = True
-            hang_up(self.file)
+            discard_output(self.file)
 
     return Polite(stderr=stderr, width=width, markup=False, highlight=False, emoji=False)
 
@@ -75,7 +75,7 @@ def prepare_streams() -> None:
             stream.reconfigure(errors="replace")  # a character that the terminal lacks becomes "?"
 
 
-def hang_up(stream: IO[str]) -> None:
+def discard_output(stream: IO[str]) -> None:
     """Discard further output to a stream."""
     with open(os.devnull, "wb") as nowhere:
         os.dup2(nowhere.fileno(), stream.fileno())
@@ -88,7 +88,7 @@ def print_exactly(text: str) -> None:
         sys.stdout.buffer.write(text.encode())
         sys.stdout.buffer.flush()
     except BrokenPipeError:
-        hang_up(sys.stdout)
+        discard_output(sys.stdout)
 
 
 def print_json(data: object) -> None:
@@ -106,7 +106,7 @@ def show_verdict(verdict: Verdict, *, json: bool = False, quiet: bool = False) -
         out().print(verdict)
 
 
-def complain(error: object) -> None:
+def print_error(error: object) -> None:
     """Print an error, or each finding of an error about a mission."""
     from rich.text import Text
 
@@ -119,12 +119,12 @@ def warn(message: object, *_where: object) -> None:
     err().print(f"warning: {message}", style="yellow", soft_wrap=True, highlight=False)
 
 
-def show(sheet: Sheet) -> None:
+def print_sheet(sheet: Sheet) -> None:
     """Print facts: in a file or a pipe, rows of tables are not wrapped."""
     from rigidfleet._common.facts import FactTable
 
     wide = out() if out().is_terminal else console(stderr=False, width=_WIDE)
-    for block in sheet.blocks:
+    for block in sheet.printed_blocks:
         (wide if isinstance(block, FactTable) and not block.bare else out()).print(block)
 
 
@@ -160,10 +160,10 @@ class _Screen:
 
     def __exit__(self, *_: object) -> None:
         if self.progress is not None:
-            self.stand_still()
+            self.stop_animation()
             self.progress.stop()
 
-    def stand_still(self) -> None:
+    def stop_animation(self) -> None:
         """Draw only what is shown from now on, without a thread."""
         self.still.set()
         if self.animation.is_alive():
@@ -173,7 +173,7 @@ class _Screen:
         while not self.still.wait(_FRAME) and self.progress is not None:
             self.progress.refresh()
 
-    def compiling(self) -> None:
+    def announce_compilation(self) -> None:
         """Announce that the simulator will be compiled, in several parts during the flight."""
         self.cold, self.begun = True, perf_counter()
         if self.progress is None:
@@ -184,7 +184,7 @@ class _Screen:
         text = COMPILING if self.cold else "Starting"
         return self._words() or f"{text}: {perf_counter() - self.begun:.0f} s"
 
-    def show(self, total: float, done: float, now: float) -> None:
+    def show_progress(self, total: float, done: float, now: float) -> None:
         """Show the progress; without animation as a line, if the last line was long ago."""
         if self.progress is not None:
             self.progress.update(self.task, total=total, completed=done)
@@ -208,7 +208,7 @@ class CheckWatch:
 
     def __enter__(self) -> Self:
         self.done = threading.Event()
-        self.thread = threading.Thread(target=self._tell, daemon=True)
+        self.thread = threading.Thread(target=self._announce_step, daemon=True)
         self.thread.start()
         return self
 
@@ -220,7 +220,7 @@ class CheckWatch:
         """Set the current step."""
         self.stage = stage
 
-    def _tell(self) -> None:
+    def _announce_step(self) -> None:
         while not self.done.wait(_PATIENCE):
             text = f"Checking {self.what}: {self.stage}, {perf_counter() - self.begun:.0f} s"
             err().print(text, soft_wrap=True)
@@ -241,7 +241,7 @@ class FlightWatch(_Screen):
             self.recent.clear()  # measure the speed without the time of compiling
         self.recent.append(progress)
         self.heard = now
-        self.show(progress.t_end, progress.t, now)
+        self.show_progress(progress.t_end, progress.t, now)
 
     def _words(self) -> str:
         """Mission time, speed relative to real time, time left, phase."""
@@ -275,10 +275,10 @@ class SweepWatch(_Screen):
         if progress.flown > before and (self.base is None or self.base.workers != progress.workers):
             self.base = progress  # measure the rate of these workers without their start-up
         if progress.flown and progress.workers > 1:
-            self.stand_still()  # the cores are for the workers, and these may be forks, which want no thread
+            self.stop_animation()  # the cores are for the workers, and these may be forks, which want no thread
         self.last = progress
         if self.base is not None:
-            self.show(progress.runs, progress.done, perf_counter())
+            self.show_progress(progress.runs, progress.done, perf_counter())
 
     def _words(self) -> str:
         """Finished runs, rate, time left, failures, workers."""

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import exact, parse_whole
+from rigidfleet.cli.arguments import parse_whole, to_whole_number
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.outputs import keep_existing
+from rigidfleet.cli.outputs import refuse_overwriting
 from rigidfleet.errors import RigidfleetError
 
 #: Maximum number of agents for which a design is compared with all pairs.
@@ -24,7 +24,7 @@ def design(
     shape: str,
     /,
     *,
-    agents: Annotated[int | None, Parameter(converter=exact)] = None,
+    agents: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
     spacing: float | None = None,
     font: str | None = None,
@@ -81,7 +81,7 @@ def design(
     from rigidfleet.formation.point_files import csv_of_points
     from rigidfleet.rigidity import design as designs
 
-    keep_existing(out, force=force)
+    refuse_overwriting(out, force=force)
     try:
         name, (slots, colours, notes) = points_of(shape, agents, size, spacing, font)
         kinds: dict[str, Any] = {}
@@ -139,7 +139,7 @@ def _refuse_options_that_clash(
     ValueError
         The graph is unknown, a value is not positive, or --extra, --range or --reach cannot be combined with it.
     """
-    from rigidfleet._common.renamed import successor
+    from rigidfleet._common.renamed import rename_hint
     from rigidfleet.formation.graphs import GRAPHS
 
     if edges is None:
@@ -149,7 +149,7 @@ def _refuse_options_that_clash(
             raise ValueError(f"--range must be a positive length [m], not {sensing_range:g}")
         return
     if edges not in GRAPHS and edges != "none":
-        remedy = successor("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"
+        remedy = rename_hint("edges", edges) or f"graphs: {', '.join(GRAPHS)}, none"
         raise ValueError(f"there is no graph {edges!r}; {remedy}")
     if extra != "0" or sensing_range is not None:
         raise ValueError("--extra and --range have no effect with --edges; remove them or --edges")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.outputs import keep_existing
+from rigidfleet.cli.outputs import refuse_overwriting
 from rigidfleet.errors import ResultError, RigidfleetError
 
 
@@ -63,7 +63,7 @@ def export(
         console.warn(why)
     name = f"{result.stem}-{format}" if chosen.each else f"{result.stem}.{chosen.suffix}"
     path = out or result.parent / name  # a path such as "." has no name to change
-    keep_existing(path, force=force)
+    refuse_overwriting(path, force=force)
     try:
         made = write(flight, path, format, rate=rate, tolerance=tolerance, flown=flown)  # ty: ignore[invalid-argument-type]
     except ValueError as error:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import exact
+from rigidfleet.cli.arguments import to_whole_number
 from rigidfleet.cli.outputs import Files
 
 if TYPE_CHECKING:
     from rigidfleet.result import Result
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.run import heeding_interrupts
+from rigidfleet.cli.run import raise_interrupts
 
 
 def live(
@@ -22,7 +22,7 @@ def live(
     /,
     *,
     out: Path | None = None,
-    port: Annotated[int, Parameter(converter=exact)] = 0,
+    port: Annotated[int, Parameter(converter=to_whole_number)] = 0,
     no_browser: bool = False,
 ) -> int:
     """Fly the vehicles of a mission by hand in the browser, in real time. Each flight is saved when it ends.
@@ -48,18 +48,18 @@ def live(
     from rigidfleet.web.live import live as fly
 
     place = Files(out or Path("flights", f"{flown.name.removesuffix('-live')}-live"), "")
-    place.try_out()
+    place.test_folder()
 
     def save_flight(result: Result) -> str:
         files = Files(place.folder, result.mission.name).make_new_folder()
         console.show_verdict(files.save(result))
-        files.show()
+        files.print_paths()
         return f"Saved in {files.result}."
 
     def ready(url: str) -> None:
         console.out().print(f"Flying {flown.name} at {url}", soft_wrap=True)
         console.err().print("To end the flight, press Ctrl-C or close its page")
 
-    with heeding_interrupts():
+    with raise_interrupts():
         fly(flown, port=port, browser=not no_browser, ready=ready, landed=save_flight)
     return PASSED

@@ -11,10 +11,10 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import exact, parse_number, parse_whole
-from rigidfleet.cli.check import facts
+from rigidfleet.cli.arguments import parse_number, parse_whole, to_whole_number
+from rigidfleet.cli.check import plain_facts
 from rigidfleet.cli.codes import PASSED
-from rigidfleet.cli.outputs import keep_existing
+from rigidfleet.cli.outputs import refuse_overwriting
 from rigidfleet.errors import RigidfleetError
 
 
@@ -23,7 +23,7 @@ def new(
     /,
     *,
     shape: str | None = None,
-    agents: Annotated[int | None, Parameter(converter=exact)] = None,
+    agents: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     size: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
     mass: float | None = None,
     thrust_limit: float | None = None,
@@ -89,7 +89,7 @@ def new(
     if not file.name:
         raise RigidfleetError(f"{file}: is a folder. Name a file.")
     file = file if file.suffix == ".toml" else file.with_name(f"{file.name}.toml")
-    keep_existing(file, force=force, other="give another name")
+    refuse_overwriting(file, force=force, other="give another name")
     if not show and (formations or shape or "cube") not in SHAPES:  # points make a show
         show, formations = True, formations or options.pop("shape")
     try:
@@ -110,7 +110,7 @@ def new(
         )
     write_file(file, text.encode())
     if json:
-        console.print_json({"file": str(file)} | facts(mission))
+        console.print_json({"file": str(file)} | plain_facts(mission))
     elif not quiet:
         console.out().print(f"{file}: {mission.size_in_words}", soft_wrap=True)
         console.out().print(f"To fly it: rigidfleet run {file}", soft_wrap=True)
@@ -135,13 +135,13 @@ def _show_text(file: Path, values: dict[str, Any], formations: str, spacing: flo
     if agents is None:
         counts = (len(points.slots) for word in words if (points := _file_points(word)))
         agents = next(counts, _SHOWN)
-    scenes = [_scene(file, word, agents, spacing) for word in words]
-    return show_draft.show(
+    scenes = [_show_formation(file, word, agents, spacing) for word in words]
+    return show_draft.show_text(
         file.stem, scenes, agents=agents, spacing=spacing, file=str(file), **values
     )
 
 
-def _scene(file: Path, word: str, agents: int, spacing: float) -> Any:
+def _show_formation(file: Path, word: str, agents: int, spacing: float) -> Any:
     """A formation of a show of a shape, a file or words.
 
     Points of a whole file in the folder of the mission that are not too narrow are written by the name of the file.
@@ -157,7 +157,7 @@ def _scene(file: Path, word: str, agents: int, spacing: float) -> Any:
     from rigidfleet.mission import show_draft
 
     if word in SHAPES:
-        return show_draft.scene(word, agents, spacing)
+        return show_draft.shape_scene(word, agents, spacing)
     folder, there, count = file.parent.resolve(), Path(word).resolve(), agents
     if (own := _file_points(word)) is not None:
         whole = not own.notes and len(own.slots) <= agents and there.is_relative_to(folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Literal
 
-from rigidfleet._common.files import make_folder, unwritable, write_file
+from rigidfleet._common.files import make_folder, unwritable_error, write_file
 from rigidfleet.cli import console
 from rigidfleet.errors import ResultError
 
@@ -51,7 +51,7 @@ class Files:
         """All files that are derived from the result."""
         return [self.verdict, self.table, self.report, self.replay, *self.figures()]
 
-    def claim(self, *, replace: bool) -> None:
+    def check_writable(self, *, replace: bool) -> None:
         """Check before a flight that its files can be written.
 
         Raises
@@ -59,10 +59,10 @@ class Files:
         ResultError
             Files exist and must not be overwritten, or the folder cannot be written.
         """
-        keep_existing(self.result, *self.beside_result, force=replace)
-        self.try_out()
+        refuse_overwriting(self.result, *self.beside_result, force=replace)
+        self.test_folder()
 
-    def try_out(self) -> None:
+    def test_folder(self) -> None:
         """Test that the folder, or the folder in which it will be created, can be written.
 
         Raises
@@ -77,7 +77,7 @@ class Files:
         try:
             TemporaryFile(dir=folder).close()
         except OSError as error:
-            raise unwritable(self.folder, error) from error
+            raise unwritable_error(self.folder, error) from error
 
     def make_new_folder(self) -> Files:
         """Create a new folder: this one, or if it exists, one with a number added to its name.
@@ -98,7 +98,7 @@ class Files:
                     count += 1
                     folder = self.folder.with_name(f"{self.folder.name}-{count}")
         except OSError as error:
-            raise unwritable(folder, error) from error
+            raise unwritable_error(folder, error) from error
 
     def save(self, result: Result, verdict: Verdict | None = None) -> Verdict:
         """Write a result and its verdict, without what is left of an earlier result, and return the verdict.
@@ -122,7 +122,7 @@ class Files:
         """Write a verdict as JSON."""
         write_file(self.verdict, (verdict.json() + "\n").encode())
 
-    def show(self) -> None:
+    def print_paths(self) -> None:
         """Print the paths of the files that are there."""
         console.out().print()
         for what, path in (
@@ -137,7 +137,7 @@ class Files:
             console.out().print(text, soft_wrap=True)
 
 
-def keep_existing(
+def refuse_overwriting(
     *paths: Path | None, force: bool, other: str = "--out to choose another place"
 ) -> None:
     """Refuse to overwrite files that exist, except with ``force``; ``other`` is the other remedy.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 from rigidfleet.cli import console
 from rigidfleet.cli.codes import FAILED, PASSED
-from rigidfleet.cli.outputs import Files, keep_existing
+from rigidfleet.cli.outputs import Files, refuse_overwriting
 from rigidfleet.cli.run import DRAWN, Format, check_width, write_figures, write_replay
 from rigidfleet.errors import ResultError, RigidfleetError
 
@@ -81,14 +81,14 @@ def report(
     paths = [result, *others]
     records = [Result.load(path) for path in paths]
     beside = {
-        "rehearsed": _rehearsal(drill, records[0].mission) if drill else [],
-        "abort": _aborts(abort, records[0].mission) if abort else [],
+        "rehearsed": _drill_sentences(drill, records[0].mission) if drill else [],
+        "abort": _abort_sentences(abort, records[0].mission) if abort else [],
     }
     if others:
         page = (out or Path()) / "comparison.html"
-        keep_existing(page, force=force)
+        refuse_overwriting(page, force=force)
     files = Files(out or (Path() if others else result.parent), records[0].mission.name)
-    files.try_out()
+    files.test_folder()
     verdicts = [assess(record) for record in records]
     if json:
         verdict_data = [verdict.to_dict() for verdict in verdicts]
@@ -114,7 +114,7 @@ def report(
             write_report(records, verdicts, files.report, quiet=quiet, **beside)
         write_figures(records[0], left, quiet=quiet, titles=not no_titles, width=width)
         if not (json or quiet):
-            files.show()
+            files.print_paths()
         if kept and not quiet:
             console.err().print(
                 f"{console.count(len(kept), 'existing file')} kept; use --force to overwrite"
@@ -138,7 +138,7 @@ def replay(result: Path, /, *, out: Path | None = None, force: bool = False) -> 
 
     record = Result.load(result)
     page = out or Files(result.parent, record.mission.name).replay
-    keep_existing(page, force=force)
+    refuse_overwriting(page, force=force)
     write_replay(record, page)
     console.out().print(f"Replay   {page}", soft_wrap=True)
     return PASSED
@@ -155,7 +155,7 @@ def write_report(
         write(records, path, verdicts=verdicts, **beside)
 
 
-def _rehearsal(folder: Path, mission: Mission) -> list[str]:
+def _drill_sentences(folder: Path, mission: Mission) -> list[str]:
     """What a mission bears by its drill, fault by fault.
 
     Raises
@@ -174,11 +174,11 @@ def _rehearsal(folder: Path, mission: Mission) -> list[str]:
             f"{path}: has no faults of the day. `rigidfleet sweep --drill` flies them."
         )
     if own.digest != mission.digest:  # a result has the ways that were planned for its mission
-        _refuse_other(path, expand_mission(own).digest, mission)
+        _refuse_other_mission(path, expand_mission(own).digest, mission)
     return [*outcome.rehearsals(), _digest_of(path)]
 
 
-def _aborts(folder: Path, mission: Mission) -> list[str]:
+def _abort_sentences(folder: Path, mission: Mission) -> list[str]:
     """How a mission is aborted, from when and when not, and what follows if a vehicle does not hear the order.
 
     Raises
@@ -194,7 +194,7 @@ def _aborts(folder: Path, mission: Mission) -> list[str]:
         raise ResultError(
             f"{path}: is no file of aborts of this version. `rigidfleet check --abort --out {folder}` writes it."
         ) from None
-    _refuse_other(path, digest, mission)
+    _refuse_other_mission(path, digest, mission)
     ways = [x for x in every if x["way"]]
     to = {"any": "to any places where vehicles stood", "own": "each to its own place"}[data["to"]]
     lines = [
@@ -223,7 +223,7 @@ def _aborts(folder: Path, mission: Mission) -> list[str]:
     return [*lines, _digest_of(path)]
 
 
-def _refuse_other(path: Path, digest: str, mission: Mission) -> None:
+def _refuse_other_mission(path: Path, digest: str, mission: Mission) -> None:
     if digest != mission.digest:
         raise ResultError(
             f"{path}: is of another mission, SHA-256 {digest[:16]}, and the flight of {mission.digest[:16]}. Make it"

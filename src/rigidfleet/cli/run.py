@@ -91,8 +91,8 @@ def run(
         data = loaded.to_dict()
         loaded = loaded.rewritten(data | {"abort": data.get("abort", {}) | {"at": abort_at}})
     files = Files(out or Path("flights", loaded.name), loaded.name)
-    files.claim(replace=force)
-    with watching(None if quiet else console.FlightWatch()) as progress:
+    files.check_writable(replace=force)
+    with show_progress(None if quiet else console.FlightWatch()) as progress:
         result, interrupted = fly(loaded, progress)
 
     verdict = files.save(result)
@@ -115,7 +115,7 @@ def run(
         except KeyboardInterrupt:
             interrupted = True
     if not (json or quiet):
-        files.show()
+        files.print_paths()
     if interrupted:
         words = f"Interrupted: {what} in {files.result}"
         console.err().print(words, style="yellow", soft_wrap=True)
@@ -158,7 +158,7 @@ def missions(
         ]
         heads = ("mission", "what it shows", "in the paper")
         first = f"\nLook first at {', '.join(FIRST)}: rigidfleet run {FIRST[0]}"
-        console.show(Sheet("", "", [FactTable(heads, rows, heads)]))
+        console.print_sheet(Sheet("", "", [FactTable(heads, rows, heads)]))
         console.out().print(first, soft_wrap=True)
     return PASSED
 
@@ -174,20 +174,20 @@ def fly(mission: Mission, progress: Callable[..., None] | None) -> tuple[Result,
 
 
 @contextmanager
-def watching(
+def show_progress(
     watch: console.FlightWatch | console.SweepWatch | None,
 ) -> Generator[Callable[..., None] | None]:
     """Show what is computed in this context, and heed interrupts; what is entered receives the progress."""
     from rigidfleet.kernel.engine.native import is_compiled
 
-    with watch or nullcontext(), heeding_interrupts():
+    with watch or nullcontext(), raise_interrupts():
         if watch is not None and not is_compiled():
-            watch.compiling()
+            watch.announce_compilation()
         yield None if watch is None else watch.update
 
 
 @contextmanager
-def heeding_interrupts() -> Generator[None]:
+def raise_interrupts() -> Generator[None]:
     """Raise KeyboardInterrupt on Ctrl-C even if the compiler turns it into another exception."""
     interrupted = False
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import check_workers, exact
+from rigidfleet.cli.arguments import check_workers, to_whole_number
 from rigidfleet.cli.codes import BAD_INPUT, INTERRUPTED, PASSED
-from rigidfleet.cli.run import DRAWN, Format, watching
+from rigidfleet.cli.run import DRAWN, Format, show_progress
 from rigidfleet.errors import RigidfleetError
 
 if TYPE_CHECKING:
@@ -27,8 +27,8 @@ def sweep(
     drill: bool = False,
     separation: float | None = None,
     radius: float | None = None,
-    runs: Annotated[int | None, Parameter(converter=exact)] = None,
-    seed: Annotated[int | None, Parameter(converter=exact)] = None,
+    runs: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
+    seed: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     out: Path | None = None,
     force: bool = False,
     final_states: bool = False,
@@ -36,7 +36,7 @@ def sweep(
     controller: str | None = None,
     rate: float | None = None,
     agent: str | None = None,
-    workers: Annotated[int | None, Parameter(converter=exact)] = None,
+    workers: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     cluster: str | None = None,
     shard: str = "",
     merge: bool = False,
@@ -134,7 +134,7 @@ def sweep(
         definition, whole = _sweep_and_folder(mission, vary or [], runs, out, shard, keys, limits)
         folder = shards.shard_folder(whole, shard)
         try:
-            with watching(None if quiet else console.SweepWatch()) as progress:
+            with show_progress(None if quiet else console.SweepWatch()) as progress:
                 table = fly(
                     definition, whole, workers=workers, cluster=cluster, shard=shard, replace=force, progress=progress,
                 )  # fmt: skip
@@ -149,7 +149,7 @@ def sweep(
     if json:
         console.print_exactly(outcome.json() + "\n")
     elif not quiet:
-        console.show(outcome.facts())
+        console.print_sheet(outcome.facts())
     drawn = [] if no_figures or shard else figures.plot(
         table, folder / "figures", formats=format or DRAWN, over=map_ or (), metric=metric,
         titles=not no_titles,
@@ -162,7 +162,7 @@ def sweep(
             console.out().print(text, soft_wrap=True)
     if outcome.reasons and set(table.reason) <= {*UNJUDGED}:
         reason, example = next(iter(outcome.examples.items()))
-        console.complain(
+        console.print_error(
             f"{folder}: no run has a verdict. Run {example.run}: {reason_in_words(reason)}: {example.detail}\n"
             "    correct the mission, what varies, or the controller; --force overwrites this sweep"
         )

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from rigidfleet.cli import console
-from rigidfleet.cli.arguments import check_workers, exact
+from rigidfleet.cli.arguments import check_workers, to_whole_number
 from rigidfleet.cli.codes import INTERRUPTED, PASSED
-from rigidfleet.cli.run import watching
+from rigidfleet.cli.run import show_progress
 from rigidfleet.errors import RigidfleetError
 
 
@@ -20,13 +20,13 @@ def tune(
     /,
     *,
     objective: Literal["shape", "shape-rms", "shape-forces", "tracking", "tracking-rms"] = "shape",
-    budget: Annotated[int, Parameter(converter=exact)] = 300,
-    seeds: Annotated[int, Parameter(converter=exact)] = 3,
-    validation: Annotated[int, Parameter(converter=exact)] = 8,
-    seed: Annotated[int, Parameter(converter=exact)] = 0,
+    budget: Annotated[int, Parameter(converter=to_whole_number)] = 300,
+    seeds: Annotated[int, Parameter(converter=to_whole_number)] = 3,
+    validation: Annotated[int, Parameter(converter=to_whole_number)] = 8,
+    seed: Annotated[int, Parameter(converter=to_whole_number)] = 0,
     margin_share: float = 1.0,
     assume: list[str] | None = None,
-    workers: Annotated[int | None, Parameter(converter=exact)] = None,
+    workers: Annotated[int | None, Parameter(converter=to_whole_number)] = None,
     out: Path | None = None,
     force: bool = False,
     json: bool = False,
@@ -75,7 +75,7 @@ def tune(
     loaded = load_mission(mission)
     folder = out or Path("tunes", loaded.name)
     try:
-        with watching(None if quiet else console.SweepWatch()) as progress:
+        with show_progress(None if quiet else console.SweepWatch()) as progress:
             tuned = study(
                 loaded, folder, objective=objective, budget=budget, seeds=seeds, validation=validation,
                 seed=seed, margin_share=margin_share, assume=_keys_of_lines(assume or []),
@@ -88,7 +88,7 @@ def tune(
     if json:
         console.print_json(tuned.to_dict()["result"])
     elif not quiet:
-        console.show(tuned.facts())
+        console.print_sheet(tuned.facts())
         console.out().print(f"\nMission  {tuned.file}", soft_wrap=True)
         console.out().print(f"Study    {folder / 'study.json'}", soft_wrap=True)
     return PASSED

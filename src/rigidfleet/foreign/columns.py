@@ -131,8 +131,8 @@ def parse_table(data: bytes, words: Units) -> tuple[TextTable, list[str]]:
 
 def _times(table: TextTable, notes: list[str]) -> tuple[Floats, int | None]:
     """Times (K,) [s], and the nanoseconds since 1970 from which they count; None if they are no dates."""
-    if not (columns := table.place("time")):
-        raise table.missing("time")
+    if not (columns := table.find("time")):
+        raise table.missing_error("time")
     fields = table.columns[columns[0]].tolist() or [""]
     number = is_number(fields[0])
     if not table.lines.size or (number and abs(float(fields[0].replace(",", "."))) < _DATES[0]):
@@ -222,7 +222,7 @@ def read_tracks(
     named = table.kinds[main.place[0]].kind in DIRECTIONS
     said = "the option" if axes else "the file" if named else ""
     notes += _doubts(table, tracks, axes=bool(said))
-    used = {*columns, *table.place("time"), *identity}
+    used = {*columns, *table.find("time"), *identity}
     return tracks, {
         "rows": len(time), "names_in_line": table.line, "separator": SEPARATORS[table.separator],
         "decimal_mark": table.decimal or ".",
@@ -248,13 +248,13 @@ def _columns_of_vehicles(table: TextTable, axes: str, notes: list[str]) -> dict[
         place, turned = table.position(axes, who)
         kinds = ("vx", "vy", "vz"), ("yaw",), ("qx", "qy", "qz", "qw")
         if place:
-            sets[who] = _Places(turned, place, *(table.place(*kind, who=who) for kind in kinds))
+            sets[who] = _Places(turned, place, *(table.find(*kind, who=who) for kind in kinds))
         if own := {kind: k for (kind, x), k in table.places.items() if x == who and kind in "xyz"}:
             loose[who] = own
     flown = {who: own for who, own in sets.items() if who not in ROLES} or sets
     flown = {"": sets[""]} if "" in sets else flown
     if not flown:
-        raise table.missing(*"xyz")
+        raise table.missing_error(*"xyz")
     main = next(iter(flown))
     for who in loose.keys() - flown.keys():
         names = ", ".join(table.names[k] for k in loose[who].values())

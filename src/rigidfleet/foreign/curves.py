@@ -72,18 +72,18 @@ def curve_through_states(time: Floats, states: Floats, yaw: Floats | None = None
         states[1:] = 0.0
         angle = np.repeat(angle, 2, axis=1) * [[1.0], [0.0]][: len(angle)]
     position, turned = (Piecewise.hermite(time, x) for x in (states, angle[..., None]))
-    return position.beside(turned)
+    return position.stack(turned)
 
 
 def with_headings(curve: Piecewise, times: Floats, yaws: Floats) -> Piecewise:
     """The same way with yaw on lines between yaws (K,) [rad] at times (K,) [s]; it jumps where two have one time."""
-    moved = curve.cut(times)
+    moved = curve.insert_knots(times)
     quarter = np.diff(moved.time) / 4  # inside of a piece, where a jump at its end is not seen
     begin = np.interp(moved.time[:-1] + quarter, times, yaws)
     end = np.interp(moved.time[1:] - quarter, times, yaws)
     slope = (end - begin) / (2 * quarter)
     yaw = Piecewise(moved.time, np.stack([begin - slope * quarter, slope], axis=-1)[:, None])
-    return Piecewise(moved.time, moved.pieces[:, :3]).beside(yaw)
+    return Piecewise(moved.time, moved.pieces[:, :3]).stack(yaw)
 
 
 def rows_to_curve(rows: ArrayLike) -> Piecewise:

@@ -15,7 +15,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from rigidfleet._common.files import why_not
+from rigidfleet._common.files import os_error_in_words
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet._common.text import first_few
 from rigidfleet.errors import TrajectoryError
@@ -124,7 +124,7 @@ def read_trajectories(
         for note in part.notes:
             who = source.stem if several and "clock" in part.read[0] else ""
             whose.setdefault(note, []).append(who)
-    notes = [*logs.of_all(whose)]
+    notes = [*logs.notes_with_names(whose)]
     if several and any(part.read[0].get("clock") == logs.GNSS for part in parts):
         notes.insert(0, f"the clock that vehicles have in common is {logs.GNSS}")
     own_clocks = several and any(part.own_clocks for part in parts)
@@ -221,11 +221,11 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     """
     if not path.is_dir():
         return [[path]]
-    inside = _seen_in(path)
+    inside = _visible_files(path)
     parts = [p for p in inside if p.suffix.lower() in _RECORDINGS]
     if parts and (path / "metadata.yaml").is_file():
         return [parts]
-    files = [p for p in inside if p.is_file() and _is_read(p)]
+    files = [p for p in inside if p.is_file() and _may_have_trajectories(p)]
     kinds = {p.suffix.lower() for p in files}
     if len(kinds) > 1:
         why = f"the folder has files {' and '.join(sorted(kinds))}"
@@ -233,7 +233,7 @@ def groups_of_files(path: Path) -> list[list[Path]]:
     if files:
         return [[p] for p in files]
     folders = [p for p in inside if p.is_dir()]
-    groups = {x: [p for p in _seen_in(x) if p.suffix.lower() == ".csv"] for x in folders}
+    groups = {x: [p for p in _visible_files(x) if p.suffix.lower() == ".csv"] for x in folders}
     for folder, group in groups.items() or [(path, [])]:
         if not group:
             why = "the folder has no .csv, .skyc, .mcap or log"
@@ -259,7 +259,7 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
     inside = sorted(path.rglob("*"), key=logs.natural_key)
     rest = [p for p in inside if p.is_file() and p not in read]
     for p in rest:
-        hidden = _is_read(p) and not _is_hidden(p)
+        hidden = _may_have_trajectories(p) and not _is_hidden(p)
         with suppress(TrajectoryError):
             hidden = hidden or bool(
                 _read_file([p], "linear", units_of(None, None), (), None, False)
@@ -271,12 +271,12 @@ def _notes_on_unread_files(path: Path, listed: list[list[Path]]) -> list[str]:
     return [f"of '{path.name}', {names} is not read"] if rest else []
 
 
-def _seen_in(folder: Path) -> list[Path]:
+def _visible_files(folder: Path) -> list[Path]:
     """What is in a folder, in order, and not hidden."""
     return [p for p in sorted(folder.iterdir(), key=logs.natural_key) if not _is_hidden(p)]
 
 
-def _is_read(path: Path) -> bool:
+def _may_have_trajectories(path: Path) -> bool:
     """Whether a file may have trajectories, by its name; of one named ``.bin``, by its content."""
     suffix = path.suffix.lower()
     return suffix in _SUFFIXES or (suffix == ".bin" and _head_of(path).startswith(logs.BIN))
@@ -294,7 +294,7 @@ def _head_of(path: Path) -> bytes:
         with path.open("rb") as file:
             return file.read(16)
     except OSError as error:
-        raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
+        raise TrajectoryError(f"{path}: {os_error_in_words(error, 'read', path)}") from error
 
 
 def _is_hidden(path: Path) -> bool:
@@ -344,7 +344,7 @@ def _read_file(
         for who, curve in zip(read.names, read.curves, strict=True):
             _refuse_far_numbers(who, curve)
     except OSError as error:
-        raise TrajectoryError(f"{path}: {why_not(error, 'read', path)}") from error
+        raise TrajectoryError(f"{path}: {os_error_in_words(error, 'read', path)}") from error
     except ContentError as error:
         raise TrajectoryError(f"{path}: {error}") from None
     return read

@@ -174,7 +174,7 @@ class _Complaints(io.TextIOBase):
         return len(text)
 
 
-def choose(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
+def choose_channels(channels: Sequence[Channel], topics: Sequence[str]) -> list[Channel]:
     """The channels whose topics are named, or all, in the order in which they are preferred.
 
     Raises
@@ -214,7 +214,7 @@ def trajectories_of(
     several |= len(log.vehicles) > 1
     for who in sorted(log.vehicles, key=natural_key):
         reasons: list[str] = []
-        channels = choose(log.vehicles[who], topics)
+        channels = choose_channels(log.vehicles[who], topics)
         unlike = lambda c: several and FORMS[c.message][0].frame == "ned" and c.reference is None  # noqa: E731
         for channel in sorted(channels, key=unlike):
             try:
@@ -237,7 +237,7 @@ def trajectories_of(
     samples = [(seconds(x.time), x.place, x.yaw) for x in every]
     curves = [curve_through_samples(*own, interpolation, str) for own in samples]
     if not topics and all(who == track.topic for who, track in tracks.items()):
-        _refuse_twins([*tracks], curves)
+        _refuse_duplicates([*tracks], curves)
     frames = [*dict.fromkeys(track.frame for track in every)]
     if len(frames) > 1:
         words = ", ".join(frames[:_LISTED])
@@ -255,12 +255,12 @@ def trajectories_of(
         spans = seconds(np.append(time, max([last, *time[-1:]]))[k].reshape(-1, 2))
         record["armed"] = [f"{a:.6g} to {b:.6g} s" for a, b in spans[:_LISTED]] or "never"
     return Trajectories(
-        tuple(tracks), tuple(curves), ASSUMED[interpolation], tuple(of_all(notes)), (record,),
+        tuple(tracks), tuple(curves), ASSUMED[interpolation], tuple(notes_with_names(notes)), (record,),
         measured=tuple(track.measured for track in every), own_clocks=not log.clock,
     )  # fmt: skip
 
 
-def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
+def _refuse_duplicates(names: list[str], curves: list[Piecewise]) -> None:
     """Refuse two topics that are at one place most of the time.
 
     Raises
@@ -279,7 +279,7 @@ def _refuse_twins(names: list[str], curves: list[Piecewise]) -> None:
             raise fault(f"{words}: is that one vehicle?", "Name the topics of vehicles: --topic")
 
 
-def of_all(notes: dict[str, list[str]]) -> Iterator[str]:
+def notes_with_names(notes: dict[str, list[str]]) -> Iterator[str]:
     """Notes with the names of those whom they are on, unless it is the only one ("")."""
     for note, names in notes.items():
         yield f"{first_few(names, _LISTED)}: {note}" if any(names) else note
@@ -312,7 +312,7 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     if form is None:
         raise fault(f"{channel.topic}: its messages are of a form that is not known")
     frame = next((f for f in ("ned", "enu") if channel.frame.endswith(f"_{f}")), form.frame)
-    place = _fields(columns, form.place) * form.units[:3]
+    place = _stack_columns(columns, form.place) * form.units[:3]
     known = np.isfinite(place).all(axis=1)
     known &= (place[:, :2] != 0.0).any(axis=1) | (frame != "geodetic")
     for name in _VALID.keys() & columns.keys():
@@ -335,17 +335,17 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
         reference = origin or (*place[0].tolist(),)
         place = enu_of(place, reference)
     else:
-        place = _turn(place, frame)
+        place = _turn_to_enu(place, frame)
         if reference is not None:
             place = place + enu_of(np.array([reference]), origin or reference)
         elif frame == "ned":
             notes.append("positions are about a place that the log does not tell")
     if form.velocity and {*form.velocity.split()} <= own.keys():
-        velocity = _turn(_fields(own, form.velocity) * form.units[3], frame)
+        velocity = _turn_to_enu(_stack_columns(own, form.velocity) * form.units[3], frame)
     if form.spread and {*form.spread.split()} <= own.keys():
-        spread = np.maximum(_fields(own, form.spread), 0.0)
+        spread = np.maximum(_stack_columns(own, form.spread), 0.0)
         spread = spread * _SHARES if form.spread == _EPH else np.sqrt(spread)
-        deviation = np.abs(_turn(np.where(spread > 0.0, spread, np.nan), frame))
+        deviation = np.abs(_turn_to_enu(np.where(spread > 0.0, spread, np.nan), frame))
     for name in {*form.yaw.split()} & own.keys():
         yaw = own[name].astype(np.float64) * form.units[4]
         yaw = yaw if frame == "enu" else 0.5 * np.pi - yaw
@@ -364,11 +364,11 @@ def _track_of(channel: Channel, origin: Geodetic | None) -> _Track:
     return _Track(channel.topic, frame, time, place, yaw, states, origin, notes)
 
 
-def _fields(columns: dict[str, Any], names: str) -> Floats:
+def _stack_columns(columns: dict[str, Any], names: str) -> Floats:
     return np.column_stack([columns[name] for name in names.split()]).astype(np.float64)
 
 
-def _turn(x: Floats, frame: str) -> Floats:
+def _turn_to_enu(x: Floats, frame: str) -> Floats:
     """Vectors (K, 3) in east, north, up."""
     return x if frame == "enu" else x[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
 
@@ -389,7 +389,7 @@ def _increasing_rows(time: Any, rows: Ints, notes: list[str]) -> Ints:
 def _resets(columns: dict[str, Any], time: Floats, place: Floats, velocity: Floats | None) -> Ints:
     """Samples at which the estimator set the position anew: as it counts that, or as its velocities show."""
     if names := [name for name in _RESETS if name in columns]:
-        again = (np.diff(_fields(columns, " ".join(names)), axis=0) != 0.0).any(axis=1)
+        again = (np.diff(_stack_columns(columns, " ".join(names)), axis=0) != 0.0).any(axis=1)
         return np.flatnonzero(again) + 1
     if velocity is None or len(time) < 2:
         return np.zeros(0, dtype=np.int64)
@@ -398,11 +398,11 @@ def _resets(columns: dict[str, Any], time: Floats, place: Floats, velocity: Floa
     return np.flatnonzero(far > max(_JUMP, _UNUSUAL * float(np.median(far)))) + 1
 
 
-def _place_of(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:
+def _geodetic_place(columns: dict[str, Any], names: str, units: Any = 1.0) -> Geodetic | None:
     """The latest place on the Earth that fields tell, if there is one."""
     if not {*names.split()} <= columns.keys():
         return None
-    place = _fields(columns, names) * units
+    place = _stack_columns(columns, names) * units
     known = place[np.isfinite(place).all(axis=1) & (place[:, :2] != 0.0).any(axis=1)]
     return (*known[-1].tolist(),) if len(known) else None
 
@@ -439,10 +439,10 @@ def channel_of_px4(topic: str, name: str, data: dict[str, Any], after: int = 0) 
     for field, ned in (("pose_frame", 1), ("local_frame", 0)):
         if field in data:
             data["is_ned"] = data[field] == ned
-    return Channel(topic, name, data, "", _place_of(data, "ref_lat ref_lon ref_alt"))
+    return Channel(topic, name, data, "", _geodetic_place(data, "ref_lat ref_lon ref_alt"))
 
 
-def _collect(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
+def _collect_columns(log: Any) -> dict[tuple[int, str, int], dict[str, Any]]:
     """Columns of the messages of a log that matter, by system, message and lane: a core, or a component of a system.
 
     ``time`` is that of the vehicle [ns], ``received`` when the message came to who wrote the log.
@@ -487,13 +487,13 @@ def _read_bin(path: Path) -> Log:
             self.init_arrays(progress_callback)
 
     with closing(Reader(str(path))) as log:
-        table = _collect(log)
+        table = _collect_columns(log)
         last = max(int(own[-1]) for own in log.offsets if len(own))
         notes = (DAMAGED,) if log.data_len - last > _PAGES else ()
     beside = {kind: columns for (_, kind, _), columns in table.items() if kind in _BESIDE}
     channels, dated, place = [], False, None
     if own := beside.get("ORGN"):  # type 0 is the origin of the filter
-        place = _place_of({k: x[own["Type"] == 0] for k, x in own.items()}, "Lat Lng Alt")
+        place = _geodetic_place({k: x[own["Type"] == 0] for k, x in own.items()}, "Lat Lng Alt")
     for (_, kind, lane), columns in table.items():
         if kind in _BESIDE:
             continue
@@ -513,12 +513,12 @@ def _read_tlog(path: Path) -> Log:
     from pymavlink.mavutil import mavlogfile
 
     with closing(mavlogfile(str(path))) as log:
-        table = _collect(log)
+        table = _collect_columns(log)
     vehicles: dict[int, list[Channel]] = defaultdict(list)
     for (who, kind, lane), columns in sorted(table.items(), key=lambda each: each[0][2]):
         if kind not in _BESIDE:
             own = table.get((who, "GPS_GLOBAL_ORIGIN", 0), {})
-            place, frame = _place_of(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
+            place, frame = _geodetic_place(own, _BESIDE["GPS_GLOBAL_ORIGIN"], _INTEGERS[:3]), ""
             if "frame_id" in columns:
                 frame = _FRAMES.get(int(columns["frame_id"][0]), "")
                 columns["is_ned"] = (columns["frame_id"] == columns["frame_id"][0]) & bool(frame)

@@ -28,7 +28,7 @@ import numpy as np
 
 from rigidfleet._common.tables import ContentError, fault
 from rigidfleet.foreign.columns import yaws_of
-from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4, choose
+from rigidfleet.foreign.logs import DAMAGED, FORMS, Channel, Log, channel_of_px4, choose_channels
 
 #: How recordings begin, and what Zstandard packed.
 MCAP, SQLITE, ZSTANDARD = b"\x89MCAP0\r\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
@@ -103,7 +103,7 @@ def read_recording(paths: Sequence[Path], topics: Sequence[str]) -> Log:
         topic, why = next(iter(unread.items()))
         raise fault(f"{topic}: {why}")
     channels = [_channel(topic, own) for topic, own in rows.items()]
-    chosen = choose(channels, topics)
+    chosen = choose_channels(channels, topics)
     undated = [c for c in chosen if not (rows[c.topic].layout or any(rows[c.topic].stamps))]
     if len(undated) < len(chosen):  # they have another clock, or nothing was sent yet
         unread |= {c.topic: "has no stamps, as others have" for c in undated}

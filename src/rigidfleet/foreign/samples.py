@@ -68,4 +68,4 @@ def curve_through_samples(
     lines = curve_through_states(time, position[None], turned)
     if kind == "linear" or len(time) < 3:
         return lines
-    return Piecewise.cubic_spline(time, position).beside(Piecewise(time, lines.pieces[:, 3:]))
+    return Piecewise.cubic_spline(time, position).stack(Piecewise(time, lines.pieces[:, 3:]))

@@ -150,8 +150,8 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     for place, point in zip(where, points, strict=True):
         if not isinstance(point, list) or len(point) < 2:
             raise fault(f"{place}: is not [time, [x, y, z], [control points]]")
-    time = _each_floats([p[0] for p in points], (), where)
-    ends = _each_floats([p[1] for p in points], (3,), where)
+    time = _float_rows([p[0] for p in points], (), where)
+    ends = _float_rows([p[1] for p in points], (3,), where)
     if len(points) == 1:
         points, time = [*points, [0, ends[0], []]], np.append(time, time + 1.0)
         ends, where = np.repeat(ends, 2, axis=0), where * 2
@@ -168,7 +168,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     for count in np.unique(counts):
         k = np.flatnonzero(counts == count)
         middle = [inner[i] or np.zeros((0, 3)) for i in k]
-        middle = _each_floats(middle, (count, 3), [where[i + 1] for i in k])
+        middle = _float_rows(middle, (count, 3), [where[i + 1] for i in k])
         control = np.concatenate([ends[k, None], middle, ends[k + 1, None]], axis=1)
         unit = Piecewise.of_bernstein(np.arange(len(k) + 1.0), control.swapaxes(1, 2))
         h = np.diff(time)[k, None, None]
@@ -185,7 +185,7 @@ def _curve(trajectory: dict[str, Any], yaw: dict[str, Any] | None, who: str) -> 
     return with_headings(curve, times, -np.radians(degrees))
 
 
-def _each_floats(values: list[Any], shape: tuple[int, ...], where: list[str]) -> Floats:
+def _float_rows(values: list[Any], shape: tuple[int, ...], where: list[str]) -> Floats:
     """Finite numbers (K, ...) of values of one shape, read at once; one by one where one of them is wrong."""
     if not any(isinstance(value, str | bool) for value in values):
         with suppress(ContentError):

@@ -27,7 +27,7 @@ def read_text(data: bytes, stem: str, interpolation: str, units: Units) -> Traje
         The table cannot be read, or a time does not increase.
     """
     table, notes = parse_table(data, units)
-    if table.place("duration", "x^0"):
+    if table.find("duration", "x^0"):
         for k, q in enumerate(table.kinds):
             labels = table.codes(k)[1] if q.kind in ("agent", "thing") else []
             if len(labels) > 1 and (
@@ -65,10 +65,10 @@ def _curve_of_coefficients(table: TextTable) -> Piecewise:
         A column is missing, or a duration is not positive.
     """
     due = ["duration", *(f"{axis}^{k}" for axis in NAMES for k in range(POWERS))]
-    if missing := [kind for kind in due if not table.place(kind)]:
+    if missing := [kind for kind in due if not table.find(kind)]:
         remedy = "A table of polynomials has the columns duration, x^0 to x^7, y^0, z^0 and yaw^0 to yaw^7"
         raise fault(f"has no column, or two, for {missing[0]}", remedy, table.line)
-    rows = table.numbers(table.place(*due))
+    rows = table.numbers(table.find(*due))
     bad = np.flatnonzero(~(rows[:, 0] > 0.0))
     if len(bad):
         why = f"the duration is {rows[bad[0], 0]:g} s"
@@ -85,7 +85,7 @@ def read_table(data: bytes) -> list[Piecewise]:
     """The curves in a table of `Result.to_csv`: polynomials of degree 7 (yaw: 3) that meet all that it says."""
     axes = [f"{kind}{axis}" for kind in ("", "v", "a", "j") for axis in "xyz"]
     table = TextTable(data, {})
-    every = table.numbers(table.place("time", *axes, "yaw", "yaw_rate"))
+    every = table.numbers(table.find("time", *axes, "yaw", "yaw_rate"))
     code, labels = table.codes(table.names.index("agent"))
     curves = []
     for agent in sorted(range(len(labels)), key=lambda k: int(labels[k])):

@@ -149,7 +149,7 @@ def assign_slots(
                 options.append(option)
                 left -= used
 
-    def worth(option: AssignedSlots) -> tuple[float, bool, float]:
+    def rank_of_option(option: AssignedSlots) -> tuple[float, bool, float]:
         to, swing = option.turn, 0.0
         if turn is not None:
             to, swing = fixed, float(np.linalg.norm(option.turn - fixed))
@@ -157,12 +157,12 @@ def assign_slots(
         return round(squares, 12), bool((option.order != own_order).any()), swing
 
     straight = [o for o in options if turn is None or o.turn is fixed]
-    shortest = min(straight, key=worth)
+    shortest = min(straight, key=rank_of_option)
     if radius is None:
         return shortest
     separation = {id(o): closest_approach(p, q[o.order] @ o.turn.T, radius)[0] for o in options}
     safe = [o for o in options if separation[id(o)] >= separation[id(shortest)]]
-    return min(safe, key=lambda o: (-round(separation[id(o)], 2), *worth(o)))
+    return min(safe, key=lambda o: (-round(separation[id(o)], 2), *rank_of_option(o)))
 
 
 def downwash_metric(up: ArrayLike, ratio: float) -> Floats:

@@ -28,7 +28,7 @@ def complete_graph(n: int) -> Ints:
     return np.ascontiguousarray(all_pairs(n).T)
 
 
-def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
+def neighbour_edges(points: ArrayLike, reach: float = REACH) -> Ints:
     """Edges (m, 2), i < j, between points (N, 3) no further apart than ``reach`` times their spacing.
 
     The spacing is the median distance to the nearest point. At a reach of 1.9, second neighbours are joined, too, which
@@ -36,17 +36,17 @@ def neighbours(points: ArrayLike, reach: float = REACH) -> Ints:
     """
     from scipy.spatial import KDTree
 
-    distance = _reach_of_neighbours(points, reach)
+    distance = _neighbour_distance(points, reach)
     pairs = KDTree(points).query_pairs(distance, output_type="ndarray")
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].astype(np.int64)
 
 
-def count_neighbours(points: ArrayLike, reach: float = REACH) -> int:
-    """Number of edges that `neighbours` would return, without building them."""
-    return count_within(points, _reach_of_neighbours(points, reach))
+def count_neighbour_edges(points: ArrayLike, reach: float = REACH) -> int:
+    """Number of edges that `neighbour_edges` would return, without building them."""
+    return count_pairs_within(points, _neighbour_distance(points, reach))
 
 
-def count_within(points: ArrayLike, distance: float) -> int:
+def count_pairs_within(points: ArrayLike, distance: float) -> int:
     """Number of pairs of points (N, 3) within a distance [m] of each other, without building them."""
     from scipy.spatial import KDTree
 
@@ -54,7 +54,7 @@ def count_within(points: ArrayLike, distance: float) -> int:
     return (int(tree.count_neighbors(tree, distance)) - tree.n) // 2
 
 
-def _reach_of_neighbours(points: ArrayLike, reach: float) -> float:
+def _neighbour_distance(points: ArrayLike, reach: float) -> float:
     """Greatest distance [m] between neighbours among points (N, 3); infinite for a single one."""
     p = np.asarray(points, dtype=np.float64)
     return reach * float(np.median(nearest(p))) * (1 + 1e-9)
@@ -233,7 +233,7 @@ def _put_spanning_points_first(p: Floats, order: Ints) -> Ints:
 #: Graphs with a name in missions, made from slots (N, 3) and, for neighbours, their reach in spacings.
 GRAPHS: dict[str, Callable[[Floats, float], Ints]] = {
     "complete": lambda p, _: complete_graph(len(p)),
-    "neighbours": neighbours,
+    "neighbours": neighbour_edges,
     "henneberg": lambda p, _: henneberg(p),
     "henneberg-multilevel": lambda p, _: henneberg_multilevel(p),
 }

@@ -169,13 +169,13 @@ def _read_table(data: bytes) -> tuple[Ints, Floats, tuple[str, ...] | None, tupl
         remedy = "if commas are decimal marks, separate numbers by semicolons"
         raise fault("has numbers such as 00", remedy)
     columns, axes = table.position()
-    if not (columns := columns or table.place("x", "y")):
-        raise table.missing("x", "y")
-    if (time := table.place("time")) and len(table.codes(time[0])[1]) > 1:
+    if not (columns := columns or table.find("x", "y")):
+        raise table.missing_error("x", "y")
+    if (time := table.find("time")) and len(table.codes(time[0])[1]) > 1:
         remedy = "keep the rows of one, or fly it as a trajectory"
         raise fault("has points of several times", remedy)
-    written, n = table.place("colour"), len(columns)
-    hues = table.place(*_HUES) if not written else []
+    written, n = table.find("colour"), len(columns)
+    hues = table.find(*_HUES) if not written else []
     values = table.numbers(columns + hues)
     if table.decimal == "," and not table.named:
         notes.append("commas are read as decimal marks")

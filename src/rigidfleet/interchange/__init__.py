@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.files import replacing_folder, write_file
+from rigidfleet._common.files import replace_folder_atomically, write_file
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign import texts
 from rigidfleet.interchange import crazyflie, gltf, mavlink, recordings, skybrush
@@ -200,7 +200,7 @@ def export(
     chosen = format_of(format)
     if format == "setpoints" and path.suffix != ".csv":
         chosen = chosen._replace(write=_write_tables, each=True)
-    setting = _setting(format, chosen, rate, tolerance)
+    setting = _rate_or_tolerance(format, chosen, rate, tolerance)
     if chosen.package and find_spec(chosen.package) is None:
         raise ResultError(
             f"{format}: needs the package {chosen.package!r}, which is not installed. Run: "
@@ -236,7 +236,7 @@ def format_of(name: str) -> Format:
     return FORMATS[name]
 
 
-def _setting(
+def _rate_or_tolerance(
     name: str, chosen: Format, rate: float | None, tolerance: float | None
 ) -> float | None:
     """The rate [Hz] or the tolerance [m] of an export, whichever its format has."""
@@ -281,7 +281,7 @@ def _write_and_measure(
             raise ResultError(f"{path}: each vehicle has a file of its own. Give a folder.")
         width = len(str(motion.n_agents))
         ours = re.compile(rf"agent-\d+\.{chosen.suffix}")
-        with replacing_folder(path, ours) as folder:
+        with replace_folder_atomically(path, ours) as folder:
             for number, data in enumerate(files(), 1):
                 name = f"agent-{number:0{width}}.{chosen.suffix}"
                 (folder / name).write_bytes(data)

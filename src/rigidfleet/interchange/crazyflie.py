@@ -40,7 +40,7 @@ _TRIED = tuple(1e-3 * np.array([2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100, 150, 20
 _Image = tuple[bytes, str, list[tuple[int, float]]]
 
 
-def _within_memory(
+def _refuse_beyond_memory(
     images: Callable[[ExportedMotion, float], Iterator[_Image]],
 ) -> Callable[[ExportedMotion, float], Iterator[bytes]]:
     """A writer of images, with an error about one that does not fit: which tolerance, and how many seconds do."""
@@ -65,12 +65,12 @@ def _within_memory(
 def write_polynomial(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     """A table for each vehicle: duration [s], and 8 coefficients of x, y, z [m] and yaw [rad] of each piece."""
     row = ",".join(["%.9g"] * (1 + len(NAMES) * POWERS))
-    for curve in fit_curves(motion.ways(), tolerance):
+    for curve in fit_curves(motion.chunks(), tolerance):
         lines = [row % tuple(numbers) for numbers in curve_to_rows(curve)]
         yield "\n".join([_HEADER, *lines, ""]).encode()
 
 
-@_within_memory
+@_refuse_beyond_memory
 def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     """A memory image for each vehicle: pieces of 32 coefficients and a duration, as 32-bit floats.
 
@@ -79,7 +79,7 @@ def write_poly4d(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     ResultError
         The flight needs more than `PIECES` pieces.
     """
-    for curve in fit_curves(motion.ways(), tolerance):
+    for curve in fit_curves(motion.chunks(), tolerance):
         rows, after = np.roll(curve_to_rows(curve), -1, axis=1), curve.time - curve.time[0]
         needed = f"{len(rows)} pieces of {_POLY4D} bytes, and the memory has room for {PIECES}"
         ends = [(_POLY4D * k, t) for k, t in enumerate(after.tolist()) if k]
@@ -92,7 +92,7 @@ def read_poly4d(data: bytes) -> list[Piecewise]:
     return [rows_to_curve(np.roll(rows, 1, axis=1))]
 
 
-@_within_memory
+@_refuse_beyond_memory
 def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Image]:
     """A compressed image for each vehicle: Bernstein coefficients in millimetres and tenths of a degree.
 
@@ -109,7 +109,7 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Imag
         )
     # Times are whole milliseconds.
     near, turned = tolerance - COMPRESSED_ROUNDING, YAW_TOLERANCE - _TENTH
-    ways = (way.on(np.round(way.time / _MS) * _MS) for way in motion.ways())
+    ways = (way.refine(np.round(way.time / _MS) * _MS) for way in motion.chunks())
     curves = fit_curves(ways, near, yaw_tolerance=turned, longest=_LONGEST * _MS)
     for number, curve in enumerate(curves, 1):
         yield _compressed_image(curve, number)
@@ -118,9 +118,9 @@ def write_compressed(motion: ExportedMotion, tolerance: float) -> Iterator[_Imag
 def _compressed_image(curve: Piecewise, number: int) -> _Image:
     """The image of the curve of a vehicle."""
     duration = np.diff(curve.time)
-    position = Piecewise(curve.time, curve.pieces[:, :3]).bernstein() / _MM
+    position = Piecewise(curve.time, curve.pieces[:, :3]).control_points() / _MM
     # Yaw is of degree 3, like the reference between samples.
-    yaw = Piecewise(curve.time, curve.pieces[:, 3:, :4]).bernstein() / _TENTH
+    yaw = Piecewise(curve.time, curve.pieces[:, 3:, :4]).control_points() / _TENTH
     if abs(position).max() > _MOST:
         k = int(np.argmax(abs(position).max(axis=(1, 2))))
         far = float(abs(position).max()) * _MM

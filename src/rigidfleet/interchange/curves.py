@@ -62,7 +62,7 @@ class ExportedMotion:
         """Setpoints at a rate [Hz]; without one, the samples."""
         return at_rate(self.samples, rate)
 
-    def ways(self) -> Iterator[Piecewise]:
+    def chunks(self) -> Iterator[Piecewise]:
         """The ways (K, n, 4, 8) of all vehicles in order, some at a time: degree 7 (yaw: 3) between samples."""
         n = 1 + _TOGETHER // (32 * len(self.samples.time))
         for first in range(0, self.n_agents, n):
@@ -70,7 +70,7 @@ class ExportedMotion:
 
     def curves(self) -> Iterator[Piecewise]:
         """The way (K, 4, 8) of each vehicle."""
-        for some in self.ways():
+        for some in self.chunks():
             for i in range(some.pieces.shape[1]):
                 yield Piecewise(some.time, some.pieces[:, i])
 
@@ -82,7 +82,7 @@ def fit_curves(
     """For each vehicle the fewest pieces that go from knot to knot within a tolerance [m], and one of yaw [rad].
 
     Pieces meet 4 (degree 7) or 2 ``orders`` of derivatives (degree 3; yaw: always) at the knots they join. Each is as
-    long as the tolerance allows, and not longer than ``longest`` [s]. ``ways`` are those of `ExportedMotion.ways`.
+    long as the tolerance allows, and not longer than ``longest`` [s]. ``ways`` are those of `ExportedMotion.chunks`.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def _fit_together(
     begin, end = source.ends(orders)
     t = time[:-1] + np.diff(time) * _CHECKED[:, None]
     # Points are the last axis: arithmetic on long rows is fast.
-    wanted = source.within(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
+    wanted = source.at_shares(_CHECKED).transpose(3, 1, 2, 0).reshape(4, len(_CHECKED), -1)
 
     def pieces_over(who: Ints, i: Ints, j: Ints) -> tuple[Floats, Floats]:
         """Pieces (M, 4, P) of vehicles (M,) over intervals i to j - 1, and errors as shares of what is allowed."""
@@ -154,12 +154,12 @@ def _fit_together(
 
 
 def cubic_curves(motion: ExportedMotion, tolerance: float) -> Iterator[Piecewise]:
-    """For each vehicle its way in cubic pieces, from time zero on; see `heading_lines`."""
-    for curve in fit_curves(motion.ways(), tolerance, 2, YAW_TOLERANCE / 2):
+    """For each vehicle its way in cubic pieces, from time zero on; see `heading_knots`."""
+    for curve in fit_curves(motion.chunks(), tolerance, 2, YAW_TOLERANCE / 2):
         yield curve.later(-motion.start)
 
 
-def heading_lines(curve: Piecewise) -> tuple[Floats, Floats]:
+def heading_knots(curve: Piecewise) -> tuple[Floats, Floats]:
     """Times (K,) [s] and yaws (K,) [rad] with lines between them, within half of `YAW_TOLERANCE` of a way.
 
     Times increase: where yaw jumps, it turns within a millisecond. A line turns by 90 deg at most: from half a turn on,
@@ -203,7 +203,7 @@ def deviation(source: Piecewise, written: Piecewise, until: float = np.inf) -> D
     """
     h = np.diff(source.time)[:, None]
     t = (source.time[:-1, None] + h * _COMPARED).ravel()
-    wanted = source.within(_COMPARED).reshape(len(t), -1)
+    wanted = source.at_shares(_COMPARED).reshape(len(t), -1)
     there = t <= written.time[-1]
     off = written.at(t[there]) - wanted[there]
     turned = (off[:, 3] + np.pi) % (2.0 * np.pi) - np.pi

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from rigidfleet.foreign.curves import with_headings
-from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_lines
+from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_knots
 from rigidfleet.math.piecewise import Piecewise
-from rigidfleet.result.lights import fades, has_lights, lights, view
+from rigidfleet.result.lights import fades, has_lights, lights, view_angles
 from rigidfleet.typing import Floats, Ints
 
 _FLOAT, _UNSIGNED = 5126, 5125
@@ -71,7 +71,7 @@ def write_gltf(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
     nodes, samplers, channels = [], [], []
     radii = motion.result.mission.fleet.radius.tolist()
     for agent, curve in enumerate(cubic_curves(motion, tolerance)):
-        times, yaws = heading_lines(curve)
+        times, yaws = heading_knots(curve)
         turned = np.stack([0 * yaws, np.sin(yaws / 2), 0 * yaws, np.cos(yaws / 2)], axis=1)
         for path, time, values, way in (
             ("translation", curve.time, _spline_rows(curve), "CUBICSPLINE"),
@@ -129,7 +129,7 @@ def _add_lights(scene: dict[str, Any], file: _File, motion: ExportedMotion) -> N
         pointer = {_POINTER: {"pointer": f"/materials/{i}/emissiveFactor"}}
         target = {"path": "pointer", "extensions": pointer}
         animation["channels"].append({"sampler": len(animation["samplers"]) - 1, "target": target})
-    azimuth, elevation = view(result)
+    azimuth, elevation = view_angles(result)
     low, high = result.position.min(axis=(0, 1)), result.position.max(axis=(0, 1))
     far = float(np.linalg.norm(high - low)) / 2 / np.sin(_FOV / 2)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])

@@ -19,7 +19,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError
 from rigidfleet.foreign.shows import read_show
-from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_lines
+from rigidfleet.interchange.curves import ExportedMotion, cubic_curves, heading_knots
 from rigidfleet.interchange.lights import light_program
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.result.lights import fades
@@ -52,7 +52,7 @@ def write_skyc(motion: ExportedMotion, tolerance: float) -> Iterator[bytes]:
         off = round(float(motion.result.motors_off[agent]) - motion.start, 6)
         span = {"takeoffTime": 0, "landingTime": min(off, points[-1][0])}
         files[f"{folder}/trajectory.json"] = {"version": 1, "points": points, **span}
-        times, yaws = heading_lines(curve)
+        times, yaws = heading_knots(curve)
         clockwise = -np.degrees(yaws)
         clockwise -= 360.0 * np.floor(clockwise[0] / 360.0)
         setpoints = np.column_stack([times.round(6), clockwise.round(4)]).tolist()
@@ -101,7 +101,7 @@ def read_skyc(data: bytes) -> list[Piecewise]:
 
 def _bezier_segments(curve: Piecewise) -> list[list[Any]]:
     """Time, end point and inner control points of each cubic piece, and of the start; numbers to a micrometre."""
-    points = np.round(Piecewise(curve.time, curve.pieces[:, :3]).bernstein(), 6)
+    points = np.round(Piecewise(curve.time, curve.pieces[:, :3]).control_points(), 6)
     times = np.round(curve.time, 6)
     segments: list[list[Any]] = [[times[0], points[0, :, 0].tolist(), []]]
     for t, piece in zip(times[1:].tolist(), points, strict=True):

@@ -172,7 +172,7 @@ def desired_attitude(k, i, flight, state, F):
 
 
 @jit
-def steer(k, i, flight, state):
+def command_rotors(k, i, flight, state):
     """Rotor speeds commanded to vehicle i at tick k, into ``state.command``; returns whether it saturates.
 
     A point's force is limited, and a lost vehicle gets none.

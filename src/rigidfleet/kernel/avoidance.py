@@ -52,7 +52,7 @@ class Sight(NamedTuple):
     bound: Floats  # (B, 2) three standard deviations of place [m] and velocity [m/s]
 
 
-def sight(
+def initial_sight(
     solids: Solids,
     reach: float = math.inf,
     noise: float = 0.0,
@@ -165,7 +165,7 @@ class AvoidanceArrays(NamedTuple):
     loser: Ints  # (2, 2) vehicle, and the other or the obstacle
 
 
-def avoidance(
+def avoidance_arrays(
     *,
     period: float,
     b: Floats,
@@ -201,14 +201,14 @@ def avoidance(
     lags: Floats = np.ascontiguousarray(np.broadcast_to(np.asarray(ahead, dtype=float), (n, 3, 3)))
     return AvoidanceArrays(
         law=np.zeros(2, dtype=np.int64), guarded=guarded, filtered=filtered, period=float(period), rate=float(rate),
-        share=float(share), release=float(release), b=_each(b, n), lift=_each(lift, n), weight=_each(mass, n),
-        inverse=1.0 / _each(mass, n),
-        g=float(g), coast=_coast(_each(drag, n), period), lag=_each(lag, n), spare=_each(spare, n),
+        share=float(share), release=float(release), b=_full(b, n), lift=_full(lift, n), weight=_full(mass, n),
+        inverse=1.0 / _full(mass, n),
+        g=float(g), coast=_coast(_full(drag, n), period), lag=_full(lag, n), spare=_full(spare, n),
         ahead=lags, lead=lags[:, :, 0] + lags[:, :, 2], soft=np.where(lags[:, 0, 0] > 0.0, b * np.asarray(lag), 0.0),
-        tilt=_each(tilt, n), requested=np.zeros((n, 3)), commanded=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
+        tilt=_full(tilt, n), requested=np.zeros((n, 3)), commanded=np.where(lags[:, :, 0] > 0.0, np.inf, 0.0),
         overruled=np.zeros(n, dtype=np.int64),
         room=radius + 0.5 * separation, reach=radius + clearance,
-        solids=solids, sight=sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
+        solids=solids, sight=initial_sight(solids) if seen is None else seen, flow=flow, candidates=candidates(),
         start=np.zeros(n + 1, dtype=np.int64), near=np.zeros(capacity, dtype=np.int64), floor=np.zeros(capacity),
         order=np.arange(n), listed=np.full((n, 3), np.inf), span=np.zeros(3),
         known=np.zeros((3, n, 3)), wanted=np.zeros((n, 3)), shift=np.zeros((n, 3)),
@@ -217,31 +217,31 @@ def avoidance(
         late=np.zeros(n), shifted=np.zeros((4, 3)), trial=np.zeros((5, 3)), normal=np.zeros(3),
         hold=np.ones(n), pull=np.zeros(edges),
         system=np.zeros((EXACT, EXACT)), right=np.zeros(EXACT), active=np.zeros(EXACT, dtype=np.int64),
-        count=np.zeros(3, dtype=np.int64), **_by_obstacle(n, count), **_record(n),
+        count=np.zeros(3, dtype=np.int64), **_arrays_by_obstacle(n, count), **_empty_record(n),
     )  # fmt: skip
 
 
-def of_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
+def for_next_phase(avoidance: AvoidanceArrays) -> AvoidanceArrays:
     """The same avoidance in the next phase, which has a record of its own."""
     avoidance.count[TICKS] = 0
-    return avoidance._replace(**_record(len(avoidance.b)))
+    return avoidance._replace(**_empty_record(len(avoidance.b)))
 
 
-def among(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArrays:
+def with_obstacles(avoidance: AvoidanceArrays, solids: Solids) -> AvoidanceArrays:
     """The same avoidance among other obstacles; the first of them are those before, and what is known of them stays."""
     before, seen = (
         avoidance.sight,
-        sight(solids, avoidance.sight.reach, 0.0, avoidance.sight.swerve),
+        initial_sight(solids, avoidance.sight.reach, 0.0, avoidance.sight.swerve),
     )
     seen = seen._replace(noise=before.noise, normals=before.normals)
     for mine, old in zip(seen[-4:], before[-4:], strict=True):  # what is known
         mine[: len(old)] = old
     return avoidance._replace(
-        solids=solids, sight=seen, **_by_obstacle(len(avoidance.b), len(solids.kind))
+        solids=solids, sight=seen, **_arrays_by_obstacle(len(avoidance.b), len(solids.kind))
     )
 
 
-def _by_obstacle(n: int, count: int) -> dict[str, Any]:
+def _arrays_by_obstacle(n: int, count: int) -> dict[str, Any]:
     """Arrays whose size depends on the number of obstacles."""
     capacity = n * (n - 1) if n <= _FEW else _NEIGHBOURS * n
     rows = min(capacity // 2, _BARRIERS * n) + 2 * n * count
@@ -252,13 +252,13 @@ def _by_obstacle(n: int, count: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def holding(avoidance: AvoidanceArrays, edges: int) -> AvoidanceArrays:
+def with_edges(avoidance: AvoidanceArrays, edges: int) -> AvoidanceArrays:
     """The same avoidance for so many other edges; neighbours are listed again."""
     avoidance.count[LISTED] = 0
     return avoidance._replace(pull=np.zeros(edges))
 
 
-def _record(n: int) -> dict[str, Any]:
+def _empty_record(n: int) -> dict[str, Any]:
     none = np.full((2, 2), -1)
     endless = np.array([[math.inf, 0.0]] * 2)
     return {
@@ -278,7 +278,7 @@ def needed_rate(gap, s, across, B, rate, soft=0.0):
     return -rate * (root - soft + s) - B * s / root - across
 
 
-def _each(x: ArrayLike, n: int) -> Floats:
+def _full(x: ArrayLike, n: int) -> Floats:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(x, dtype=float), (n,)))
 
 

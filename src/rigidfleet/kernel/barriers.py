@@ -30,8 +30,8 @@ from rigidfleet.kernel.avoidance import needed_rate as _needed_rate
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.constraint import find_multipliers
 from rigidfleet.kernel.linalg import cholesky, cholesky_solve
-from rigidfleet.kernel.moving import braking_beside
-from rigidfleet.kernel.segments import from_obstacle, from_solid
+from rigidfleet.kernel.moving import braking_limit_beside
+from rigidfleet.kernel.segments import point_to_obstacle, segment_to_obstacle
 
 #: Greatest number of sweeps, change of an acceleration that ends them [m/s^2].
 _SWEEPS, _CLOSE = 10, 5e-5
@@ -50,7 +50,7 @@ needed_rate = jit_inline(_needed_rate)
 
 
 @jit
-def loosen(p, w, state, a):
+def subtract_released_forces(p, w, state, a):
     """Take from the forces of edges what they let go, and from their integrals what the tick has added to it.
 
     All edges let go by one share, that of the vehicle that is pushed most: where edges are redundant, forces of single
@@ -72,10 +72,10 @@ def loosen(p, w, state, a):
 
 
 @jit
-def add_row(count, i, j, entry, n, missing, limit, a):
+def add_barrier(count, i, j, entry, n, missing, limit, a):
     """Add a barrier along n (3,), with its entry of ``last``; returns the number of them.
 
-    It changes the acceleration along n by twice ``limit`` at most.
+    It changes the acceleration along n by twice ``limit_thrust`` at most.
     """
     if count < a.rows.shape[0]:
         a.rows[count, 0], a.rows[count, 1], a.rows[count, 2] = i, j, entry
@@ -89,17 +89,17 @@ def add_row(count, i, j, entry, n, missing, limit, a):
 
 
 @jit
-def add_obstacle(count, i, entry, needed, a):
+def add_obstacle_barrier(count, i, entry, needed, a):
     """Add a barrier of vehicle i along ``normal``, if it may act; the number of them, and whether this is violated."""
     n, c = a.normal, a.wanted[i]
     missing = needed - (n[0] * c[0] + n[1] * c[1] + n[2] * c[2])
     if missing > -a.b[i]:
-        count = add_row(count, i, -1, entry, n, missing, a.b[i], a)
+        count = add_barrier(count, i, -1, entry, n, missing, a.b[i], a)
     return count, missing > 0.0
 
 
 @jit
-def needed_beside(i, o, r, v, a):
+def needed_acceleration_beside(i, o, r, v, a):
     """Least acceleration of vehicle i with which obstacle o, which moves, passes it; ``normal`` is its direction.
 
     Both go on straight to where they are nearest, in the time t, with a part of the distance to keep missing. An
@@ -113,9 +113,9 @@ def needed_beside(i, o, r, v, a):
         q[k] = p[k] + _AHEAD * (v[k] - x[3 + k])
     keep = a.reach[i] + a.spare[i] + bound[0]
     most = keep + _AHEAD * bound[1]
-    if from_obstacle(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
+    if segment_to_obstacle(p, q, o, a.solids, most, a.normal)[1] >= most:  # quick
         return -math.inf
-    _, away, share = from_obstacle(p, q, o, a.solids, math.nan, a.normal)
+    _, away, share = segment_to_obstacle(p, q, o, a.solids, math.nan, a.normal)
     t = _AHEAD * share
     missing = keep + t * bound[1] - away
     along = fast = 0.0
@@ -158,18 +158,18 @@ def list_barriers(r, v, lost, a):
             have = n[0] * (c[0] - d[0]) + n[1] * (c[1] - d[1]) + n[2] * (c[2] - d[2])
             if needed > have - both:  # one that others may yet push into it is listed, too
                 violated = violated or needed > have
-                count = add_row(count, i, j, e, n, needed - have, both, a)
+                count = add_barrier(count, i, j, e, n, needed - have, both, a)
         for o in range(a.solids.kind.shape[0]):
             B = a.b[i]
             if a.sight.moves[o] == 0:
-                away = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, n)
+                away = point_to_obstacle(r[i, 0], r[i, 1], r[i, 2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i]
                 s = n[0] * v[i, 0] + n[1] * v[i, 1] + n[2] * v[i, 2]
             elif a.sight.known[o] == KNOWN:
-                x, bound, B = a.sight.track[o], a.sight.bound[o], braking_beside(i, o, a)
+                x, bound, B = a.sight.track[o], a.sight.bound[o], braking_limit_beside(i, o, a)
                 for q in range(3):
                     n[q] = r[i, q] - x[q] - a.lead[i, q] * x[3 + q]
-                away = from_solid(n[0], n[1], n[2], o, a.solids, n)
+                away = point_to_obstacle(n[0], n[1], n[2], o, a.solids, n)
                 gap = away - a.reach[i] - a.spare[i] - bound[0]
                 s = n[0] * (v[i, 0] - x[3]) + n[1] * (v[i, 1] - x[4]) + n[2] * (v[i, 2] - x[5])
                 s -= bound[1]
@@ -182,17 +182,17 @@ def list_barriers(r, v, lost, a):
                 soft = a.share * B * a.soft[i] / a.b[i]
                 needed = needed_rate(gap, s, 0.0, a.share * B, a.rate, soft)
             entry = walls + 2 * (i * a.solids.kind.shape[0] + o)
-            count, worse = add_obstacle(count, i, entry, needed, a)
+            count, worse = add_obstacle_barrier(count, i, entry, needed, a)
             violated = violated or worse
             if a.sight.moves[o] != 0:
-                needed = needed_beside(i, o, r[i], v[i], a)
-                count, worse = add_obstacle(count, i, entry + 1, needed, a)
+                needed = needed_acceleration_beside(i, o, r[i], v[i], a)
+                count, worse = add_obstacle_barrier(count, i, entry + 1, needed, a)
                 violated = violated or worse
     return count, violated
 
 
 @jit
-def relative(i, j, n, x):
+def difference_along(i, j, n, x):
     """The part along a unit vector n (3,) of the difference of rows i and j of x (N, 3); of row i if j is -1."""
     along = n[0] * x[i, 0] + n[1] * x[i, 1] + n[2] * x[i, 2]
     if j >= 0:
@@ -201,7 +201,7 @@ def relative(i, j, n, x):
 
 
 @jit
-def shove(i, j, n, force, a):
+def push_apart(i, j, n, force, a):
     """Add the accelerations of a force [N] along a unit vector n (3,) on i, and against it on j if j is not -1."""
     for q in range(3):
         a.shift[i, q] += force * a.inverse[i] * n[q]
@@ -218,16 +218,16 @@ def edge_softness(e, p, a):
 
 
 @jit
-def relax(k, a):
+def relax_barrier(k, a):
     """Let barrier k push as it must with the present accelerations; returns the change that it makes [m/s^2]."""
     i, j, n = a.rows[k, 0], a.rows[k, 1], a.normals[k]
-    rest = a.missing[k] - relative(i, j, n, a.shift)
+    rest = a.missing[k] - difference_along(i, j, n, a.shift)
     # Over-relaxed, then back between its bounds: projected Gauss-Seidel converges for any factor below 2.
     push = min(max(a.push[k] + _BEYOND * rest * a.reduced[k], 0.0), a.most[k])
     more = push - a.push[k]
     if more == 0.0:
         return 0.0
-    shove(i, j, n, more, a)
+    push_apart(i, j, n, more, a)
     a.push[k] = push
     return abs(more) * (a.inverse[i] + (a.inverse[j] if j >= 0 else 0.0))
 
@@ -238,26 +238,26 @@ def relax_edges(p, w, a):
     change = 0.0
     for e in range(p.graph.edges.shape[0]):
         i, j, n = p.graph.edges[e, 0], p.graph.edges[e, 1], w.u[e]
-        along = relative(i, j, n, a.shift)
+        along = difference_along(i, j, n, a.shift)
         if along == 0.0 and a.pull[e] == 0.0:
             continue
         soft, diagonal = edge_softness(e, p, a), p.graph.diagonal[e]
         pull = -_BEYOND * (along + soft * a.pull[e]) / (diagonal + soft)
         change = max(change, abs(pull) * diagonal)
-        shove(i, j, n, pull, a)
+        push_apart(i, j, n, pull, a)
         a.pull[e] += pull
     return change
 
 
 @jit
-def sweep(count, p, w, a):
+def sweep_gauss_seidel(count, p, w, a):
     """Projected Gauss-Seidel: a sweep over all barriers and edges, then some over those that push alone.
 
     Returns the greatest change of the first one [m/s^2].
     """
     first, pushing = 0.0, 0
     for k in range(count):
-        first = max(first, relax(k, a))
+        first = max(first, relax_barrier(k, a))
         if a.push[k] > 0.0:
             a.pushing[pushing] = k
             pushing += 1
@@ -265,14 +265,14 @@ def sweep(count, p, w, a):
     for _ in range(_INNER if first >= _CLOSE else 0):
         change = 0.0
         for k in range(pushing):
-            change = max(change, relax(a.pushing[k], a))
+            change = max(change, relax_barrier(a.pushing[k], a))
         if max(change, relax_edges(p, w, a)) < _CLOSE:
             break
     return first
 
 
 @jit
-def entry(i, j, n, k, l, m, a):
+def matrix_entry(i, j, n, k, l, m, a):
     """Entry of A for two rows: unit vectors n and m (3,), vehicles i and j, k and l (-1: none)."""
     value = 0.0
     dot = n[0] * m[0] + n[1] * m[1] + n[2] * m[2]
@@ -289,7 +289,7 @@ def entry(i, j, n, k, l, m, a):
 
 
 @jit
-def finish(count, p, w, a):
+def solve_active_set(count, p, w, a):
     """Solve exactly for the barriers that push less than they may, and the edges, if the sweeps have found which.
 
     Returns whether the solution is one: no push is negative, and no other barrier violated.
@@ -306,12 +306,12 @@ def finish(count, p, w, a):
         return False
     # The unknowns are corrections of pushes, then of pulls. A push at a bound stays: the sweeps have chosen it.
     for row in range(whole):
-        i, j, n = line(row, size, p, w, a)
+        i, j, n = row_of_system(row, size, p, w, a)
         for column in range(row + 1):
-            k, l, other = line(column, size, p, w, a)
-            a.system[row, column] = entry(i, j, n, k, l, other, a)
+            k, l, other = row_of_system(column, size, p, w, a)
+            a.system[row, column] = matrix_entry(i, j, n, k, l, other, a)
         # What is left by the pushes so far and by those at their bounds
-        a.right[row] = -relative(i, j, n, a.shift)
+        a.right[row] = -difference_along(i, j, n, a.shift)
         if row < size:
             a.right[row] += a.missing[a.active[row]]
         else:
@@ -326,8 +326,8 @@ def finish(count, p, w, a):
         if not 0.0 <= push <= a.most[a.active[row]]:
             return False
     for row in range(whole):
-        i, j, n = line(row, size, p, w, a)
-        shove(i, j, n, a.right[row], a)
+        i, j, n = row_of_system(row, size, p, w, a)
+        push_apart(i, j, n, a.right[row], a)
         if row < size:
             a.push[a.active[row]] += a.right[row]
         else:
@@ -336,7 +336,7 @@ def finish(count, p, w, a):
 
 
 @jit
-def line(row, size, p, w, a):
+def row_of_system(row, size, p, w, a):
     """Vehicles and unit vector of a row of the system: of one of ``size`` barriers, or after these of an edge."""
     if row < size:
         k = a.active[row]
@@ -357,16 +357,16 @@ def solve_barriers(count, p, w, a):
         a.pull[e] = 0.0
     for k in range(count):
         if a.push[k] > 0.0:
-            shove(a.rows[k, 0], a.rows[k, 1], a.normals[k], a.push[k], a)
+            push_apart(a.rows[k, 0], a.rows[k, 1], a.normals[k], a.push[k], a)
     for _ in range(3):
         for _ in range(_SWEEPS):
-            if sweep(count, p, w, a) < _CLOSE:
+            if sweep_gauss_seidel(count, p, w, a) < _CLOSE:
                 return
-        finish(count, p, w, a)  # a sweep after it tells whether that was all
+        solve_active_set(count, p, w, a)  # a sweep after it tells whether that was all
 
 
 @jit
-def limit(i, a):
+def limit_thrust(i, a):
     """Limit the thrust of an acceleration asked for."""
     c = a.wanted[i]
     size = math.sqrt(c[0] * c[0] + c[1] * c[1] + (c[2] + a.g) ** 2)
@@ -412,5 +412,5 @@ def filter_accelerations(t, r, v, lost, p, w, a):
         if violated:
             for q in range(3):
                 a.wanted[i, q] += a.shift[i, q]
-            limit(i, a)
+            limit_thrust(i, a)
     return violated

@@ -13,7 +13,7 @@ import numpy as np
 
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.solids.distance import box_normal, from_box
+from rigidfleet.solids.distance import box_distance, box_normal
 
 #: Accuracy of a least value [m, m/s].
 CLOSE = 1e-9
@@ -31,7 +31,7 @@ _SQUARE = np.array(
 
 
 @jit
-def lowest(work, degree, floor):
+def lowest_value(work, degree, floor):
     """Least value of a polynomial over [0, 1] and its place, if below ``floor``; otherwise ``floor`` and -1.
 
     ``work[0]`` holds the Bernstein coefficients. The value is exact to `CLOSE` and rounding; for squares, of eighth
@@ -80,7 +80,7 @@ def lowest(work, degree, floor):
 
 
 @jit
-def halve(piece, left):
+def halve_curve(piece, left):
     """Halve a curve (15 control points, start and width): write its first half into ``left``, keep the second."""
     half = 0.5 * piece[16]
     left[15], left[16] = piece[15], half
@@ -97,7 +97,7 @@ def halve(piece, left):
 
 
 @jit
-def square(points, sign, out):
+def squared_length(points, sign, out):
     """Bernstein coefficients (9,) of sign |r|^2 of a curve with control points (15,)."""
     for k in range(9):
         out[k] = 0.0
@@ -122,7 +122,7 @@ def length_at(points, x):
 
 
 @jit
-def span_of(curve):
+def ball_radius(curve):
     """Radius [m] of the ball about the middle one of control points (5, 3) that holds all."""
     far = 0.0
     for k in range(5):
@@ -150,7 +150,7 @@ def point_at(curve, x):
 
 
 @jit
-def shortest(curve, floor, work, pieces):
+def shortest_length(curve, floor, work, pieces):
     """Least |r| of a curve with control points (5, 3) and its place, if below ``floor``; otherwise ``floor`` and -1.
 
     Rounding of a squared length of some metres hides lengths of a millimetre. Therefore both halves of a long piece
@@ -179,8 +179,8 @@ def shortest(curve, floor, work, pieces):
         start = length_at(piece, 0.0)
         if start < best:
             best, at = start, piece[15]
-        square(piece, 1.0, work[0])
-        _, place = lowest(work, 8, best * best)
+        squared_length(piece, 1.0, work[0])
+        _, place = lowest_value(work, 8, best * best)
         if place >= 0.0:
             length = length_at(piece, place)
             if length < best:
@@ -190,7 +190,7 @@ def shortest(curve, floor, work, pieces):
         if count > _MOST and not known and along < best * math.sqrt(middle):
             best, at = along / math.sqrt(middle), piece[15]
         elif not known and piece[16] > _SHORTEST:
-            halve(piece, pieces[top + 2])
+            halve_curve(piece, pieces[top + 2])
             top += 2
     return best, at
 
@@ -215,11 +215,11 @@ def distance_beyond_plane(piece, distance, x, y, z):
 def tangent_of_box(x, y, z, b, _, boxes):
     """Signed distance of a point from box b, negative inside, and the normal of its tangent plane."""
     nx, ny, nz = box_normal(x, y, z, boxes[b])
-    return from_box(x, y, z, boxes[b]), nx, ny, nz
+    return box_distance(x, y, z, boxes[b]), nx, ny, nz
 
 
 @jit
-def refine(bound, best, at, close, count, top, pieces):
+def refine_top_piece(bound, best, at, close, count, top, pieces):
     """Halve the piece on top of the stack if its lower bound may be below the best value, else drop it.
 
     After `_MOST` pieces, the bound itself is taken. Returns the best value, its place, and the new top.
@@ -229,13 +229,13 @@ def refine(bound, best, at, close, count, top, pieces):
         if count > _MOST:
             return bound, piece[15], top - 1
         if piece[16] > _SHORTEST:
-            halve(piece, pieces[top + 1])
+            halve_curve(piece, pieces[top + 1])
             return best, at, top + 1
     return best, at, top - 1
 
 
 @jit
-def put_whole(curve, pieces):
+def stack_curve(curve, pieces):
     """Put a curve with control points (5, 3) on an empty stack; returns the accuracy that its rounding allows [m]."""
     close = CLOSE
     for k in range(5):
@@ -247,12 +247,12 @@ def put_whole(curve, pieces):
 
 
 @jit
-def nearest_box(curve, b, part, floor, pieces, boxes):
+def distance_to_box(curve, b, part, floor, pieces, boxes):
     """Least distance of a curve with control points (5, 3) from box b, if below ``floor``, and its place; else -1.
 
     `obstacles` makes of this source the same for any solid, or a ``part`` of one, by another `tangent_of_box`.
     """
-    best, at, top, count, close = floor, -1.0, 0, 0, put_whole(curve, pieces)
+    best, at, top, count, close = floor, -1.0, 0, 0, stack_curve(curve, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         distance, x, y, z = tangent_of_box(piece[6], piece[7], piece[8], b, part, boxes)
@@ -264,14 +264,14 @@ def nearest_box(curve, b, part, floor, pieces, boxes):
                 )
                 if distance < best:
                     best, at = distance, piece[15] + (piece[16] if k == 12 else 0.0)
-        best, at, top = refine(bound, best, at, close, count, top, pieces)
+        best, at, top = refine_top_piece(bound, best, at, close, count, top, pieces)
     return best, at
 
 
 @jit
-def lowest_overlap(points, reach, floor, pieces):
+def least_height_within(points, reach, floor, pieces):
     """Least |z| of a curve with control points (5, 3) while within ``reach`` of the z axis, and its place."""
-    best, at, top, count, close = floor, -1.0, 0, 0, put_whole(points, pieces)
+    best, at, top, count, close = floor, -1.0, 0, 0, stack_curve(points, pieces)
     while top >= 0:
         piece, count = pieces[top], count + 1
         for k in (0, 4):
@@ -291,7 +291,7 @@ def lowest_overlap(points, reach, floor, pieces):
             best, at = bound, piece[15]
             top -= 1
         else:
-            halve(piece, pieces[top + 1])
+            halve_curve(piece, pieces[top + 1])
             top += 1
     return best, at
 
@@ -299,7 +299,7 @@ def lowest_overlap(points, reach, floor, pieces):
 @jit
 def shortest_above(curve, own, other, altitude, floor, pieces):
     """Least |r| of a curve with control points (5, 3) while one of two others is at z >= ``altitude``; its place."""
-    best, at, top, count, close, rate = floor, -1.0, 0, 0, put_whole(curve, pieces), 0.0
+    best, at, top, count, close, rate = floor, -1.0, 0, 0, stack_curve(curve, pieces), 0.0
     for k in range(1, 5):
         rate = max(rate, abs(own[k, 2] - own[k - 1, 2]), abs(other[k, 2] - other[k - 1, 2]))
     while top >= 0:
@@ -319,11 +319,11 @@ def shortest_above(curve, own, other, altitude, floor, pieces):
         bound = max(along / middle, 0.0) if middle > 0.0 else 0.0
         if high + 2.0 * rate * piece[16] < altitude:
             bound = math.inf
-        best, at, top = refine(bound, best, at, close, count, top, pieces)
+        best, at, top = refine_top_piece(bound, best, at, close, count, top, pieces)
     return best, at
 
 
 @jit
-def weights(x, out):
+def write_basis(x, out):
     """Write the Bernstein polynomials (5,) of fourth degree at x."""
     out[0], out[1], out[2], out[3], out[4] = basis_at(x)

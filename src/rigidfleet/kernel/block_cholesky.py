@@ -202,7 +202,7 @@ def apply_Jt(u, edges, b, scale, out):
 
 
 @jit_inline
-def multiply(u, edges, m, mbar, mu, a, out):
+def multiply_by_K(u, edges, m, mbar, mu, a, out):
     """out = K a for (N, 3) arrays."""
     for i in range(m.shape[0]):
         s = mu * m[i]
@@ -225,7 +225,7 @@ def inner(a, b):
 
 
 @jit
-def project(u, edges, m, mbar, mu, g, past, G, x):
+def project_on_solutions(u, edges, m, mbar, mu, g, past, G, x):
     """x (N, 3) = the combination of past solutions (P, N, 3) that is nearest to the solution of K x = g.
 
     Nearest in the norm of K, so that its residual is orthogonal to all of them (Fischer, 1998). Solutions that depend
@@ -285,7 +285,7 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
     """
     r, z, q, Kq, w = work[0], work[1], work[2], work[3], work[4]
     n = m.shape[0]
-    multiply(u, edges, m, mbar, mu, x, Kq)
+    multiply_by_K(u, edges, m, mbar, mu, x, Kq)
     for i in range(n):
         for s in range(3):
             r[i, s] = g[i, s] - Kq[i, s]
@@ -300,7 +300,7 @@ def conjugate_gradients(u, edges, m, mbar, mu, R, place, column, row, L, g, x, w
             for s in range(3):
                 q[i, s] = z[i, s] + (rz / last) * q[i, s]
         last = rz
-        multiply(u, edges, m, mbar, mu, q, Kq)
+        multiply_by_K(u, edges, m, mbar, mu, q, Kq)
         step = rz / inner(q, Kq)
         rest = 0.0
         for i in range(n):

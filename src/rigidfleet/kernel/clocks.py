@@ -31,7 +31,7 @@ _BANDWIDTH = 5.0
 
 
 @jit
-def take_row(k, i, tick, flight, state):
+def fill_rows(k, i, tick, flight, state):
     """Fill the rows of vehicle i for tick k in the tables of its path, yaw, jerk and snap, by its own clock."""
     tables, rate, here = flight.tables, state.tau[i, RATE], k - flight.tables.first
     rows = tables.by_clock.shape[0]
@@ -73,7 +73,7 @@ def advance_clocks(k, tick, flight, state):
         own[OFF] += tick * (own[RATE] - 1.0)
         if k < clocks.late[i]:
             own[RATE] = 0.0
-            take_row(k, i, tick, flight, state)
+            fill_rows(k, i, tick, flight, state)
             continue
         target = min(max(2.0 - 2.0 * own[WORST] / clocks.wait, 0.0), 1.0)
         second = _BANDWIDTH * (_BANDWIDTH * (target - own[PACE]) - 2.0 * own[SLOPE])
@@ -87,7 +87,7 @@ def advance_clocks(k, tick, flight, state):
         # Of the sum, the own clock counts at the end of the tick: stable at any gain
         pull *= clocks.gain / (1.0 + tick * clocks.gain * heard)
         own[RATE] = min(max(own[PACE] * (1.0 + clocks.drift[i]) + pull, 0.0), FASTEST)
-        take_row(k, i, tick, flight, state)
+        fill_rows(k, i, tick, flight, state)
 
 
 @jit
@@ -99,7 +99,7 @@ def post_clock(k, i, clocks, own, message):
 
 
 @jit
-def report_error(i, k, error, net, mail, own):
+def take_greatest_error(i, k, error, net, mail, own):
     """Take the error of vehicle i [m] at tick k, or a greater one that it has heard of.
 
     What was measured a time of silence ago counts nothing, and newer errors count more until then. So a great error
@@ -147,7 +147,7 @@ def follow_own_clock(i, k, t, p, w, flight, state):
             error += away * away
             own[SLOT + q], own[SLOT + 3 + q] = w.r_ref[i, q], w.v_ref[i, q]
             own[SLOT + 6 + q] = w.a_ref[i, q]
-    report_error(i, k, math.sqrt(error), net, mail, own)
+    take_greatest_error(i, k, math.sqrt(error), net, mail, own)
     stuck = False
     for n in range(flight.clocks.stuck.shape[0]):
         one = flight.clocks.stuck[n]
@@ -162,7 +162,7 @@ def follow_own_clock(i, k, t, p, w, flight, state):
 
 
 @jit
-def take_own_slots(p, w, state):
+def use_own_slots(p, w, state):
     """Put into w the slot of each vehicle by its own clock: what others know of it is no longer needed."""
     for i in range(state.tau.shape[0] if p.control.kind == TRACKING else 0):
         for q in range(3):
@@ -171,7 +171,7 @@ def take_own_slots(p, w, state):
 
 
 @jit
-def let_go(i, w, net, state):
+def drop_constraint_force(i, w, net, state):
     """Exert no constraint force as vehicle i; its integrals of constraints go on, as its neighbours' do."""
     mail = state.mail
     state.saturated[i] = True  # its own integral rests; steering says anew whether it is

@@ -25,7 +25,7 @@ from rigidfleet.kernel.records import (
     TRAILED,
     TRIAL,
 )
-from rigidfleet.kernel.vectors import fill_lanes, in_vectors, rough_inverse, total_or_worst
+from rigidfleet.kernel.vectors import as_lanes, fill_lanes, rough_inverse, total_or_worst
 
 # Dormand and Prince's 5(4) pair, with Hairer's fourth-order continuous extension.
 _STAGES = 7
@@ -190,7 +190,7 @@ def integrate(p, w, state, t_end, fresh, times, samples, max_steps):
     y, trial = K[STATE], K[TRIAL]
     for q in range(n):
         y[q] = state.y[q]
-    k = in_vectors(K)
+    k = as_lanes(K)
     t, h, last = clock[TIME], clock[NEXT_STEP], clock[LAST_ERROR]
     if fresh:
         forget_stages(k, 0)

@@ -24,14 +24,14 @@ def solve(u, b, r, m, M, order, known, cm, I, I_inv, a, f_C):
         centre_of_mass(r, m, M, cm)
         inertia(r, m, cm, I)
         inertia_inverse(I, I_inv)
-    pivot = particular(u, b, order, a)
+    pivot = particular_solution(u, b, order, a)
     if pivot > LOST_PIVOT:
-        balance(r, m, M, cm, I_inv, a, f_C)
+        balanced_forces(r, m, M, cm, I_inv, a, f_C)
     return pivot
 
 
 @jit_inline
-def particular(u, b, order, a):
+def particular_solution(u, b, order, a):
     """Write into a (N, 3) a solution of J a = b, agent by agent; return the smallest pivot.
 
     An edge to agent j requires u . a_i = +-b + u . a_j. If an agent has fewer than three edges, the shortest
@@ -76,7 +76,7 @@ def particular(u, b, order, a):
 
 
 @jit_inline
-def balance(r, m, M, cm, I_inv, a, f):
+def balanced_forces(r, m, M, cm, I_inv, a, f):
     """Forces f = M a (N, 3) of accelerations a (N, 3), without the rigid motion that carries their momentum.
 
     The forces then have zero sum, and zero torque about cm, the centre of mass of agents r (N, 3).
@@ -101,7 +101,7 @@ def balance(r, m, M, cm, I_inv, a, f):
 
 
 @jit
-def pull_back(u, order, f, multiplier):
+def multipliers(u, order, f, multiplier):
     """Multipliers (m,) with J^T lambda = f for balanced forces f (N, 3), last agent first; f is overwritten.
 
     Each agent's three edges carry its force, and pass the reactions to the agents before.

@@ -193,7 +193,7 @@ class TickInputs(NamedTuple):
 
     first: int
     last: int
-    path: Floats  # (K, N, 6) r, v about which states are measured; see `sampled_flight.measure`
+    path: Floats  # (K, N, 6) r, v about which states are measured; see `sampled_flight.measure_states`
     yaw: Floats  # (K, N, 3) yaw [rad], its rate and acceleration
     jerk: Floats  # (K, N, 3) of the reference [m/s^3]
     snap: Floats  # (K, N, 3) [m/s^4]
@@ -398,7 +398,7 @@ def no_commands(n: int) -> Commands:
     )
 
 
-def flight(
+def ideal_flight(
     vehicles: Quadrotors, *, start: float, h: float, steps: int, every: int = 1
 ) -> SampledFlight:
     """A flight in still air with exact sensing; see `SampledFlight`. Replace parts of it by ``_replace``."""
@@ -409,7 +409,7 @@ def flight(
     )  # fmt: skip
 
 
-def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 0.0) -> Floats:
+def hover_states(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 0.0) -> Floats:
     """States (N, 17) at positions and velocities (N, 3), level, with thrust equal to weight.
 
     ``yaw`` (N,) or one for all [rad].
@@ -423,7 +423,7 @@ def hovering(vehicles: Quadrotors, r: ArrayLike, v: ArrayLike, yaw: ArrayLike = 
     return S
 
 
-def begin(
+def initial_state(
     flight: SampledFlight,
     S: Floats,
     workspace: Workspace,
@@ -464,7 +464,7 @@ def begin(
     )  # fmt: skip
 
 
-def under_problem(
+def state_under_problem(
     state: SampledState, workspace: Workspace, integral: Floats, *, frame: Floats | None = None
 ) -> SampledState:
     """The same flight under another problem, such as that of the next phase, whose edges may be others.

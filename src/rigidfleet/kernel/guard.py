@@ -7,8 +7,8 @@ after the other then takes what it wants, if its motion over the tick and its st
 from what the others do at present; else the nearest of some fixed accelerations that does; else it brakes. The proof is
 in docs/avoidance.md.
 
-A quadrotor is led by a point ahead of it that obeys at once (`foresee`), and keeps its distances with the hull of this
-point, its stop point and what comes behind: while it brakes, this hull only shrinks, too.
+A quadrotor is led by a point ahead of it that obeys at once (`move_to_obedient_point`), and keeps its distances with
+the hull of this point, its stop point and what comes behind: while it brakes, this hull only shrinks, too.
 
 Vehicles or obstacles that are nearer than they should be must not come nearer still.
 
@@ -29,31 +29,31 @@ from rigidfleet.kernel.avoidance import (
     PAIR,
     TICKS,
 )
-from rigidfleet.kernel.barriers import filter_accelerations, limit, loosen
+from rigidfleet.kernel.barriers import filter_accelerations, limit_thrust, subtract_released_forces
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.fleet import TICKS as FLIGHT_TICKS
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.moving import (
-    brake_beside,
-    braking_beside,
-    clearance_beside_moving,
-    follow_flow,
-    is_known,
+    braking_acceleration_beside,
+    braking_limit_beside,
+    is_obstacle_known,
+    margin_beside_moving,
     miss_distance,
     room_beside,
-    stop_beside,
+    steer_round_obstacles,
     update_tracks,
     way_to_rest,
+    write_stop_beside,
 )
 from rigidfleet.kernel.rigid_body import attitude_matrix
 from rigidfleet.kernel.sampled_flight import path_at
 from rigidfleet.kernel.segments import (
-    between_hulls,
-    between_segments,
-    from_obstacle,
-    from_solid,
-    kept_from,
+    hull_distance,
     least_along,
+    point_to_obstacle,
+    refined_segment_to_obstacle,
+    segment_distance,
+    segment_to_obstacle,
 )
 
 #: Neighbours are listed for speeds higher by this share and summand [m/s], and for ways of this share of their
@@ -75,7 +75,7 @@ def stop_distance(u, i, a):
 
 
 @jit
-def predict(i, r, v, c, a, out):
+def predict_motion(i, r, v, c, a, out):
     """Motion of vehicle i from r, v (3,) under an acceleration c (3,) held for a tick; see `AvoidanceArrays.trial`.
 
     Returns the distance from r that it cannot leave in the tick, and by braking after it.
@@ -98,7 +98,7 @@ def predict(i, r, v, c, a, out):
 
 
 @jit
-def brake(i, v, a, out):
+def braking_acceleration(i, v, a, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,): by b, or to rest within the tick, with drag."""
     speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     most = a.b[i] * speed / max(speed + a.soft[i], 1e-12) if a.soft[i] > 0.0 else a.b[i]
@@ -108,7 +108,7 @@ def brake(i, v, a, out):
 
 
 @jit
-def accept(i, far, a):
+def accept_candidate(i, far, a):
     """Make the candidate ``trial`` the present choice of vehicle i."""
     trial = a.trial
     a.far[i] = far
@@ -119,7 +119,7 @@ def accept(i, far, a):
 
 
 @jit
-def keeps(i, v, j, s, floor, a):
+def is_apart(i, v, j, s, floor, a):
     """Whether the candidate of vehicle i keeps its distance from the present choice of j; velocities v and s (3,).
 
     The relative path over the tick lies beyond the parabola of its part along any unit vector. The vector is that to
@@ -127,9 +127,9 @@ def keeps(i, v, j, s, floor, a):
     """
     mine, other, rise = a.trial, a.ways[j], a.rise[j]
     if a.soft[i] + a.soft[j] > 0.0:  # quadrotors, by their hulls
-        return between_hulls(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
+        return hull_distance(mine, 2, a.ways[i, 4:], other, 2, other[4:], floor, a.normal) >= floor
     # After the tick: from then on both may brake, and their stop segments only shrink.
-    if between_segments(mine[1], mine[2], other[1], other[2]) < floor:
+    if segment_distance(mine[1], mine[2], other[1], other[2]) < floor:
         return False
     # During the tick: the chord of the relative path, and how far the path may be from it.
     x, y, z = mine[0, 0] - other[0, 0], mine[0, 1] - other[0, 1], mine[0, 2] - other[0, 2]
@@ -154,7 +154,7 @@ def keeps(i, v, j, s, floor, a):
 
 
 @jit
-def clears(i, v, far, a):
+def keeps_clearance(i, v, far, a):
     """Whether the candidate of vehicle i, with a velocity v (3,), keeps its distances from obstacles at rest."""
     way, normal = a.trial, a.normal
     for o in range(a.solids.kind.shape[0]):
@@ -162,14 +162,14 @@ def clears(i, v, far, a):
             continue
         floor = a.walls[i, o]
         # Farther away than it can come: most obstacles take one distance.
-        if from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
+        if point_to_obstacle(way[0, 0], way[0, 1], way[0, 2], o, a.solids, normal) - far >= floor:
             continue
-        # Its stop segment after the tick, then its path over the tick as in `keeps`: a parabola beyond the chord.
+        # Its stop segment after the tick, then its path over the tick as in `is_apart`: a parabola beyond the chord.
         after = a.ways[i, 4] if a.soft[i] > 0.0 else way[1]
-        bound, _, _ = from_obstacle(after, way[2], o, a.solids, floor, normal)
+        bound, _, _ = segment_to_obstacle(after, way[2], o, a.solids, floor, normal)
         if bound < floor:
             return False
-        bound, value, x = from_obstacle(way[0], way[1], o, a.solids, floor, normal)
+        bound, value, x = segment_to_obstacle(way[0], way[1], o, a.solids, floor, normal)
         if bound < floor:
             return False
         along = rate = rise = 0.0
@@ -260,7 +260,7 @@ def list_neighbours(r, lost, way, a):
 
 
 @jit
-def greatest(x):
+def greatest_length(x):
     """Greatest length of the rows of x (N, 3)."""
     longest = 0.0
     for i in range(x.shape[0]):
@@ -269,7 +269,7 @@ def greatest(x):
 
 
 @jit
-def moved_apart(r, a):
+def greatest_move_apart(r, a):
     """Greatest way [m] of a vehicle since neighbours were listed, beside the way that all have gone."""
     # What all have gone together changes no distance: a fleet that travels keeps its lists.
     n, farthest = a.b.shape[0], 0.0
@@ -289,11 +289,11 @@ def moved_apart(r, a):
 @jit
 def update_neighbours(r, v, lost, a):
     """Renew the list of neighbours if others could have come near; returns False if it is too short."""
-    fastest, hardest = greatest(v), greatest(a.wanted)
+    fastest, hardest = greatest_length(v), greatest_length(a.wanted)
     due = a.count[LISTED] == 0 or fastest > a.span[1] or hardest > a.span[2]
     # Nor for speeds far below those for which it was made
     due = due or 2.5 * fastest + _LEAST_SPEED < 0.8 * a.span[1]
-    if not (due or 2.0 * moved_apart(r, a) > a.span[0]):
+    if not (due or 2.0 * greatest_move_apart(r, a) > a.span[0]):
         return True
     speed, hard = (1.0 + _FASTER) * fastest + _LEAST_SPEED, (1.0 + _FASTER) * hardest + 1.0
     way = interaction_range(speed, hard, a)
@@ -309,7 +309,7 @@ def update_neighbours(r, v, lost, a):
 
 
 @jit
-def note(kind, value, t, i, j, a):
+def note_margin(kind, value, t, i, j, a):
     """Note a margin [m] of vehicle i to j, or to obstacle j, if it is the least so far, or the first negative one."""
     if value < a.margin[kind, 0]:
         a.margin[kind, 0], a.margin[kind, 1] = value, t
@@ -320,50 +320,50 @@ def note(kind, value, t, i, j, a):
 
 
 @jit
-def alone(i, a):
+def is_alone(i, a):
     """Whether vehicle i has neither neighbours nor obstacles."""
     return a.start[i + 1] == a.start[i] and a.solids.kind.shape[0] == 0
 
 
 @jit
-def set_floor_beside(t, i, o, r, v, closest, a):
+def set_distance_floor_beside(t, i, o, r, v, closest, a):
     """Find the distance that the relative stop segment of vehicle i keeps from obstacle o, which moves.
 
     Returns the least by which such a segment exceeds what it needs so far, at most 0; `threat` is its obstacle.
     """
-    if not is_known(o, a):
+    if not is_obstacle_known(o, a):
         return closest
-    stop, speed = stop_beside(i, o, r, v, a)
-    need, way = clearance_beside_moving(i, o, speed, braking_beside(i, o, a), a), a.shifted
-    apart = from_solid(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
+    stop, speed = write_stop_beside(i, o, r, v, a)
+    need, way = margin_beside_moving(i, o, speed, braking_limit_beside(i, o, a), a), a.shifted
+    apart = point_to_obstacle(way[0, 0], way[0, 1], way[0, 2], o, a.solids, a.normal) - stop
     a.walls[i, o] = need
     if a.threat[i] < 0:  # also one that is still far: a single tick may bring it near
         a.threat[i] = o
     if apart < need or apart - need < a.margin[OBSTACLE, 0]:
         # Rounding alone must not make the bound a loose one: the vehicle could lose a little at each tick
         enough = need - 10.0 * _ROUNDING
-        kept = kept_from(way[0], way[2], o, a.solids, enough, a.normal)
+        kept = refined_segment_to_obstacle(way[0], way[2], o, a.solids, enough, a.normal)
         a.walls[i, o] = min(need, kept)
-        note(OBSTACLE, kept - a.reach[i], t, i, o, a)
+        note_margin(OBSTACLE, kept - a.reach[i], t, i, o, a)
         if kept - need < closest or (apart < need and closest == 0.0):
             a.threat[i], closest = o, min(kept - need, 0.0)
     return closest
 
 
 @jit
-def set_floors(t, r, v, lost, a):
+def set_distance_floors(t, r, v, lost, a):
     """Let all vehicles brake, and find the distances that their stop segments keep, as they should or as they do."""
     n, acceleration = a.b.shape[0], a.trial[3]
     for i in range(n):
-        if alone(i, a):
+        if is_alone(i, a):
             continue
-        brake(i, v[i], a, acceleration)
+        braking_acceleration(i, v[i], a, acceleration)
         speed = math.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2 + v[i, 2] ** 2)
         stop = stop_distance(speed, i, a)
         for q in range(3):
             a.ways[i, 3, q] = r[i, q] + stop / max(speed, 1e-12) * v[i, q]
         # It stays on the stop segment, also after the tick
-        accept(i, max(predict(i, r[i], v[i], acceleration, a, a.trial), stop), a)
+        accept_candidate(i, max(predict_motion(i, r[i], v[i], acceleration, a, a.trial), stop), a)
     # A vehicle that is nearer than it should be keeps what it has: a floor that nobody meets would stop all.
     for i in range(n):
         if lost[i]:
@@ -377,38 +377,38 @@ def set_floors(t, r, v, lost, a):
             if apart < need or apart - need < a.margin[PAIR, 0]:
                 if a.soft[i] + a.soft[j] > 0.0:
                     mine, other = a.ways[i], a.ways[j]
-                    kept = between_hulls(mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal)
+                    kept = hull_distance(mine, 3, mine[4:], other, 3, other[4:], math.nan, a.normal)
                 else:
-                    kept = between_segments(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
+                    kept = segment_distance(r[i], a.ways[i, 3], r[j], a.ways[j, 3])
                 a.floor[e] = min(need, kept)
                 if i < j:
-                    note(PAIR, kept - a.room[i] - a.room[j], t, i, j, a)
+                    note_margin(PAIR, kept - a.room[i] - a.room[j], t, i, j, a)
         a.threat[i], a.late[i], closest = -1, 0.0, 0.0
         for o in range(a.solids.kind.shape[0]):
             if a.sight.moves[o] != 0:
-                closest = set_floor_beside(t, i, o, r[i], v[i], closest, a)
+                closest = set_distance_floor_beside(t, i, o, r[i], v[i], closest, a)
                 a.late[i] = closest
                 continue
             need = a.reach[i] + a.spare[i]
-            apart = from_solid(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
+            apart = point_to_obstacle(r[i, 0], r[i, 1], r[i, 2], o, a.solids, a.normal) - a.far[i]
             a.walls[i, o] = need
             if apart < need or apart - need < a.margin[OBSTACLE, 0]:
                 way = a.ways[i]
-                kept = kept_from(way[4], way[3], o, a.solids, need, a.normal)
+                kept = refined_segment_to_obstacle(way[4], way[3], o, a.solids, need, a.normal)
                 a.walls[i, o] = min(need, kept)
-                note(OBSTACLE, kept - a.reach[i], t, i, o, a)
+                note_margin(OBSTACLE, kept - a.reach[i], t, i, o, a)
 
 
 @jit
-def safe(i, r, v, far, a):
+def is_safe(i, r, v, far, a):
     """Whether the candidate of vehicle i is compatible with the present choices of all others and with obstacles."""
     for e in range(a.start[i], a.start[i + 1]):
         j = a.near[e]
         x, y, z = r[i, 0] - r[j, 0], r[i, 1] - r[j, 1], r[i, 2] - r[j, 2]
         reach = a.floor[e] + far + a.far[j]
-        if x * x + y * y + z * z < reach * reach and not keeps(i, v[i], j, v[j], a.floor[e], a):
+        if x * x + y * y + z * z < reach * reach and not is_apart(i, v[i], j, v[j], a.floor[e], a):
             return False
-    return clears(i, v[i], far, a)
+    return keeps_clearance(i, v[i], far, a)
 
 
 @jit
@@ -419,34 +419,34 @@ def is_pushed(i, a):
 
 
 @jit
-def propose(i, k, v, a, c):
+def propose_candidate(i, k, v, a, c):
     """Candidate k of vehicle i into c (3,): what it wants, fixed ones, then braking relative to its threat."""
     last = a.candidates.shape[0] + 1
     if k == 0:
         c[0], c[1], c[2] = a.wanted[i, 0], a.wanted[i, 1], a.wanted[i, 2]
         if a.soft[i] > 0.0 and a.overruled[i] == 0 and not is_pushed(i, a):
             for q in range(3):
-                c[q] = at_once(i, q, a)
+                c[q] = immediate_choice(i, q, a)
     elif k < last:
         for q in range(3):
             c[q] = a.b[i] * a.candidates[k - 1, q]
     else:
-        brake_beside(i, a.threat[i], v, a, c)
+        braking_acceleration_beside(i, a.threat[i], v, a, c)
 
 
 @jit
 def room_if_braking(i, r, v, late, a):
-    """What `choose` compares of vehicle i, if it brakes [m]."""
+    """What `choose_acceleration` compares of vehicle i, if it brakes [m]."""
     c = a.trial[3]
-    brake(i, v[i], a, c)
+    braking_acceleration(i, v[i], a, c)
     if late:
         return miss_distance(r[i], v[i], c, a)
-    predict(i, r[i], v[i], c, a, a.trial)
+    predict_motion(i, r[i], v[i], c, a, a.trial)
     return room_beside(i, v[i], a)
 
 
 @jit
-def choose(i, r, v, a):
+def choose_acceleration(i, r, v, a):
     """Choose for vehicle i: what it wants, else the nearest safe candidate, else braking; returns which.
 
     0 means what it wants, 1 a candidate, 2 braking. Obstacles that move can leave no safe candidate and make braking
@@ -457,14 +457,14 @@ def choose(i, r, v, a):
     most, second = -math.inf, -1
     late = a.threat[i] >= 0 and a.late[i] < -_LATE
     for k in range(a.candidates.shape[0] + (2 if a.threat[i] >= 0 else 1)):
-        propose(i, k, v[i], a, c)
+        propose_candidate(i, k, v[i], a, c)
         away = 0.0
         for q in range(3):
             away += (c[q] - wanted[q]) ** 2
         if away >= best:  # before it is tried: distances cost far more
             continue
-        far = predict(i, r[i], v[i], c, a, a.trial)
-        if not safe(i, r, v, far, a):
+        far = predict_motion(i, r[i], v[i], c, a, a.trial)
+        if not is_safe(i, r, v, far, a):
             continue
         room = miss_distance(r[i], v[i], c, a) if late else room_beside(i, v[i], a)
         if late or room < 0.0:
@@ -473,26 +473,26 @@ def choose(i, r, v, a):
             continue
         best, nearest = away, k
         if k == 0:
-            accept(i, far, a)
+            accept_candidate(i, far, a)
             return 0
     if nearest < 0:
         if second < 0 or room_if_braking(i, r, v, late, a) >= most:
             return 2
         nearest = second
-    propose(i, nearest, v[i], a, c)
-    accept(i, predict(i, r[i], v[i], c, a, a.trial), a)
+    propose_candidate(i, nearest, v[i], a, c)
+    accept_candidate(i, predict_motion(i, r[i], v[i], c, a, a.trial), a)
     return 1
 
 
 @jit
-def tally(kind, i, t, a):
+def count_action(kind, i, t, a):
     """Count that a layer has acted on vehicle i at this tick."""
     a.acted[kind, i] += 1
     a.first[kind, i] = min(a.first[kind, i], t)
 
 
 @jit
-def command(i, state, a):
+def command_force(i, state, a):
     """Give vehicle i the force of the acceleration chosen for it; a quadrotor's follows it with a lag."""
     c, u = a.chosen[i], a.commanded[i]
     for q in range(3):
@@ -509,22 +509,22 @@ def wanted_acceleration(i, state, a):
     for q in range(3):
         a.wanted[i, q] = share * force[q] / a.weight[i] - (a.g if q == 2 else 0.0)
     if a.soft[i] > 0.0:
-        limit(i, a)
+        limit_thrust(i, a)
         off = 0.0
         for q in range(3):
             a.requested[i, q] = a.wanted[i, q]
             if not a.commanded[i, q] < math.inf:
                 a.commanded[i, q] = a.requested[i, q]
-            a.wanted[i, q] = at_once(i, q, a)
-        limit(i, a)
+            a.wanted[i, q] = immediate_choice(i, q, a)
+        limit_thrust(i, a)
         for q in range(3):
-            off = max(off, abs(a.wanted[i, q] - at_once(i, q, a)))
+            off = max(off, abs(a.wanted[i, q] - immediate_choice(i, q, a)))
         if off < _ROUNDING:
             a.overruled[i] = 0
 
 
 @jit
-def at_once(i, q, a):
+def immediate_choice(i, q, a):
     """The choice, along axis q, that has vehicle i follow what it is asked for at once."""
     return a.commanded[i, q] + (1.0 + a.ahead[i, q, 2] / a.period) * (
         a.requested[i, q] - a.commanded[i, q]
@@ -532,7 +532,7 @@ def at_once(i, q, a):
 
 
 @jit
-def foresee(i, vehicles, state, r, v, a):
+def move_to_obedient_point(i, vehicles, state, r, v, a):
     """Lead r and v (3,) of vehicle i to the point that obeys the guard at once; keeps the points behind it.
 
     From a command u to the acceleration, attitude and motors act as u = a + a1 da/dt + a2 d2a/dt2 + ..., so that
@@ -557,19 +557,19 @@ def foresee(i, vehicles, state, r, v, a):
 
 
 @jit
-def avoid(p, w, flight, state, a):
+def guard_forces(p, w, flight, state, a):
     """Filter and guard the forces that the formation's law has just given; returns 0 if neighbours are too many."""
     n, lost, t = a.b.shape[0], flight.vehicles.lost, state.work.law_time[0]
     r, v, k = a.known[0], a.known[1], state.count[FLIGHT_TICKS]
     if a.filtered:
-        loosen(p, w, state, a)
+        subtract_released_forces(p, w, state, a)
     for i in range(n):
         for q in range(3):
             r[i, q] = state.seen[i, q] + path_at(k, i, q, flight.tables)
             v[i, q] = state.seen[i, 3 + q] + path_at(k, i, 3 + q, flight.tables)
         wanted_acceleration(i, state, a)
         if a.soft[i] > 0.0:
-            foresee(i, flight.vehicles, state, r[i], v[i], a)
+            move_to_obedient_point(i, flight.vehicles, state, r[i], v[i], a)
         else:
             for q in range(3):
                 a.ways[i, 4, q] = a.ways[i, 5, q] = r[i, q]
@@ -578,14 +578,14 @@ def avoid(p, w, flight, state, a):
     flows = False
     if a.flow:
         for i in range(n):
-            if follow_flow(i, r[i], v[i], a):
-                limit(i, a)
+            if steer_round_obstacles(i, r[i], v[i], a):
+                limit_thrust(i, a)
                 flows = True
     if not update_neighbours(r, v, lost, a):
         a.count[FULL] = 1
         return 0
     a.count[TICKS] += 1
-    set_floors(t, r, v, lost, a)
+    set_distance_floors(t, r, v, lost, a)
     changed = a.filtered and filter_accelerations(t, r, v, lost, p, w, a)
     for k in range(n):
         i = (k + a.count[TICKS]) % n  # each comes first in turn
@@ -593,17 +593,17 @@ def avoid(p, w, flight, state, a):
             state.layers[i] = ACTS[BARRIER]
         if lost[i]:
             continue
-        free = alone(i, a) or not a.guarded
+        free = is_alone(i, a) or not a.guarded
         # Its choice counts for those that come after it, who keep their distances from it: the order makes the proof.
-        how = 0 if free else choose(i, r, v, a)
+        how = 0 if free else choose_acceleration(i, r, v, a)
         if free:
             for q in range(3):
                 a.chosen[i, q] = a.wanted[i, q]
         if how > 0:
-            tally(GUARD, i, t, a)
+            count_action(GUARD, i, t, a)
             state.layers[i] |= ACTS[GUARD]
         if how > 1:
-            tally(BRAKE, i, t, a)
+            count_action(BRAKE, i, t, a)
             state.layers[i] |= ACTS[BRAKE]
         if a.soft[i] > 0.0:
             if how + state.layers[i] + a.overruled[i] == 0:
@@ -613,7 +613,7 @@ def avoid(p, w, flight, state, a):
             a.overruled[i] = 1
             if state.layers[i] == 0:
                 state.layers[i] = ACTS[GUARD]
-            command(i, state, a)
+            command_force(i, state, a)
         elif how > 0 or changed or flows:
-            command(i, state, a)
+            command_force(i, state, a)
     return 1

@@ -8,7 +8,7 @@ doi:10.1107/S0108767305015266).
 
 import math
 
-from rigidfleet.kernel.compiler.jit import exact, jit
+from rigidfleet.kernel.compiler.jit import jit, jit_exact
 from rigidfleet.kernel.linalg import jacobi_eigen
 from rigidfleet.kernel.rigid_body import (
     attitude_matrix,
@@ -31,7 +31,7 @@ _MULTIPLE = 0.03
 
 
 @jit
-def fit(B, bound, K, V, w, q):
+def fit_quaternion(B, bound, K, V, w, q):
     """Unit quaternion q (4,) of the rotation T that maximises tr(T B^T), B = sum m p x^T (3, 3).
 
     ``bound`` is the maximum, or little more: sum m (p^2 + x^2) / 2 is, if the points nearly fit.
@@ -161,7 +161,7 @@ def keep_sign(q, last):
 
 
 @jit
-def extent(p, mass, C, V, w, axis):
+def width_and_length(p, mass, C, V, w, axis):
     """Width and length of slots p (N, 3) of a ``mass`` (N,); the direction of the length into ``axis`` (3,).
 
     For slots too wide to be a line, two numbers with a ratio that shows this, and no axis.
@@ -194,7 +194,7 @@ def extent(p, mass, C, V, w, axis):
 
 
 @jit
-def lay_line(x, p, mass, axis, near, T, now, there, across):
+def attitude_of_line(x, p, mass, axis, near, T, now, there, across):
     """Attitude T (3, 3) of a line: ``near``, followed by the smallest rotation that lays its axis along the agents."""
     for a in range(3):
         there[a] = 0.0
@@ -242,7 +242,7 @@ def lay_line(x, p, mass, axis, near, T, now, there, across):
 
 
 @jit
-def line_inverse(I, lifted, axis, out):
+def inertia_inverse_of_line(I, lifted, axis, out):
     """Pseudo-inverse of an inertia I (3, 3) into out, without the spin of a line about itself.
 
     ``lifted`` (3, 3) and ``axis`` (3,) are scratch.
@@ -250,7 +250,7 @@ def line_inverse(I, lifted, axis, out):
     first = I[0, 0] + I[1, 1] + I[2, 2]
     second = I[0, 0] * I[1, 1] + I[0, 0] * I[2, 2] + I[1, 1] * I[2, 2]
     second -= I[0, 1] * I[0, 1] + I[0, 2] * I[0, 2] + I[1, 2] * I[1, 2]
-    third = axis_of(I, 0.0, axis)
+    third = eigenvector_of(I, 0.0, axis)
     if not second > 0.0:
         for a in range(3):
             for b in range(3):
@@ -270,7 +270,7 @@ def line_inverse(I, lifted, axis, out):
         inertia_inverse(I, out)
         return
     # I + largest n n^T, n the axis of the least inertia, has no small eigenvalue.
-    axis_of(I, x, axis)
+    eigenvector_of(I, x, axis)
     for a in range(3):
         for b in range(3):
             lifted[a, b] = I[a, b] + largest * axis[a] * axis[b]
@@ -281,7 +281,7 @@ def line_inverse(I, lifted, axis, out):
 
 
 @jit
-def axis_of(I, x, axis):
+def eigenvector_of(I, x, axis):
     """Unit eigenvector of symmetric I (3, 3) for its simple eigenvalue x, into axis (3,); returns det (I - x)."""
     a, d, f = I[0, 0] - x, I[1, 1] - x, I[2, 2] - x
     b, c, e = I[0, 1], I[0, 2], I[1, 2]
@@ -311,11 +311,11 @@ def attitude_of(m, k, known, line_known, near, work, T):
     B, K, V, w, axis, size = work[0], work[1], work[2], work[3, 0], work[7, 0], work[7, 1]
     n = x.shape[0]
     if not line_known:
-        size[0], size[1] = extent(p, mass, K, V, w, axis)
+        size[0], size[1] = width_and_length(p, mass, K, V, w, axis)
     width, length = size[0], size[1]
     line = width <= _THIN * length
     if line or (known and width <= _NARROW * length):
-        lay_line(x, p, mass, axis, near, T, work[3, 1], work[3, 2], work[3, 3])
+        attitude_of_line(x, p, mass, axis, near, T, work[3, 1], work[3, 2], work[3, 3])
         if not line:
             off = 0.0
             for i in range(n):
@@ -335,7 +335,7 @@ def attitude_of(m, k, known, line_known, near, work, T):
             B[a, b] = s
         for i in range(n):
             bound += 0.5 * mass[i] * (p[i, a] * p[i, a] + x[i, a] * x[i, a])
-    fit(B, bound, K, V, w, m.attitude[k])
+    fit_quaternion(B, bound, K, V, w, m.attitude[k])
     attitude_matrix(m.attitude[k], T)
     return False
 
@@ -366,7 +366,7 @@ def measure(m):
                 for i in range(n):
                     for a in range(3):
                         same = same and m.p[k, i, a] == m.p[k - 1, i, a]
-            motion(m, k, mass, M)
+            measure_motion(m, k, mass, M)
             line = False
             if m.attached[piece]:
                 centre_of_mass(m.p[k], mass, M, centre)
@@ -399,7 +399,7 @@ def measure(m):
             angular_momentum(m, k, mass, h)
             inertia(m.x[0], mass, zero, I)
             if line:
-                line_inverse(I, work[8], work[3, 2], inverse)
+                inertia_inverse_of_line(I, work[8], work[3, 2], inverse)
             else:
                 inertia_inverse(I, inverse)
             multiply(inverse, h, omega)
@@ -424,14 +424,14 @@ def move_origin(m, k, T, centre, omega, offset):
         m.cm_velocity[k, a] -= omega[b] * offset[c] - omega[c] * offset[b]
 
 
-@exact
+@jit_exact
 def length(x, y, z):
     """Length of a vector."""
     return math.sqrt(x * x + y * y + z * z)
 
 
 @jit
-def motion(m, k, mass, M):
+def measure_motion(m, k, mass, M):
     """Centre of mass, wrench, thrust and distances at sample k; agents about their centre of mass into ``m.x``."""
     r, v, f, g = m.r[k], m.v[k], m.f_u[k], m.f_C[k]
     n = r.shape[0]

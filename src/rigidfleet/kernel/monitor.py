@@ -11,26 +11,27 @@ Forces are known where the law is evaluated: at the end of each step, and on bot
 than both its neighbours, the law is evaluated in between, until the parabola through three values promises no further
 rise: to 1e-5 of the value. The same holds for large formations, whose multipliers are iterated, with one exception:
 constraint forces and tensions below a tenth of the greatest thrust are found to 1e-6 of that thrust, the accuracy that
-the solver's residual allows. Large formations use a separate solver for these evaluations (`LargeSolver.aside`),
-because a solver keeps state and another thread calls the monitor. The flight is therefore the same to the bit with and
-without a monitor. The extremes do not depend on where the trail is cut, because the order of evaluations does not.
+the solver's residual allows. Large formations use a separate solver for these evaluations
+(`LargeSolver.solver_for_thread`), because a solver keeps state and another thread calls the monitor. The flight is
+therefore the same to the bit with and without a monitor. The extremes do not depend on where the trail is cut, because
+the order of evaluations does not.
 """
 
 import math
 
 from rigidfleet.kernel.bernstein import (
     CLOSE,
+    ball_radius,
+    distance_to_box,
+    least_height_within,
     length_at,
-    lowest,
-    lowest_overlap,
-    nearest_box,
+    lowest_value,
     point_at,
-    shortest,
     shortest_above,
-    span_of,
-    square,
+    shortest_length,
+    squared_length,
     tangent_of_box,
-    weights,
+    write_basis,
 )
 from rigidfleet.kernel.compiler.jit import jit
 from rigidfleet.kernel.gauge import read_gauge
@@ -75,7 +76,7 @@ _NARROW = 1e-3
 
 
 @jit
-def take(kind, key, t, first, second, monitor):
+def take_if_worse(kind, key, t, first, second, monitor):
     """Store a value that is worse than the worst one of its kind; a smaller ``key`` is worse."""
     if key < monitor.worst[kind]:
         monitor.worst[kind] = key
@@ -87,7 +88,7 @@ def take(kind, key, t, first, second, monitor):
 
 
 @jit
-def quaternion_of(points, p):
+def quaternion_bounds(points, p):
     """Greatest rate, over a step, and least length of the quaternion of the body axes, by its control points."""
     first = 6 * p.vehicles.m.shape[0] + p.graph.edges.shape[0]
     fastest, least = 0.0, math.inf
@@ -105,12 +106,12 @@ def rotation_bound(points, p):
     """Upper bound of the rotation [rad] of the axes of the states over a step: 0 in the inertial formulation."""
     if not p.body_formulation:
         return 0.0
-    rate, length = quaternion_of(points, p)
+    rate, length = quaternion_bounds(points, p)
     return 2.0 * rate / max(length, 1e-3)
 
 
 @jit
-def pieces_over(angle):
+def count_pieces(angle):
     """Number of pieces into which a step is cut whose axes turn by an angle [rad]."""
     return int(min(max(1.0, math.ceil(angle / _TURN)), 1e4))
 
@@ -122,7 +123,7 @@ def find_attitudes(points, part, parts, p, monitor):
     quaternion = monitor.scratch[0]
     for k in range(5):
         basis = monitor.basis[k]
-        weights((part + KNOTS[k]) / parts, basis)
+        write_basis((part + KNOTS[k]) / parts, basis)
         for s in range(4):
             quaternion[s] = value_of_column(basis, points, first + s)
         for s in range(6):
@@ -140,7 +141,7 @@ def value_of_column(basis, points, q):
 
 
 @jit
-def in_world(points, i, moving, p, monitor, out):
+def world_points(points, i, moving, p, monitor, out):
     """Control points (5, 3) of agent i's position in the world, or of its velocity (``moving`` 1)."""
     n = p.vehicles.m.shape[0]
     first = 3 * i + 3 * n * moving
@@ -169,7 +170,7 @@ def in_world(points, i, moving, p, monitor, out):
 
 
 @jit
-def from_mean(points, k, i, mean):
+def point_from_mean(points, k, i, mean):
     """Control point k of agent i, from the mean of those of the agents that are monitored."""
     return (
         points[k, 3 * i] - mean[k, 0],
@@ -203,8 +204,8 @@ def rotation_over(points, mean, monitor):
     xx = xy = xz = yy = yz = zz = moment_x = moment_y = moment_z = 0.0
     for i in range(monitor.left.shape[0]):
         if monitor.left[i]:
-            x0, y0, z0 = from_mean(points, 0, i, mean)
-            x1, y1, z1 = from_mean(points, 4, i, mean)
+            x0, y0, z0 = point_from_mean(points, 0, i, mean)
+            x1, y1, z1 = point_from_mean(points, 4, i, mean)
             x, y, z = 0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)
             dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
             xx, yy, zz = xx + y * y + z * z, yy + x * x + z * z, zz + x * x + y * y
@@ -225,7 +226,7 @@ def rotation_over(points, mean, monitor):
 
 
 @jit
-def bound_moves(p, state, monitor):
+def bound_changes(p, state, monitor):
     """Bounds [m] of the change of any distance over the trail's first step, in space and as seen from above.
 
     They are written into ``monitor.moves``. With r_i' = any rigid motion + u_i, the rate of a distance is at most
@@ -239,10 +240,10 @@ def bound_moves(p, state, monitor):
     for i in range(monitor.left.shape[0]):
         if not monitor.left[i]:
             continue
-        x, y, z = from_mean(points, 0, i, mean)
+        x, y, z = point_from_mean(points, 0, i, mean)
         before_x = before_y = before_z = 0.0
         for k in range(5):
-            next_x, next_y, next_z = from_mean(points, min(k + 1, 4), i, mean)
+            next_x, next_y, next_z = point_from_mean(points, min(k + 1, 4), i, mean)
             after_x, after_y, after_z = next_x - x, next_y - y, next_z - z
             # The rate of a quartic has, in quartic form, k (x_k - x_k-1) + (4 - k) (x_k+1 - x_k) as coefficients; the
             # rotation takes its cross product with the place from it.
@@ -257,7 +258,7 @@ def bound_moves(p, state, monitor):
     if p.body_formulation:
         # The axes turn as well, and where the vertical is in them is not asked: any rotation may tilt. A quaternion
         # between its control points may be shorter than they are, hence the tenth.
-        rate, length = quaternion_of(points, p)
+        rate, length = quaternion_bounds(points, p)
         turn = math.sqrt(turn_x * turn_x + turn_y * turn_y + turn_z * turn_z)
         tilt = 2.0 * rate / max(length - 0.1, 0.1) + turn
     # Of two agents, each may move by its part, and tilting moves each by at most its distance from the mean.
@@ -266,20 +267,20 @@ def bound_moves(p, state, monitor):
 
 
 @jit
-def enclose(curve, ball):
+def enclose_points(curve, ball):
     """Write into a ball (4,) the middle one of control points (5, 3), and the least radius [m] that holds all."""
-    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
+    ball[0], ball[1], ball[2], ball[3] = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
 
 
 @jit
 def enclose_agents(points, monitor):
     """Balls that hold the agents' positions over a step, in the axes of the states."""
     for i in range(monitor.balls.shape[0]):
-        enclose(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
+        enclose_points(points[:, 3 * i : 3 * i + 3], monitor.balls[i])
 
 
 @jit
-def apart(i, j, axes, reach, monitor):
+def surely_apart(i, j, axes, reach, monitor):
     """Whether agents i and j stay at least ``reach`` [m] apart over a step, by their balls, along the first ``axes``.
 
     If so, their curves need not be compared. False does not say that they come closer.
@@ -306,7 +307,7 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
         # Surfaces that overlap count by how deep, so that the floor may be below the sum of the radii.
         radii = monitor.radius[i] + monitor.radius[j]
         floor = monitor.worst[kind] + radii
-        if apart(i, j, axes, radii if below else floor, monitor):
+        if surely_apart(i, j, axes, radii if below else floor, monitor):
             continue
         own, other = monitor.places[i], monitor.places[j]
         for s in range(5):
@@ -316,13 +317,13 @@ def watch_pairs(kind, pairs, points, t, h, monitor):
                 else:
                     curve[s, q] = points[s, 3 * i + q] - points[s, 3 * j + q]
         if below:
-            value, at = lowest_overlap(curve, radii, floor, monitor.pieces)
+            value, at = least_height_within(curve, radii, floor, monitor.pieces)
         elif flying:
             value, at = shortest_above(curve, own, other, monitor.altitude, floor, monitor.pieces)
         else:
-            value, at = shortest(curve, floor, monitor.work, monitor.pieces)
+            value, at = shortest_length(curve, floor, monitor.work, monitor.pieces)
         if at >= 0.0:
-            take(kind, value - radii, t + at * h, i, j, monitor)
+            take_if_worse(kind, value - radii, t + at * h, i, j, monitor)
 
 
 @jit
@@ -333,9 +334,9 @@ def watch_coordinate(kind, curve, axis, sign, offset, t, h, i, monitor):
         work[0, k] = sign * curve[k, axis] - offset
         bound = min(bound, work[0, k])
     if bound < monitor.worst[kind] - CLOSE:
-        value, at = lowest(work, 4, monitor.worst[kind])
+        value, at = lowest_value(work, 4, monitor.worst[kind])
         if at >= 0.0:
-            take(kind, value, t + at * h, i, -1, monitor)
+            take_if_worse(kind, value, t + at * h, i, -1, monitor)
 
 
 @jit
@@ -351,10 +352,10 @@ def watch_speed(kind, curve, low, high, t, h, i, monitor):
     greatest = -monitor.worst[kind]  # -inf at first
     if fastest <= greatest * abs(greatest):
         return
-    square(piece, -1.0, monitor.work[0])
-    _, at = lowest(monitor.work, 8, -greatest * abs(greatest))
+    squared_length(piece, -1.0, monitor.work[0])
+    _, at = lowest_value(monitor.work, 8, -greatest * abs(greatest))
     if at >= 0.0:
-        take(kind, -length_at(piece, at), t + at * h, i, -1, monitor)
+        take_if_worse(kind, -length_at(piece, at), t + at * h, i, -1, monitor)
 
 
 @jit
@@ -371,11 +372,11 @@ def clearance_of_interest(i, monitor):
 def take_clearance(value, t, i, b, above, monitor):
     """Store the clearance of agent i to obstacle b; of one ``above`` it, which may be landing, until it leaves."""
     low = monitor.low
-    take(CLEARANCE, value, t, i, b, monitor)
+    take_if_worse(CLEARANCE, value, t, i, b, monitor)
     if not above:
-        take(FLYING, value, t, i, b, monitor)
+        take_if_worse(FLYING, value, t, i, b, monitor)
     elif monitor.standing[i] != 0:
-        take(STANDING, value, t, i, b, monitor)
+        take_if_worse(STANDING, value, t, i, b, monitor)
     elif value < low[i, 0]:
         low[i, 0], low[i, 1], low[i, 2] = value, t, float(b)
 
@@ -387,7 +388,7 @@ def note_departure(i, monitor):
     if monitor.standing[i] != 0:
         monitor.standing[i] = 0
     else:
-        take(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
+        take_if_worse(FLYING, low[i, 0], low[i, 1], i, int(low[i, 2]), monitor)
         low[i, 0] = math.inf
 
 
@@ -408,7 +409,7 @@ def watch_obstacles(i, curve, t, h, last, monitor):
         far += max(0.0, box[2] - z, z - box[5]) ** 2
         if far >= (floor + span) ** 2 and floor + span > 0.0:  # far from the whole obstacle
             continue
-        value, at = nearest_box(curve, b, -1, floor, monitor.pieces, monitor.boxes)
+        value, at = distance_to_box(curve, b, -1, floor, monitor.pieces, monitor.boxes)
         if at >= 0.0:
             x_near, y_near, z_near = point_at(curve, at)
             _, _, up = box_normal(x_near, y_near, z_near, box)
@@ -438,7 +439,7 @@ def watch_step(step, p, state, monitor):
     watch_pairs(SEPARATION, monitor.pairs, points, t, h, monitor)
     watch_pairs(LOST, monitor.struck, points, t, h, monitor)
     angle = rotation_bound(points, p)
-    parts = pieces_over(angle)
+    parts = count_pieces(angle)
     h /= parts
     for part in range(parts):
         start = t + part * h
@@ -448,14 +449,14 @@ def watch_step(step, p, state, monitor):
             if not monitor.left[i]:
                 continue
             curve = monitor.curve
-            in_world(points, i, 1, p, monitor, curve)
+            world_points(points, i, 1, p, monitor, curve)
             watch_speed(SPEED, curve, 0, 3, start, h, i, monitor)
             if monitor.worst[HORIZONTAL_SPEED] > -math.inf:
                 watch_speed(HORIZONTAL_SPEED, curve, 0, 2, start, h, i, monitor)
                 watch_speed(VERTICAL_SPEED, curve, 2, 3, start, h, i, monitor)
             curve = monitor.places[i]
-            in_world(points, i, 0, p, monitor, curve)
-            enclose(curve, monitor.balls[i])
+            world_points(points, i, 0, p, monitor, curve)
+            enclose_points(curve, monitor.balls[i])
             watch_coordinate(LOWEST, curve, 2, 1.0, 0.0, start, h, i, monitor)
             watch_coordinate(HIGHEST, curve, 2, -1.0, 0.0, start, h, i, monitor)
             for f in range(monitor.fence.shape[0]):
@@ -474,31 +475,31 @@ def watch_step(step, p, state, monitor):
 
 
 @jit
-def judge_forces(values, t, p, monitor):
+def take_forces(values, t, p, monitor):
     """Take the forces of a gauge (3N + 2m or 5N + 2m,) at time t [s] into account."""
     n, edges = p.vehicles.m.shape[0], p.graph.edges
     m = edges.shape[0]
     for i in range(n):
         if monitor.left[i]:
             thrust = values[i]
-            take(THRUST, -thrust, t, i, -1, monitor)
-            take(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
-            take(ACCELERATION, -values[n + i], t, i, -1, monitor)
-            take(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
+            take_if_worse(THRUST, -thrust, t, i, -1, monitor)
+            take_if_worse(THRUST_MARGIN, p.vehicles.thrust_limit[i] - thrust, t, i, -1, monitor)
+            take_if_worse(ACCELERATION, -values[n + i], t, i, -1, monitor)
+            take_if_worse(CONSTRAINT_FORCE, -values[2 * n + i], t, i, -1, monitor)
             if values.shape[0] > 3 * n + 2 * m:
                 across, up = values[3 * n + 2 * m + i], values[4 * n + 2 * m + i]
-                take(HORIZONTAL_ACCELERATION, -across, t, i, -1, monitor)
-                take(VERTICAL_ACCELERATION, -abs(up), t, i, -1, monitor)
+                take_if_worse(HORIZONTAL_ACCELERATION, -across, t, i, -1, monitor)
+                take_if_worse(VERTICAL_ACCELERATION, -abs(up), t, i, -1, monitor)
     for k in range(m):
         pull, c = values[3 * n + k], values[3 * n + m + k]
         if -abs(pull) < monitor.worst[TENSION]:
             monitor.sign[0] = 1.0 if pull > 0.0 else -1.0
-        take(TENSION, -abs(pull), t, edges[k, 0], edges[k, 1], monitor)
-        take(CONSTRAINT, -abs(c), t, edges[k, 0], edges[k, 1], monitor)
+        take_if_worse(TENSION, -abs(pull), t, edges[k, 0], edges[k, 1], monitor)
+        take_if_worse(CONSTRAINT, -abs(c), t, edges[k, 0], edges[k, 1], monitor)
 
 
 @jit
-def worst_of(c, p, monitor):
+def worst_so_far(c, p, monitor):
     """The greatest value so far of the quantity of entry c of a gauge."""
     n, m = p.vehicles.m.shape[0], p.graph.edges.shape[0]
     of_agent = c if c < 3 * n else c - 3 * n - 2 * m  # negative of an edge
@@ -518,19 +519,19 @@ def worst_of(c, p, monitor):
 
 
 @jit
-def evaluate(t, step, p, w, state, monitor, values):
+def evaluate_forces(t, step, p, w, state, monitor, values):
     """Forces at time t [s], within a step of the trail, into a gauge."""
     trail, row = state.trail, row_of(step, state)
     x = (t - trail.clock[row, 0]) / trail.clock[row, 1]
     basis, y = monitor.basis[0], monitor.states[0]
-    weights(min(max(x, 0.0), 1.0), basis)
+    write_basis(min(max(x, 0.0), 1.0), basis)
     for q in range(y.shape[0]):
         y[q] = value_of_column(basis, trail.points[row], q)
     monitor.time[0] = t
     # The recorder contains the compiled law; without rows to write, it leaves all values in the workspace.
     call_recorder(monitor.recorder, p, w, monitor.segment, monitor.record)
     read_gauge(p, w, values)
-    judge_forces(values, t, p, monitor)
+    take_forces(values, t, p, monitor)
 
 
 @jit
@@ -547,7 +548,7 @@ def expected_excess(c, a, b, v, ta, tb, tc, p, monitor):
         return 0.0, tb
     top = 0.5 * (ta + tb) - 0.5 * left / bend
     gain = -bend * (top - tb) ** 2
-    worst = worst_of(c, p, monitor)
+    worst = worst_so_far(c, p, monitor)
     close = _CLOSE_FORCE * worst
     if p.graph.solver != 0:
         # The solver's residual makes an error of constraint forces and tensions in proportion to the greatest force.
@@ -564,7 +565,7 @@ def expected_excess(c, a, b, v, ta, tb, tc, p, monitor):
 
 
 @jit
-def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
+def search_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     """Search for the greatest forces between ta and tc, from gauges at ta < tb < tc.
 
     The law is evaluated where the parabola through three neighbouring values of an entry promises most. All entries
@@ -588,7 +589,7 @@ def look_between(before, middle, after, step, ta, tb, tc, p, w, state, monitor):
     # Entries peak at different times: the most promising one is looked at first, and all are judged there.
     for count in range(3, at.shape[0]):
         in_step = step if top <= end_time(step, state) else step + 1
-        evaluate(top, in_step, p, w, state, monitor, values[count])
+        evaluate_forces(top, in_step, p, w, state, monitor, values[count])
         # Into its place by time: values stay where they are, ``rank`` says their order.
         k = count
         while at[rank[k - 1]] > top:
@@ -624,12 +625,12 @@ def end_time(step, state):
 
 
 @jit
-def watch_middle(step, before, after, p, w, state, monitor):
+def watch_lone_step(step, before, after, p, w, state, monitor):
     """Search a step that has no neighbour, because of a jump or the end."""
     start, end = state.trail.clock[row_of(step, state), 0], end_time(step, state)
     middle, values = 0.5 * (start + end), monitor.gauge[1]
-    evaluate(middle, step, p, w, state, monitor, values)
-    look_between(before, values, after, step, start, middle, end, p, w, state, monitor)
+    evaluate_forces(middle, step, p, w, state, monitor, values)
+    search_between(before, values, after, step, start, middle, end, p, w, state, monitor)
 
 
 @jit
@@ -649,24 +650,24 @@ def watch_forces(last, p, w, state, monitor):
         if step == 0 and new:
             for c in range(before.shape[0]):
                 before[c] = trail.start[c]
-            judge_forces(before, start, p, monitor)
+            take_forces(before, start, p, monitor)
         if new:
-            judge_forces(after, end, p, monitor)
+            take_forces(after, end, p, monitor)
         if step == 0 and new:
-            watch_middle(0, before, after, p, w, state, monitor)
+            watch_lone_step(0, before, after, p, w, state, monitor)
         if step + 1 < steps:
             then, until = trail.gauge[row_of(step + 1, state)], end_time(step + 1, state)
-            look_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
+            search_between(earlier, after, then, step, start, end, until, p, w, state, monitor)
         elif last and (step > 0 or not new):
-            watch_middle(step, earlier, after, p, w, state, monitor)
+            watch_lone_step(step, earlier, after, p, w, state, monitor)
     if last or steps == 0:
         monitor.count[STAYED], state.count[TRAILED] = 0, 0
     else:
-        keep_last(steps, state, monitor)
+        keep_last_step(steps, state, monitor)
 
 
 @jit
-def keep_last(steps, state, monitor):
+def keep_last_step(steps, state, monitor):
     """Leave the last of the ``steps`` alone in the trail, and keep the forces at the end of the one before it."""
     if steps > 1:
         before = state.trail.gauge[row_of(steps - 2, state)]

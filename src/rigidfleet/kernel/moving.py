@@ -16,8 +16,8 @@ import math
 from rigidfleet.kernel.avoidance import FOLLOWED, KNOWN, UNKNOWN
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.segments import from_obstacle, from_solid, least_along
-from rigidfleet.solids.distance import displacement, is_there
+from rigidfleet.kernel.segments import least_along, point_to_obstacle, segment_to_obstacle
+from rigidfleet.solids.distance import displacement, is_present
 
 #: Standard deviations that bounds of an estimate have.
 _SIGMAS = 3.0
@@ -52,7 +52,7 @@ def predict_track(o, T, sight):
 
 
 @jit
-def correct(o, z, sight):
+def correct_track(o, z, sight):
     """Correct the track of obstacle o by a measured displacement z (3,) [m]."""
     x, P = sight.track[o], sight.spread[o]
     total = P[0] + sight.noise * sight.noise
@@ -67,7 +67,7 @@ def correct(o, z, sight):
 
 
 @jit
-def velocity(t, o, solids):
+def obstacle_velocity(t, o, solids):
     """Velocity [m/s] of obstacle o at t [s], free of the rounding that differences of places would have."""
     for k in range(solids.first[o, 3], solids.last[o, 3] - 1):
         if solids.times[k] <= t < solids.times[k + 1]:
@@ -82,7 +82,7 @@ def in_sight(o, x, y, z, r, lost, a):
     """Whether any vehicle is within sensing range of obstacle o, displaced by x, y, z [m]."""
     for i in range(r.shape[0]):
         if not lost[i]:
-            away = from_solid(r[i, 0] - x, r[i, 1] - y, r[i, 2] - z, o, a.solids, a.normal)
+            away = point_to_obstacle(r[i, 0] - x, r[i, 1] - y, r[i, 2] - z, o, a.solids, a.normal)
             if away <= a.sight.reach:
                 return True
     return False
@@ -106,7 +106,7 @@ def use_measurement(o, k, x, y, z, u, v, w, a):
             track[axis], track[3 + axis] = seen[axis], 0.0
         spread[0], spread[1], spread[2] = s.noise * s.noise, 0.0, _FIRST * _FIRST
     else:
-        correct(o, seen, s)
+        correct_track(o, seen, s)
 
 
 @jit
@@ -117,11 +117,11 @@ def update_tracks(t, r, lost, a):
     for o in range(s.moves.shape[0]):
         if s.moves[o] == 0:
             continue
-        if not is_there(t, o, a.solids):
+        if not is_present(t, o, a.solids):
             s.known[o] = UNKNOWN
             continue
         x, y, z = displacement(t, o, a.solids)
-        u, v, w = velocity(t + 0.5 * T, o, a.solids)
+        u, v, w = obstacle_velocity(t + 0.5 * T, o, a.solids)
         if s.known[o] != UNKNOWN:
             predict_track(o, T, s)
         if not s.reach < math.inf or in_sight(o, x, y, z, r, lost, a):
@@ -140,13 +140,13 @@ def update_tracks(t, r, lost, a):
 
 
 @jit
-def is_known(o, a):
+def is_obstacle_known(o, a):
     """Whether obstacle o stands still, or moves and is known."""
     return a.sight.moves[o] == 0 or a.sight.known[o] == KNOWN
 
 
 @jit
-def braking_beside(i, o, a):
+def braking_limit_beside(i, o, a):
     """Acceleration [m/s^2] with which vehicle i can always brake relative to obstacle o, which moves."""
     x = a.sight.track[o]
     speed = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
@@ -155,7 +155,7 @@ def braking_beside(i, o, a):
 
 
 @jit
-def brake_beside(i, o, v, a, out):
+def braking_acceleration_beside(i, o, v, a, out):
     """Acceleration (3,) that brakes vehicle i from a velocity v (3,) relative to obstacle o, straight, with drag.
 
     It bears the drag that the vehicle has at the obstacle's velocity, so that what is left acts on the relative one.
@@ -165,7 +165,7 @@ def brake_beside(i, o, v, a, out):
     for q in range(3):
         speed += (v[q] - x[3 + q]) ** 2
     speed = math.sqrt(speed)
-    size = min(braking_beside(i, o, a), speed * E / first) / max(speed, 1e-12)
+    size = min(braking_limit_beside(i, o, a), speed * E / first) / max(speed, 1e-12)
     for q in range(3):
         out[q] = (1.0 - E) / first * x[3 + q] - size * (v[q] - x[3 + q])
 
@@ -181,14 +181,14 @@ def way_to_rest(u, b, lag, T):
 
 
 @jit
-def clearance_beside_moving(i, o, speed, b, a):
+def margin_beside_moving(i, o, speed, b, a):
     """Distance [m] from obstacle o, which moves, to keep by the stop segment of vehicle i at a relative speed."""
     bound = a.sight.bound[o]
     return a.reach[i] + a.spare[i] + bound[0] + bound[1] * speed / b
 
 
 @jit
-def stop_beside(i, o, r, v, a):
+def write_stop_beside(i, o, r, v, a):
     """Write the relative stop segment of vehicle i to ``shifted`` 0 and 2; returns its length and relative speed."""
     x, out = a.sight.track[o], a.shifted
     speed = 0.0
@@ -196,7 +196,7 @@ def stop_beside(i, o, r, v, a):
         out[0, q], out[3, q] = r[q] - x[q] - a.lead[i, q] * x[3 + q], v[q] - x[3 + q]
         speed += out[3, q] * out[3, q]
     speed = math.sqrt(speed)
-    stop = way_to_rest(speed, braking_beside(i, o, a), a.lag[i], a.period)
+    stop = way_to_rest(speed, braking_limit_beside(i, o, a), a.lag[i], a.period)
     for q in range(3):
         out[2, q] = out[0, q] + stop / max(speed, 1e-12) * out[3, q]
     return stop, speed
@@ -224,16 +224,16 @@ def room_beside(i, v, a):
             after += end * end
             rise += way[4, q] * way[4, q]
         before, after = math.sqrt(before), math.sqrt(after)
-        stop = way_to_rest(after, braking_beside(i, o, a), a.lag[i], T)
+        stop = way_to_rest(after, braking_limit_beside(i, o, a), a.lag[i], T)
         far = T * (before + 0.5 * T * math.sqrt(rise)) + stop
-        if from_solid(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
+        if point_to_obstacle(out[0, 0], out[0, 1], out[0, 2], o, a.solids, normal) - far >= floor:
             continue
         # Three distances: of the stop segment after the tick, of the chord of the tick, and of the parabola beyond it.
         for q in range(3):
             out[2, q] = out[1, q] + stop / max(after, 1e-12) * out[2, q]
-        bound, value, _ = from_obstacle(out[1], out[2], o, a.solids, floor, normal)
+        bound, value, _ = segment_to_obstacle(out[1], out[2], o, a.solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
-        bound, value, share = from_obstacle(out[0], out[1], o, a.solids, floor, normal)
+        bound, value, share = segment_to_obstacle(out[0], out[1], o, a.solids, floor, normal)
         room = min(room, (value if value < floor else bound) - floor)
         along = rate = lift = 0.0
         for q in range(3):
@@ -263,7 +263,7 @@ def miss_distance(r, v, c, a):
         until = min(2.0 * nearing / max(fast, 1e-12), _FARTHEST)
         for k in range(1, _LOOKS + 1):
             t = max(until, a.period) * k / _LOOKS
-            away = from_solid(
+            away = point_to_obstacle(
                 r[0] - x[0] + t * (w[0] + 0.5 * t * c[0]), r[1] - x[1] + t * (w[1] + 0.5 * t * c[1]),
                 r[2] - x[2] + t * (w[2] + 0.5 * t * c[2]), o, a.solids, a.normal,
             )  # fmt: skip
@@ -275,7 +275,7 @@ def miss_distance(r, v, c, a):
 
 
 @jit
-def follow_flow(i, r, v, a):
+def steer_round_obstacles(i, r, v, a):
     """Lead what vehicle i is asked for round obstacles, as a flow round balls leads a fluid; whether it does.
 
     The law asks for a velocity V = v + a / rate. With the obstacle's velocity w, the stream U = V - w that meets a
@@ -287,10 +287,10 @@ def follow_flow(i, r, v, a):
     for q in range(3):
         ask[q] = v[q] + a.wanted[i, q] / _FLOW_RATE
     for o in range(s.moves.shape[0]):
-        if not (s.ball[o] < math.inf and is_known(o, a)):
+        if not (s.ball[o] < math.inf and is_obstacle_known(o, a)):
             continue
         x = s.track[o]
-        away = from_solid(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
+        away = point_to_obstacle(r[0] - x[0], r[1] - x[1], r[2] - x[2], o, a.solids, normal)
         size = _WIDER * (s.ball[o] + a.reach[i] + a.spare[i])
         share = 0.5 * (size / max(away + s.ball[o], size)) ** 3
         if share < _WEAK:

@@ -53,7 +53,7 @@ def estimate_acceleration(i, dt, v, net, mail):
 
 
 @jit
-def agree(l, messages, mail):
+def draw_integrals_together(l, messages, mail):
     """Draw i's integral of the edge of link l towards j's, both as when the newest message was sent."""
     share = mail.multiplier.shape[1] - 1
     part = min(TOGETHER, UNDER_WAY / max(messages, 1.0))
@@ -61,7 +61,7 @@ def agree(l, messages, mail):
 
 
 @jit
-def hold_edges(i, k, ticks, net, mail):
+def fade_silent_edges(i, k, ticks, net, mail):
     """Let go of silent neighbours of vehicle i over some time, and take hold again as smoothly.
 
     ``ticks`` is the number of ticks since the last evaluation.
@@ -73,12 +73,12 @@ def hold_edges(i, k, ticks, net, mail):
         if mail.edge[l] == NONE or mail.stamp[l] < 0:
             mail.grip[l] = 0.0
         elif mail.fresh[l]:
-            agree(l, (k - mail.stamp[l]) / net.every, mail)
+            draw_integrals_together(l, (k - mail.stamp[l]) / net.every, mail)
         mail.fresh[l] = False
 
 
 @jit
-def bring_forward(j, q, age, message, tracks, w, k1, k2):
+def extrapolate(j, q, age, message, tracks, w, k1, k2):
     """Coordinate q of where vehicle j is, how fast, and what its input accelerates it by, ``age`` [s] after a message.
 
     What it is off its slot moves on by its acceleration; the slot moves as planned, whatever the age. Without a slot,
@@ -94,7 +94,7 @@ def bring_forward(j, q, age, message, tracks, w, k1, k2):
 
 
 @jit
-def constraint_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
+def equation_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
     """Row of vehicle i's own equations for the edge of link l, from its state in w.r and w.v, and its message.
 
     Fills the unit vector from the neighbour and the right side of Eq. (12) without any constraint force; integrates the
@@ -108,8 +108,8 @@ def constraint_of_edge(row, l, k, dt, tick, p, w, net, mail, saturated):
     distance = along = square = pull = 0.0
     x, k1, k2 = rows[row, _UNIT:_RIGHT], p.control.k1, p.control.k2
     for q in range(3):
-        theirs, speed, put = bring_forward(j, q, age, heard, tracks, w, k1, k2)
-        mine, pace, _ = bring_forward(i, q, age, own, tracks, w, k1, k2)
+        theirs, speed, put = extrapolate(j, q, age, heard, tracks, w, k1, k2)
+        mine, pace, _ = extrapolate(i, q, age, own, tracks, w, k1, k2)
         # Where both are by what both know, and half of what only i knows of itself.
         x[q] = mine + FRESH * (w.r[i, q] - mine) - theirs
         pace += FRESH * (w.v[i, q] - pace) - speed
@@ -150,7 +150,7 @@ def solve_own_edges(i, k, dt, tick, p, w, net, mail, saturated):
     mu, d = p.law.mu if iterated else 0.0, 0
     for l in range(net.first[i], net.first[i + 1]):
         if mail.grip[l] > 0.0:
-            constraint_of_edge(d, l, k, dt, tick, p, w, net, mail, saturated)
+            equation_of_edge(d, l, k, dt, tick, p, w, net, mail, saturated)
             d += 1
     for q in range(3):
         w.f_C[i, q] = 0.0

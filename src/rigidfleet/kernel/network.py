@@ -12,7 +12,7 @@ _FADES, _WAITS = range(2)
 
 
 @jit
-def mix(x):
+def mix_bits(x):
     """A permutation of the integers of 32 bits without pattern (C. Wellons' lowbias32)."""
     x ^= x >> 16
     x = (x * 0x7FEB352D) & 0xFFFFFFFF
@@ -22,17 +22,17 @@ def mix(x):
 
 
 @jit
-def chance(seed, kind, link, k):
+def random_uniform(seed, kind, link, k):
     """A number in [0, 1) of a link (2,) at tick k: the same one whenever it is drawn."""
-    x = mix(seed[0] ^ kind)
-    x = mix(x ^ seed[1])
-    x = mix(x ^ link[0])
-    x = mix((x + link[1]) & 0xFFFFFFFF)
-    return mix((x + k) & 0xFFFFFFFF) / 4294967296.0
+    x = mix_bits(seed[0] ^ kind)
+    x = mix_bits(x ^ seed[1])
+    x = mix_bits(x ^ link[0])
+    x = mix_bits((x + link[1]) & 0xFFFFFFFF)
+    return mix_bits((x + k) & 0xFFFFFFFF) / 4294967296.0
 
 
 @jit
-def is_out(k, i, j, outages):
+def is_in_outage(k, i, j, outages):
     """Whether an outage keeps vehicle i from hearing j at tick k."""
     for row in range(outages.shape[0]):
         x, y, begin, end = outages[row, 0], outages[row, 1], outages[row, 2], outages[row, 3]
@@ -49,16 +49,16 @@ def send(k, S, net, mail):
         if mail.silent[j]:
             continue
         mail.count[SENT, l] += 1
-        draw = chance(net.seed, _FADES, net.links[l], k)
+        draw = random_uniform(net.seed, _FADES, net.links[l], k)
         # A chain of two states (Gilbert, Elliott): what it did last decides what the same number means.
         mail.fading[l] = draw >= net.recovers if mail.fading[l] else draw < net.worsens
         distance = 0.0
         for q in range(3):
             distance += (S[i, q] - S[j, q]) ** 2
-        if mail.fading[l] or distance > net.range**2 or is_out(k, i, j, net.outages):
+        if mail.fading[l] or distance > net.range**2 or is_in_outage(k, i, j, net.outages):
             mail.count[LOST, l] += 1
             continue
-        late = int(chance(net.seed, _WAITS, net.links[l], k) * (net.jitter + 1))
+        late = int(random_uniform(net.seed, _WAITS, net.links[l], k) * (net.jitter + 1))
         slot = (k + net.delay + late) % mail.due.shape[1]
         if mail.due[l, slot] != NONE:  # an older one that arrives at the same tick
             mail.count[HEARD, l] += 1

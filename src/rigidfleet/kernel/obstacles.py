@@ -11,27 +11,27 @@ to `bernstein.CLOSE` as well. Inside, its depth is that at five points of each s
 
 import math
 
-from rigidfleet.kernel.bernstein import nearest_box, point_at, span_of
+from rigidfleet.kernel.bernstein import ball_radius, distance_to_box, point_at
 from rigidfleet.kernel.compiler import elementwise  # noqa: F401 -- the functions of numbers below
 from rigidfleet.kernel.compiler.jit import compiled_copy, jit
 from rigidfleet.kernel.monitor import (
     clearance_of_interest,
+    count_pieces,
     find_attitudes,
-    in_world,
     note_departure,
-    pieces_over,
     rotation_bound,
     take_clearance,
+    world_points,
 )
 from rigidfleet.solids.distance import (
+    box_distance,
     displacement,
-    from_box,
     is_below,
-    is_there,
-    off_triangle,
+    is_present,
     outward_normal,
     own_axes,
     signed_distance,
+    triangle_to_point,
 )
 from rigidfleet.solids.records import HEIGHTS
 
@@ -45,25 +45,25 @@ def tangent_of_solid(x, y, z, b, triangle, s):
     if triangle < 0:
         nx, ny, nz = outward_normal(x, y, z, b, s)
         return signed_distance(x, y, z, b, s), nx, ny, nz
-    nx, ny, nz, squared = off_triangle(x, y, z, s.triangles[triangle])
+    nx, ny, nz, squared = triangle_to_point(x, y, z, s.triangles[triangle])
     away = math.sqrt(squared)
     if away == 0.0:
         return 0.0, 0.0, 0.0, 0.0
     return away, nx / away, ny / away, nz / away
 
 
-#: As `nearest_box`, of solid b or of one of its triangles.
-nearest_along = compiled_copy(nearest_box, "nearest_along", tangent_of_box=tangent_of_solid)
+#: As `distance_to_box`, of solid b or of one of its triangles.
+nearest_along = compiled_copy(distance_to_box, "nearest_along", tangent_of_box=tangent_of_solid)
 
 
 @jit
-def nearest_heights(curve, b, floor, pieces, s):
+def distance_to_heights(curve, b, floor, pieces, s):
     """The same for a height map: the least over its triangles near the curve, and inside the depth at five points."""
     best, at = floor, -1.0
-    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], span_of(curve)
+    x, y, z, span = curve[2, 0], curve[2, 1], curve[2, 2], ball_radius(curve)
     node, last = s.first[b, 0], s.last[b, 0]
     while node < last:
-        if from_box(x, y, z, s.nodes[node]) - span >= best:
+        if box_distance(x, y, z, s.nodes[node]) - span >= best:
             node = s.after[node]
             continue
         for triangle in range(s.leaf[node, 0], s.leaf[node, 1]):
@@ -81,7 +81,7 @@ def nearest_heights(curve, b, floor, pieces, s):
 
 
 @jit
-def cut(curve, start, end, work, out):
+def cut_curve(curve, start, end, work, out):
     """Control points (5, 3) of the part of a curve between two places, by its blossom."""
     for k in range(5):
         for q in range(3):
@@ -95,7 +95,7 @@ def cut(curve, start, end, work, out):
 
 
 @jit
-def into_axes(curve, t, h, b, s, out):
+def curve_in_axes(curve, t, h, b, s, out):
     """Control points (5, 3) in the axes of solid b, which moves straight from t to t + h."""
     x0, y0, z0 = displacement(t, b, s)
     x1, y1, z1 = displacement(t + h, b, s)
@@ -108,7 +108,7 @@ def into_axes(curve, t, h, b, s, out):
 
 
 @jit
-def into_own_axes(x, y, z, t, b, s):
+def point_in_axes(x, y, z, t, b, s):
     """Coordinates of a point of the world in the axes of solid b at time t [s]."""
     u, v, w = displacement(t, b, s)
     return own_axes(x - u, y - v, z - w, b, s)
@@ -130,15 +130,15 @@ def watch_solid(i, b, curve, t, h, s, monitor):
         if way < last and s.times[way] < t + h:
             end = min(stop, max((s.times[way] - t) / h, start + _SHORTEST))
         if start > 0.0 or end < 1.0:
-            cut(curve, start, end, monitor.scratch[2], part)
-            into_axes(part, t + start * h, (end - start) * h, b, s, own)
+            cut_curve(curve, start, end, monitor.scratch[2], part)
+            curve_in_axes(part, t + start * h, (end - start) * h, b, s, own)
         else:
-            into_axes(curve, t, h, b, s, own)
+            curve_in_axes(curve, t, h, b, s, own)
         x, y, z = own[2, 0], own[2, 1], own[2, 2]
         floor = clearance_of_interest(i, monitor) + radius
-        if not (floor < math.inf and far_from(x, y, z, b, s) - span_of(own) >= floor):
+        if not (floor < math.inf and distance_bound(x, y, z, b, s) - ball_radius(own) >= floor):
             if s.kind[b] == HEIGHTS:
-                value, at = nearest_heights(own, b, floor, monitor.pieces, s)
+                value, at = distance_to_heights(own, b, floor, monitor.pieces, s)
             else:
                 value, at = nearest_along(own, b, -1, floor, monitor.pieces, s)
             if at >= 0.0:
@@ -150,10 +150,10 @@ def watch_solid(i, b, curve, t, h, s, monitor):
 
 
 @jit
-def far_from(x, y, z, b, s):
+def distance_bound(x, y, z, b, s):
     """Lower bound of the distance of a point from solid b, in its axes: that from the box around it."""
     if s.leaf.shape[0] > 0 and s.last[b, 0] > s.first[b, 0]:
-        return from_box(x, y, z, s.size[b])
+        return box_distance(x, y, z, s.size[b])
     return signed_distance(x, y, z, b, s)
 
 
@@ -163,12 +163,12 @@ def watch_landing(i, curve, t, s, monitor):
     if not (monitor.standing[i] != 0 or monitor.low[i, 0] < math.inf):
         return
     for b in range(s.kind.shape[0]):
-        if not is_there(t, b, s):
+        if not is_present(t, b, s):
             continue
         u, v, w = curve[4, 0], curve[4, 1], curve[4, 2]
-        x, y, z = into_own_axes(u, v, w, t, b, s)
+        x, y, z = point_in_axes(u, v, w, t, b, s)
         near = monitor.radius[i] + monitor.pad
-        if far_from(x, y, z, b, s) > near or signed_distance(x, y, z, b, s) > near:
+        if distance_bound(x, y, z, b, s) > near or signed_distance(x, y, z, b, s) > near:
             continue
         if is_below(u, v, w, b, s):
             return
@@ -178,7 +178,7 @@ def watch_landing(i, curve, t, s, monitor):
 @jit
 def watch_step(points, start, length, p, s, monitor):
     """Take the clearances of a step from ``start`` of a ``length`` [s]: control points (5, n) of the states."""
-    curve, parts = monitor.curves[0], pieces_over(rotation_bound(points, p))
+    curve, parts = monitor.curves[0], count_pieces(rotation_bound(points, p))
     h = length / parts
     for part in range(parts):
         t = start + part * h
@@ -187,7 +187,7 @@ def watch_step(points, start, length, p, s, monitor):
         for i in range(monitor.left.shape[0]):
             if not monitor.left[i]:
                 continue
-            in_world(points, i, 0, p, monitor, curve)
+            world_points(points, i, 0, p, monitor, curve)
             for b in range(s.kind.shape[0]):
                 watch_solid(i, b, curve, t, h, s, monitor)
             if part == parts - 1:

@@ -12,7 +12,7 @@ from rigidfleet.kernel.compiler.jit import jit, jit_inline
 from rigidfleet.kernel.disturbances import contact
 from rigidfleet.kernel.fleet import thrust_of
 from rigidfleet.kernel.rigid_body import attitude_matrix, quaternion_rate
-from rigidfleet.kernel.vectors import in_vectors
+from rigidfleet.kernel.vectors import as_lanes
 from rigidfleet.solids.distance import height_below
 
 #: Rows of `SampledWork.y`.
@@ -127,7 +127,7 @@ def runge_kutta(h, commands, vehicles, around, push, work):
     the end. The quaternion is normalised after the step. Row 2 then holds the derivative at the start. Each stage takes
     all vehicles, so that rows are added eight numbers at a time.
     """
-    y, rows = work.y, in_vectors(work.y)
+    y, rows = work.y, as_lanes(work.y)
     for q in range(rows.shape[1]):
         rows[_TRIAL, q] = rows[_END, q] = rows[_START, q]
     for stage in range(4):

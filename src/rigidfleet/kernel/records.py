@@ -54,12 +54,12 @@ _NODES = 27
 KNOTS = np.linspace(0.0, 1.0, 5)
 
 
-def bernstein(x: Floats) -> Floats:
+def bernstein_basis(x: Floats) -> Floats:
     """Bernstein polynomials (..., 5) of fourth degree at x (...)."""
     return np.stack([math.comb(4, k) * x**k * (1.0 - x) ** (4 - k) for k in range(5)], axis=-1)
 
 
-FROM_KNOTS = np.linalg.inv(bernstein(KNOTS))
+FROM_KNOTS = np.linalg.inv(bernstein_basis(KNOTS))
 
 
 class Trail(NamedTuple):
@@ -109,7 +109,7 @@ class Monitor(NamedTuple):
     struck: Pairs  # of a lost agent and one still flying
     columns: Pairs  # that may fly one below the other
     count: Ints  # (1,) see `STAYED`
-    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_moves`
+    moves: Floats  # (2,) bounds of the change of any distance [m], see `monitor.bound_changes`
     recorder: int  # address of the recorder, with its arguments: `time` and `states` to evaluate at
     segment: int
     record: int
@@ -228,7 +228,7 @@ class Record(NamedTuple):
     f_D: PlacesInTime
 
 
-def recorder(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
+def new_record(k: int, n: int, m: int, *, disturbed: bool = True) -> Record:
     """Allocate a record of ``k`` samples, to be written.
 
     Unless ``disturbed``, there are no rows of what disturbances alone give.

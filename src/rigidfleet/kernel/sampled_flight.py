@@ -9,14 +9,14 @@ are evaluated at each stage, a user's force in the middle of each step, downwash
 import math
 
 from rigidfleet.kernel.aerodynamics import add_downwash, air_velocity
-from rigidfleet.kernel.attitude_control import steer
+from rigidfleet.kernel.attitude_control import command_rotors
 from rigidfleet.kernel.clock_records import OFF, RATE, SLOPE
 from rigidfleet.kernel.clocks import (
     advance_clocks,
+    drop_constraint_force,
     follow_own_clock,
-    let_go,
     post_clock,
-    take_own_slots,
+    use_own_slots,
 )
 from rigidfleet.kernel.compiler.calls import call_external, call_recorder
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
@@ -44,9 +44,9 @@ from rigidfleet.kernel.fleet import (
 )
 from rigidfleet.kernel.mail import NONE, PULL, SATURATED, SLOT, TRACKED, A, R, U, V
 from rigidfleet.kernel.neighbours import (
-    bring_forward,
     estimate_acceleration,
-    hold_edges,
+    extrapolate,
+    fade_silent_edges,
     solve_own_edges,
 )
 from rigidfleet.kernel.network import receive, send
@@ -73,7 +73,7 @@ _speed = jit_inline(speed_of)
 
 
 @jit
-def row_of(k, every, first):
+def tick_row(k, every, first):
     """Row of a table for the measurement at tick k, if the table begins with tick ``first``."""
     return k // every - (first + every - 1) // every
 
@@ -85,7 +85,7 @@ def path_at(k, i, q, tables):
 
 
 @jit
-def measure(k, flight, state):
+def measure_states(k, flight, state):
     """Measured states of all vehicles at tick k, into ``state.seen``.
 
     States are kept as what they differ from a path by. A state that is old when it is used is then added to the path of
@@ -97,7 +97,7 @@ def measure(k, flight, state):
         for q in range(6):
             state.history[now, i, q] = state.S[i, q] - path_at(k, i, q, tables)
     if k % sensing.every == 0:
-        u = row_of(k, sensing.every, tables.first)
+        u = tick_row(k, sensing.every, tables.first)
         noisy = tables.noise_r.shape[0] > 0
         for i in range(n):
             if tables.dropped.shape[0] > 0 and tables.dropped[u, i]:
@@ -162,7 +162,7 @@ def expect_drag(i, v, share, vehicles, state):
 
 
 @jit
-def take_force(k, i, dt, p, w, flight, state):
+def take_desired_force(k, i, dt, p, w, flight, state):
     """Desired force of vehicle i [N] from the law just evaluated, with what is added after it, if it is not its own."""
     vehicles, guidance, own = flight.vehicles, flight.guidance, flight.commands.kind == OWN
     m, pull = p.vehicles.m[i], 0.0
@@ -195,9 +195,9 @@ def record_if_worse(i, kind, value, t, state):
 
 
 @jit
-def know(k, t, p, w, flight, state):
+def write_knowledge(k, t, p, w, flight, state):
     """What each vehicle knows at tick k, time t [s], into w: its measured state and, by one clock, the plan."""
-    known_states(k, w, flight, state)
+    write_measured_states(k, w, flight, state)
     if not flight.clocks.own:
         evaluate_plan(t, p, w)
 
@@ -211,7 +211,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
     """
     net, mail, tick, stuck = flight.network, state.mail, flight.steps * flight.h, False
     state.work.law_time[0] = t
-    know(k, t, p, w, flight, state)
+    write_knowledge(k, t, p, w, flight, state)
     state.integral[:] = 0.0
     last = mail.multiplier.shape[1] - 1
     for i in range(state.S.shape[0]):
@@ -221,15 +221,15 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             evaluate_plan(max(t + state.tau[i, OFF], p.motion.knots[0]), p, w)
             stuck = follow_own_clock(i, k, t, p, w, flight, state)
         estimate_acceleration(i, dt, w.v[i], net, mail)
-        hold_edges(i, k, flight.every, net, mail)
+        fade_silent_edges(i, k, flight.every, net, mail)
         if flight.commands.kind == OWN:
             for q in range(3):
                 w.f_u[i, q], w.f_C[i, q] = state.f_u[i, q], 0.0
         else:
             solve_own_edges(i, k, dt, tick, p, w, net, mail, state.saturated[i])
         if stuck:
-            let_go(i, w, net, state)
-        take_force(k, i, dt, p, w, flight, state)
+            drop_constraint_force(i, w, net, state)
+        take_desired_force(k, i, dt, p, w, flight, state)
         for q in range(3):
             mail.commanded[i, q] = state.force[i, q] * p.vehicles.inverse[i]
         mail.commanded[i, 2] -= p.vehicles.g
@@ -237,7 +237,7 @@ def evaluate_by_neighbours(k, t, dt, p, w, flight, state):
             if mail.edge[l] >= 0:
                 state.integral[mail.edge[l]] += 0.5 * mail.multiplier[l, last]
     if flight.clocks.own:
-        take_own_slots(p, w, state)
+        use_own_slots(p, w, state)
 
 
 @jit
@@ -257,7 +257,7 @@ def evaluate_plan(t, p, w):
 
 
 @jit
-def known_states(k, w, flight, state):
+def write_measured_states(k, w, flight, state):
     """Measured states of vehicles at tick k, each of its own, into w.r and w.v."""
     for i in range(state.S.shape[0]):
         for q in range(3):
@@ -266,10 +266,10 @@ def known_states(k, w, flight, state):
 
 
 @jit
-def post(k, p, w, flight, state):
+def post_messages(k, p, w, flight, state):
     """Have ready what each vehicle could send at tick k: what it knows of itself, and what it does."""
     mail, row = state.mail, k % state.mail.due.shape[1]
-    known_states(k, w, flight, state)
+    write_measured_states(k, w, flight, state)
     for i in range(state.S.shape[0]):
         message, m = mail.post[row, i], p.vehicles.inverse[i]
         for q in range(3):
@@ -289,14 +289,14 @@ def post(k, p, w, flight, state):
 
 
 @jit
-def is_foreseen(j, k, p, w, flight, mail):
+def is_well_predicted(j, k, p, w, flight, mail):
     """Whether neighbours guess at tick k where vehicle j is, in w.r, well enough by its last broadcast."""
     net, since, square = flight.network, k - mail.said[j], 0.0
     if net.event == 0.0 or mail.said[j] == NONE or since >= net.longest:
         return False
     age, tracks = since * flight.steps * flight.h, p.control.kind == TRACKING
     for q in range(3):
-        place, _, _ = bring_forward(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
+        place, _, _ = extrapolate(j, q, age, mail.last[j], tracks, w, 0.0, 0.0)
         square += (w.r[j, q] - place) ** 2
     return square < net.event**2
 
@@ -307,7 +307,7 @@ def decide_broadcasts(k, p, w, flight, state):
     mail = state.mail
     for j in range(state.S.shape[0]):
         quiet = flight.vehicles.lost[j] or mail.mute[j]
-        mail.silent[j] = quiet or is_foreseen(j, k, p, w, flight, mail)
+        mail.silent[j] = quiet or is_well_predicted(j, k, p, w, flight, mail)
         if not mail.silent[j]:
             mail.said[j] = k
             for q in range(mail.last.shape[1]):
@@ -325,7 +325,7 @@ def find_desired_forces(k, t, p, w, flight, state, call):
         evaluate_law(k, t, state.seen, state.integral, p, w, flight, state, call)
         integrate_constraints(dt, state.integral, p, w, state)
         for i in range(n):
-            take_force(k, i, dt, p, w, flight, state)
+            take_desired_force(k, i, dt, p, w, flight, state)
     if p.has_frame:
         for i in range(n):
             for q in range(3):
@@ -358,7 +358,7 @@ def advance_frame(t, p, state):
 
 
 @jit
-def hear(k, flight, state):
+def receive_messages(k, flight, state):
     """Take the messages that arrive at tick k, and advance the clocks to it."""
     if flight.clocks.own:
         advance_clocks(k, flight.steps * flight.h, flight, state)
@@ -366,20 +366,20 @@ def hear(k, flight, state):
 
 
 @jit
-def tick(k, t, p, w, flight, state, call):
+def run_tick(k, t, p, w, flight, state, call):
     """Measure, desire and steer at tick k, time t [s]; returns False if the law gives no force."""
     if flight.network.every > 0:
-        hear(k, flight, state)
-    measure(k, flight, state)
+        receive_messages(k, flight, state)
+    measure_states(k, flight, state)
     due = flight.commands.kind in (FORCE, OWN) and k % flight.every == 0
     if due and not find_desired_forces(k, t, p, w, flight, state, call):
         return False
     for i in range(state.S.shape[0]):
-        state.saturated[i] = steer(k, i, flight, state)
+        state.saturated[i] = command_rotors(k, i, flight, state)
         if state.saturated[i]:
             state.saturations[i] += 1
     if flight.network.every > 0:
-        post(k, p, w, flight, state)
+        post_messages(k, p, w, flight, state)
         if k % flight.network.every == 0:
             decide_broadcasts(k, p, w, flight, state)
             send(k, state.S, flight.network, state.mail)
@@ -472,7 +472,7 @@ def write_samples(t, h, p, flight, state, call):
 
 
 @jit
-def keep_path(i, h, work, points):
+def keep_step_path(i, h, work, points):
     """Bernstein coefficients (5, 6 N) of vehicle i over a step: of the quartic through r0, v0, a0, r1, v1; its rate."""
     own = slice(17 * i, 17 * i + 17)
     first, end, rate = work.y[0, own], work.y[6, own], work.y[2, own]
@@ -538,19 +538,19 @@ def advance_fleet(t, h, p, flight, state):
         if not flight.vehicles.lost[i]:
             take_extremes(i, t, h, flight.vehicles, state)
         if kept:
-            keep_path(i, h, state.work, trail.points[row])
+            keep_step_path(i, h, state.work, trail.points[row])
         for q in range(17):
             state.S[i, q] = state.work.y[6, 17 * i + q]
     return True
 
 
 @jit
-def look(k, t, p, w, flight, state):
+def measure_for_laws(k, t, p, w, flight, state):
     """Measure at tick k, time t [s]; where vehicles follow laws of their own, have ready what they know there."""
-    measure(k, flight, state)
+    measure_states(k, flight, state)
     if flight.commands.kind == OWN:
         receive(k, flight.network, state.mail)
-        know(k, t, p, w, flight, state)
+        write_knowledge(k, t, p, w, flight, state)
 
 
 @jit
@@ -566,7 +566,7 @@ def fly_ticks(p, w, flight, state, call):
     """
     count, clock = state.count, state.clock
     if call.max_steps == 0 and count[TICKS] == count[STEPS] // flight.steps:
-        look(count[TICKS], clock[TIME], p, w, flight, state)
+        measure_for_laws(count[TICKS], clock[TIME], p, w, flight, state)
     room = state.trail.clock.shape[0]
     for _ in range(call.max_steps):
         t, step = clock[TIME], count[STEPS]
@@ -579,9 +579,9 @@ def fly_ticks(p, w, flight, state, call):
             if k >= flight.tables.last:
                 return PAUSED
             if flight.commands.kind == OWN and k % flight.every == 0 and count[ANSWERED] <= k:
-                look(k, t, p, w, flight, state)
+                measure_for_laws(k, t, p, w, flight, state)
                 return ASKS
-            if not tick(k, t, p, w, flight, state, call):
+            if not run_tick(k, t, p, w, flight, state, call):
                 return COLLAPSED
             count[TICKS] = k + 1
         grid, until = flight.start + (step + 1) * flight.h, flight.start + step * flight.h

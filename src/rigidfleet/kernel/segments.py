@@ -13,7 +13,7 @@ _STEPS = 100
 
 
 @jit
-def from_solid(x, y, z, o, solids, normal):
+def point_to_obstacle(x, y, z, o, solids, normal):
     """Signed distance [m] of a point from obstacle o, as it stands without motion; writes its gradient (3,)."""
     x, y, z = own_axes(x, y, z, o, solids)
     u, v, w = outward_normal(x, y, z, o, solids)
@@ -26,7 +26,7 @@ def from_solid(x, y, z, o, solids, normal):
 
 
 @jit
-def between_segments(p, q, r, s):
+def segment_distance(p, q, r, s):
     """Least distance [m] between the segments from p to q and from r to s (3,); Ericson 2005, section 5.1.9."""
     d0, d1, d2 = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     e0, e1, e2 = s[0] - r[0], s[1] - r[1], s[2] - r[2]
@@ -53,7 +53,7 @@ def between_segments(p, q, r, s):
 
 
 @jit
-def between_hulls(p, last, a, q, end, b, enough, x):
+def hull_distance(p, last, a, q, end, b, enough, x):
     """Least distance [m] between the hulls of p[0], p[1], p[last], a (2, 3) and of q[0], q[1], q[end], b; x (3,): work.
 
     Gilbert's algorithm on the differences of points (SIAM J. Control 4, 1966): a lower bound, exact to 1e-9 unless it
@@ -89,25 +89,25 @@ def between_hulls(p, last, a, q, end, b, enough, x):
 
 
 @jit
-def slope(p, q, x, o, solids, normal):
+def distance_and_slope(p, q, x, o, solids, normal):
     """Distance of a point at a share x of a segment from obstacle o, and its rate along it; writes the normal."""
     u, v, w = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    value = from_solid(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
+    value = point_to_obstacle(p[0] + x * u, p[1] + x * v, p[2] + x * w, o, solids, normal)
     return value, normal[0] * u + normal[1] * v + normal[2] * w
 
 
 @jit
-def from_obstacle(p, q, o, solids, enough, normal):
+def segment_to_obstacle(p, q, o, solids, enough, normal):
     """Distance of the segment from p to q (3,) from obstacle o: a lower bound, and a place near the nearest point.
 
     The distance to a convex obstacle is convex along the segment, so that it lies above its tangents. The bound is
     exact, to rounding, unless it is certain to be at least, or below, ``enough`` (NaN: always). Returns the bound, the
     distance at a share of the segment, and this share, for which ``normal`` (3,) is that of a supporting plane.
     """
-    high, falls = slope(p, q, 1.0, o, solids, normal)
+    high, falls = distance_and_slope(p, q, 1.0, o, solids, normal)
     if falls <= 0.0:
         return high, high, 1.0
-    low, rises = slope(p, q, 0.0, o, solids, normal)
+    low, rises = distance_and_slope(p, q, 0.0, o, solids, normal)
     if rises >= 0.0:
         return low, low, 0.0
     a, b = 0.0, 1.0
@@ -115,7 +115,7 @@ def from_obstacle(p, q, o, solids, enough, normal):
     for _ in range(_TANGENTS):
         x = min(max((high - low + rises * a - falls * b) / (rises - falls), a), b)
         bound = low + rises * (x - a)
-        value, rate = slope(p, q, x, o, solids, normal)
+        value, rate = distance_and_slope(p, q, x, o, solids, normal)
         if bound >= enough or value < enough or value - bound <= 1e-13:
             break
         if rate < 0.0:
@@ -126,11 +126,11 @@ def from_obstacle(p, q, o, solids, enough, normal):
 
 
 @jit
-def kept_from(p, q, o, solids, need, normal):
+def refined_segment_to_obstacle(p, q, o, solids, need, normal):
     """Distance of the segment from p to q (3,) from obstacle o: exact below ``need``, else a lower bound."""
-    kept, _, _ = from_obstacle(p, q, o, solids, need, normal)
+    kept, _, _ = segment_to_obstacle(p, q, o, solids, need, normal)
     if kept < need:
-        kept, _, _ = from_obstacle(p, q, o, solids, math.nan, normal)
+        kept, _, _ = segment_to_obstacle(p, q, o, solids, math.nan, normal)
     return kept
 
 

@@ -22,7 +22,7 @@ _CLOSE, _HALVINGS = 1e-10, 50
 
 
 @cache
-def _halving(powers: int) -> Floats:
+def _halving_matrices(powers: int) -> Floats:
     """Matrices (2, P, P) from the control points of a piece to those of its first and of its second half."""
     first = np.array([[comb(i, k) / 2.0**i for k in range(powers)] for i in range(powers)])
     return np.stack([first, first[::-1, ::-1]])
@@ -42,7 +42,7 @@ Measured = tuple[Floats, Floats, Floats]
 Measure = Callable[[Floats, Ints], Measured]
 
 
-def greatest(points: Floats, size: Callable[[Floats], Floats]) -> Greatest:
+def greatest_convex_value(points: Floats, size: Callable[[Floats], Floats]) -> Greatest:
     """Greatest value of a convex function over curves with control points (M, 3, P), to 1e-10 of the value.
 
     ``size`` maps (..., 3) to (...). A curve lies within the hull of its control points, where a convex function is
@@ -54,10 +54,10 @@ def greatest(points: Floats, size: Callable[[Floats], Floats]) -> Greatest:
         ends = sizes[:, [0, -1]]
         return ends.max(axis=1), ends.argmax(axis=1).astype(float), sizes.max(axis=1)
 
-    return greatest_of(points, measure, lambda best: _CLOSE * max(abs(best), 1e-3))
+    return greatest_by_measure(points, measure, lambda best: _CLOSE * max(abs(best), 1e-3))
 
 
-def greatest_of(
+def greatest_by_measure(
     points: Floats, measure: Measure, close: Callable[[float], float], least: float = -np.inf
 ) -> Greatest:
     """Greatest value that curves with control points (M, C, P) reach by a measure.
@@ -67,7 +67,7 @@ def greatest_of(
     """
     who, start, width = np.arange(len(points)), np.zeros(len(points)), 1.0
     best = Greatest(least, -1, 0.0)
-    halving = _halving(points.shape[-1])
+    halving = _halving_matrices(points.shape[-1])
     for _ in range(_HALVINGS):
         if not len(who):
             break

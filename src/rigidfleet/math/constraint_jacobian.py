@@ -83,14 +83,14 @@ def smallest_singular_value(r: Floats, edges: Ints, masses: ArrayLike | None = N
         parts = [r[k : k + some] for k in range(0, len(r), some)]
         return np.concatenate([smallest_singular_value(part, edges, masses) for part in parts])
     if masses is not None or len(edges) > 3 * r.shape[1]:
-        return smallest_of(jacobian(r, edges), masses)
+        return smallest_value(jacobian(r, edges), masses)
     # J J^T without J: the cosine between two edges, if they meet.
     _, i, j, u = _directions(r, edges)
     B = np.eye(r.shape[1])[i] - np.eye(r.shape[1])[j]
     return _root_of_least(u @ u.swapaxes(1, 2) * (B @ B.T))
 
 
-def smallest_of(J: Floats, masses: ArrayLike | None = None) -> Floats:
+def smallest_value(J: Floats, masses: ArrayLike | None = None) -> Floats:
     """`smallest_singular_value` (K,) of Jacobians J (K, m, 3N), m > 0."""
     if masses is not None:
         m = np.asarray(masses, dtype=float)

@@ -18,7 +18,7 @@ from rigidfleet.typing import Floats
 _SMALL, _STEPS, _CLOSE = 0.02, 60, 1e-5
 
 
-def weights(k: Floats, tau: Floats) -> tuple[Floats, Floats]:
+def drag_integrals(k: Floats, tau: Floats) -> tuple[Floats, Floats]:
     """phi [s] and psi [s^2] of a drag per mass k [1/s] and a time tau [s]."""
     x = k * tau
     far = np.maximum(x, _SMALL)
@@ -38,7 +38,7 @@ def fall_time(height: Floats, climb: Floats, k: Floats, wind: float, g: float) -
     if not np.any(k):
         return np.maximum(tau, 0.0)
     for _ in range(_STEPS):
-        phi, psi = weights(k, tau)
+        phi, psi = drag_integrals(k, tau)
         z = height + climb * phi + wind * (tau - phi) - g * psi
         speed = climb * (1.0 - k * phi) + k * phi * wind - g * phi
         pull = k * (wind - speed) - g
@@ -50,13 +50,13 @@ def fall_time(height: Floats, climb: Floats, k: Floats, wind: float, g: float) -
     return tau
 
 
-def landing(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -> Floats:
+def landing_places(r: Floats, v: Floats, tau: Floats, k: Floats, wind: Floats) -> Floats:
     """Places (..., 2) [m] as seen from above, a time (...) [s] after vehicles at r, with v (..., 3), have failed."""
-    phi = weights(k, tau)[0][..., None]
+    phi = drag_integrals(k, tau)[0][..., None]
     return r[..., :2] + v[..., :2] * phi + wind[:2] * (tau[..., None] - phi)
 
 
 def places(r: Floats, v: Floats, time: Floats, k: float, wind: Floats, g: float) -> Floats:
     """Places (K, 3) [m] at times (K,) [s] after a vehicle at r, with v (3,), has failed."""
-    psi = weights(np.full(len(time), k), time)[1][:, None]
+    psi = drag_integrals(np.full(len(time), k), time)[1][:, None]
     return r + v * time[:, None] + psi * (k * (wind - v) - g * np.array([0.0, 0.0, 1.0]))

@@ -65,7 +65,7 @@ def infinite_horizon(
     modes = np.linalg.eigvals(H)
     slowest = np.abs(modes.real).min()
     start = np.eye(len(A))
-    if not riccati.positive(W):
+    if not riccati.is_semidefinite(W):
         start = riccati.stable_subspace(H)
     elif not slowest > 1e-12 * np.abs(modes).max():
         raise ValueError(

@@ -223,7 +223,7 @@ class Margins:
     phase: float = math.nan
     delay: float = math.nan
 
-    def common(self, other: Margins) -> Margins:
+    def smaller_margins(self, other: Margins) -> Margins:
         """The smaller margins of both: those of their loops together."""
         if not (self.stable and other.stable):
             return Margins(stable=False)
@@ -264,7 +264,7 @@ def formation_loops(
     for name, count in (("lags", len(lags)), ("masses", len(m))):
         if count != n:
             raise ValueError(f"{n} agents need {n} {name}, one each, not {count}")
-    S = shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
+    S = input_shares(r, np.asarray(edges, dtype=np.int64).reshape(-1, 2), m, law)
     rigid = rigid_motions(r, m)
     Q = rigid @ rigid.T
     kinds = [(lag, axis == 2 and not lag.point) for lag in lags for axis in range(3)]
@@ -277,7 +277,7 @@ def formation_loops(
         parts = [basis.T @ part @ basis for part in parts]
     loops = []
     acting = [k for k in range(len(parts)) if k != 1 or law.control != "tracking"]
-    for V in _invariant([parts[k] for k in acting]):
+    for V in _invariant_subspaces([parts[k] for k in acting]):
         S2, Q2, *rest = (V.T @ part @ V for part in parts)
         P2 = np.stack(rest)
         present = np.abs(P2).max(axis=(1, 2)) > _ROUNDING
@@ -293,7 +293,7 @@ def tracking_loops(lags: Sequence[Lag]) -> list[Loop]:
     return [Loop(zero, zero, one, (kind,)) for kind in kinds]
 
 
-def shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
+def input_shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     """S (3N, 3N): the law's share of the input, with nearly equal filter factors made equal."""
     if not len(edges):
         return np.zeros((r.size, r.size))
@@ -310,7 +310,7 @@ def shares(r: Floats, edges: Ints, m: Floats, law: LoopGains) -> Floats:
     return (V * sigma) @ V.T
 
 
-def _invariant(matrices: list[Floats]) -> list[Floats]:
+def _invariant_subspaces(matrices: list[Floats]) -> list[Floats]:
     """Orthonormal bases (n, k) of subspaces that symmetric matrices (n, n) leave invariant; of alike ones, one.
 
     An eigenvector of a random combination lies in a single irreducible subspace but for accidents, which only
@@ -322,7 +322,7 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     turned = np.stack([V.T @ A @ V for A in matrices])
     turned[np.abs(turned) < _ROUNDING] = 0.0
     bases: dict[tuple[float, ...], Floats] = {}
-    for own in _connected(turned.any(axis=0) | np.eye(len(w), dtype=np.bool_)):
+    for own in _connected_components(turned.any(axis=0) | np.eye(len(w), dtype=np.bool_)):
         done = np.zeros((len(own), 0))
         for v in np.eye(len(own)):
             rest = v - done @ (done.T @ v)
@@ -346,7 +346,7 @@ def _invariant(matrices: list[Floats]) -> list[Floats]:
     return list(bases.values())
 
 
-def _connected(joined: Bools) -> list[Ints]:
+def _connected_components(joined: Bools) -> list[Ints]:
     """Sets of what is joined (n, n), each also with itself, directly or through others."""
     first = np.arange(len(joined))
     while ((least := np.where(joined, first, len(joined)).min(axis=1)) < first).any():
@@ -378,7 +378,7 @@ def _is_stable(loop: Loop, law: LoopGains, growth: float) -> bool:
     n = loop.S.shape[-1]
     # From F to F (1 + X), det F turns by sum arg(1 + eig X) < pi if the norm of X is below this.
     near = min(0.7, 2.5 / math.sqrt(n))
-    end = _highest(loop, law, min(0.7, 2.5 / n))  # from here on, det F turns by less than pi
+    end = _top_frequency(loop, law, min(0.7, 2.5 / n))  # from here on, det F turns by less than pi
     if end == 0.0:
         return True
 
@@ -409,7 +409,7 @@ def _is_stable(loop: Loop, law: LoopGains, growth: float) -> bool:
     return bool((np.round((rest - turned) / math.pi) == 0.0).all())
 
 
-def _highest(loop: Loop, law: LoopGains, size: float) -> float:
+def _top_frequency(loop: Loop, law: LoopGains, size: float) -> float:
     """Frequency [rad/s] from which on the norm of L is below ``size``, by an upper bound; 0 if it is nowhere above."""
     omega = np.geomspace(*_FREQUENCIES, 600)
     s = 1j * omega
@@ -469,13 +469,13 @@ def _crossings(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes, Bools]:
 
 def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
     """Frequencies (K,) [rad/s], and the logarithms (K, n) of the loci there, each continuous."""
-    end = _highest(loop, law, _FAINT)
+    end = _top_frequency(loop, law, _FAINT)
     if end <= _FREQUENCIES[0]:
         return np.zeros(0), np.zeros((0, len(loop.S)), np.complex128)
     omega = np.geomspace(_FREQUENCIES[0], end, _SAMPLES)
     values = _eigenvalues(loop.gain(1j * omega, law))
     for _ in range(12):
-        loci = _follow(np.log(np.where(values == 0, 1e-300, values)))
+        loci = _continuous_logarithms(np.log(np.where(values == 0, 1e-300, values)))
         step = np.abs(np.diff(loci, axis=0))
         # Where loci are fainter than the threshold, they turn as they please.
         step[np.maximum(loci[1:].real, loci[:-1].real) < math.log(_FAINT)] = 0.0
@@ -486,11 +486,11 @@ def _loci(loop: Loop, law: LoopGains) -> tuple[Floats, Complexes]:
         omega = np.insert(omega, coarse + 1, middle)
         values = np.insert(values, coarse + 1, _eigenvalues(loop.gain(1j * middle, law)), axis=0)
     else:
-        loci = _follow(np.log(np.where(values == 0, 1e-300, values)))
+        loci = _continuous_logarithms(np.log(np.where(values == 0, 1e-300, values)))
     return omega, loci
 
 
-def _follow(loci: Complexes) -> Complexes:
+def _continuous_logarithms(loci: Complexes) -> Complexes:
     """Logarithms (K, n), reordered and unwrapped so that each column is continuous."""
     if loci.shape[1] > 1:
         for k in range(1, len(loci)):

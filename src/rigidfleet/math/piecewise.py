@@ -65,7 +65,7 @@ class Piecewise(NamedTuple):
     def series(self, t: Floats, orders: int) -> Floats:
         """Taylor coefficients (orders, T, ...) at times (T,) [s]."""
         k = piece_at(self.time, t)
-        return series.of_polynomials(_some(self.pieces, k), t - self.time[k], orders)
+        return series.of_polynomials(_take_pieces(self.pieces, k), t - self.time[k], orders)
 
     def at(self, t: Floats) -> Floats:
         """Values (T, ...) at times (T,) [s]."""
@@ -81,10 +81,10 @@ class Piecewise(NamedTuple):
         begin, end = (series.of_polynomials(self.pieces, t, orders) for t in times)
         return series.derivatives(begin), series.derivatives(end)
 
-    def within(self, shares: Floats) -> Floats:
+    def at_shares(self, shares: Floats) -> Floats:
         """Values (K, S, ...) of each piece at shares (S,) of its time."""
         after = np.diff(self.time)[:, None] * shares
-        each = _some(self.pieces, np.repeat(np.arange(len(after)), len(shares)))
+        each = _take_pieces(self.pieces, np.repeat(np.arange(len(after)), len(shares)))
         values = series.of_polynomials(each, after.ravel(), 1)[0]
         return values.reshape(*after.shape, *values.shape[1:])
 
@@ -102,7 +102,7 @@ class Piecewise(NamedTuple):
         """The same, begun later [s]."""
         return Piecewise(self.time + start, self.pieces)
 
-    def on(self, knots: Floats, *, stays: bool = False) -> Piecewise:
+    def refine(self, knots: Floats, *, stays: bool = False) -> Piecewise:
         """The same on other knots (K' + 1,) [s], no interval of which contains one of its own.
 
         Beyond its ends the curve goes on, or ``stays`` where it begins and ends.
@@ -112,14 +112,14 @@ class Piecewise(NamedTuple):
         middle = 0.5 * (knots[:-1] + knots[1:])
         begin = np.clip(knots[:-1], self.time[0], self.time[-1]) if stays else knots[:-1]
         k = piece_at(self.time, middle)
-        pieces = about(_some(self.pieces, k), begin - self.time[k])
+        pieces = expand_about(_take_pieces(self.pieces, k), begin - self.time[k])
         if stays:
             pieces[(middle < self.time[0]) | (middle > self.time[-1]), ..., 1:] = 0.0
         return Piecewise(knots, pieces)
 
-    def cut(self, times: Floats, apart: float = 0.0) -> Piecewise:
+    def insert_knots(self, times: Floats, apart: float = 0.0) -> Piecewise:
         """The same with further knots at times that lie inside, further ``apart`` [s] from any of its own."""
-        return self.on(refine(self.time, times, apart))
+        return self.refine(refine_knots(self.time, times, apart))
 
     def part(self, first: int, last: int) -> Piecewise:
         """The pieces from a first one to before a last one."""
@@ -129,7 +129,7 @@ class Piecewise(NamedTuple):
     def between(self, start: float, end: float) -> Piecewise:
         """The part from a start to an end [s] within it."""
         inside = self.time[(self.time > start) & (self.time < end)]
-        return self.on(np.concatenate([[start], inside, [end]]))
+        return self.refine(np.concatenate([[start], inside, [end]]))
 
     def start_from(self, state: Floats, fade: float) -> Piecewise:
         """The same from another state, derivatives (4, ...), at its first knot.
@@ -142,19 +142,19 @@ class Piecewise(NamedTuple):
             return self
         ends = np.stack([off, np.zeros_like(off)], axis=1)
         extra = Piecewise.hermite(self.time[0] + np.array([0.0, fade]), ends)
-        moved = self.cut(extra.time)
+        moved = self.insert_knots(extra.time)
         pieces = pad(moved.pieces, extra.pieces.shape[-1])
         early = moved.time[:-1] < extra.time[1]
-        pieces[early] += pad(extra.on(moved.time).pieces[early], pieces.shape[-1])
+        pieces[early] += pad(extra.refine(moved.time).pieces[early], pieces.shape[-1])
         return Piecewise(moved.time, pieces)
 
-    def beside(self, other: Piecewise) -> Piecewise:
+    def stack(self, other: Piecewise) -> Piecewise:
         """The channels (..., Q, P) of two curves on the same knots as those of one."""
         powers = max(self.pieces.shape[-1], other.pieces.shape[-1])
         both = [pad(curve.pieces, powers) for curve in (self, other)]
         return Piecewise(self.time, np.concatenate(both, axis=-2))
 
-    def bernstein(self) -> Floats:
+    def control_points(self) -> Floats:
         """Control points (K, ..., P), in whose hull each piece lies."""
         powers = self.pieces.shape[-1]
         scaled = self.pieces * _widths(self.time, self.pieces) ** np.arange(powers)
@@ -181,7 +181,7 @@ def piece_at(knots: Floats, t: Floats, side: Literal["left", "right"] = "right")
     return np.minimum(np.maximum(after, 0), len(knots) - 2)  # `clip` takes far longer
 
 
-def refine(knots: Floats, times: Floats, apart: float = 0.0) -> Floats:
+def refine_knots(knots: Floats, times: Floats, apart: float = 0.0) -> Floats:
     """Knots with further ones at times that lie inside, further ``apart`` [s] from any of them."""
     inside = times[(times > knots[0]) & (times < knots[-1])]
     k = piece_at(knots, inside)
@@ -215,7 +215,7 @@ def join(curves: Sequence[Piecewise], most: float = np.inf) -> Piecewise:
     # Coefficients of one power lie side by side in memory: arithmetic on long rows is fast.
     rows = np.zeros((powers, len(knots) - 1, len(curves), *inner))
     for i, curve in enumerate(curves):
-        pieces = curve.on(knots, stays=True).pieces
+        pieces = curve.refine(knots, stays=True).pieces
         rows[: pieces.shape[-1], :, i] = np.moveaxis(pieces, -1, 0)
     return Piecewise(knots, np.moveaxis(rows, 0, -1))
 
@@ -228,7 +228,7 @@ def pad(pieces: Floats, powers: int) -> Floats:
     return np.pad(pieces, [(0, 0)] * (pieces.ndim - 1) + [(0, lacking)])
 
 
-def _some(pieces: Floats, k: Ints) -> Floats:
+def _take_pieces(pieces: Floats, k: Ints) -> Floats:
     """Pieces (k, ..., P); of many, each coefficient is a row in memory, as `series.of_polynomials` takes them."""
     if len(k) < len(pieces):
         return pieces[k]
@@ -236,7 +236,7 @@ def _some(pieces: Floats, k: Ints) -> Floats:
     return pieces.transpose(turned).take(k, axis=-1).transpose(turned)
 
 
-def about(pieces: Floats, x: Floats) -> Floats:
+def expand_about(pieces: Floats, x: Floats) -> Floats:
     """Coefficients (K, ..., P) of the same polynomials in powers of the time since x (K,) [s]."""
     return np.moveaxis(series.of_polynomials(pieces, x, pieces.shape[-1]), 0, -1)
 

@@ -188,7 +188,7 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
         r = np.where(among[:, :, None], r, np.nan)
     if n > _MANY:
         for k, points in enumerate(r):
-            least[k], pair[k] = _lowest(points, radius)
+            least[k], pair[k] = _least_headroom(points, radius)
         return least, pair
     x = np.ascontiguousarray(r.T)
     i, j = all_pairs(n)
@@ -211,7 +211,7 @@ def headroom(r: Floats, radius: ArrayLike, among: Bools | None = None) -> tuple[
     return least, pair
 
 
-def _lowest(r: Floats, radius: Floats) -> tuple[float, Ints]:
+def _least_headroom(r: Floats, radius: Floats) -> tuple[float, Ints]:
     """Least height between two of many agents (N, 3), one below the other, and the pair."""
     from scipy.spatial import KDTree
 
@@ -302,7 +302,7 @@ def obstacle_clearances(
     some = max(1, CACHED * n // max(1, r.size))
     for first in range(0, n if obstacles else 0, some):
         part = slice(first, first + some)
-        _approach(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
+        _add_obstacles(least[part], nearest[part], r[..., part, :], radius[part], obstacles, time)
     return least.T, nearest.T
 
 
@@ -322,7 +322,7 @@ def below(
     return under
 
 
-def _approach(
+def _add_obstacles(
     least: Floats,
     nearest: Ints,
     r: Floats,
@@ -360,7 +360,7 @@ def distances(
     x, y, z = distance.own_axes(x, y, z, 0, solid)
     if solid.kind[0] in _SURFACES:
         away = np.full(x.shape, np.inf)
-        near = np.flatnonzero((distance.from_box(x, y, z, solid.size[0]) < most).reshape(-1))
+        near = np.flatnonzero((distance.box_distance(x, y, z, solid.size[0]) < most).reshape(-1))
         points, flat = np.stack([x, y, z]).reshape(3, -1), away.reshape(-1)
         for first in range(0, len(near), _TOGETHER):
             some = near[first : first + _TOGETHER]
@@ -369,7 +369,7 @@ def distances(
         away = distance.signed_distance(x, y, z, 0, solid)
     if not any(map(math.isfinite, solid.there[0].tolist())):
         return away
-    there = distance.is_there(np.asarray(time, dtype=float).T, 0, solid)
+    there = distance.is_present(np.asarray(time, dtype=float).T, 0, solid)
     return np.where(there, away, np.inf)
 
 

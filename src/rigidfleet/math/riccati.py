@@ -21,7 +21,7 @@ _GROWTH = 1e4
 _STEPS = 20_000
 
 
-def positive(weight: Floats) -> bool:
+def is_semidefinite(weight: Floats) -> bool:
     """Whether a weight is positive semi-definite, to rounding."""
     return bool(np.linalg.eigvalsh(weight)[0] >= -ROUNDING * np.abs(weight).max())
 
@@ -31,7 +31,7 @@ def cost_to_go(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Float
 
     Raises ValueError if P does not exist at all times to go until the greatest, or cannot be computed.
     """
-    grows = _grows(A, G, Q, S, tau.max(initial=0.0))
+    grows = _needs_small_steps(A, G, Q, S, tau.max(initial=0.0))
     return _by_marching(A, G, Q, S, tau)[0] if grows else _by_doubling(A, G, Q, S, tau)
 
 
@@ -43,7 +43,7 @@ def costs_and_states(
     Raises ValueError as `cost_to_go` does.
     """
     tau = np.maximum(T - t, 0.0)
-    if _grows(A, G, Q, S, T):
+    if _needs_small_steps(A, G, Q, S, T):
         P, x = (part[:-1] for part in _by_marching(A, G, Q, S, np.append(tau, T)))
         return P, x
     P = _by_doubling(A, G, Q, S, tau)
@@ -59,16 +59,16 @@ def _by_doubling(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> Flo
     return 0.5 * (P + _transpose(P))
 
 
-def _grows(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
+def _needs_small_steps(A: Floats, G: Floats, Q: Floats, S: Floats, T: float) -> bool:
     """Whether a motion that no weight sees grows over T so far that only small steps keep its digits.
 
     Motions that are weighed end the growth themselves, on the way of the doublings.
     """
     if not np.linalg.eigvals(A).real.max() * T > math.log(_GROWTH):
         return False
-    if not (positive(Q) and positive(S)):
+    if not (is_semidefinite(Q) and is_semidefinite(S)):
         return False
-    rate = _rate(A, G, Q)
+    rate = _fastest_rate(A, G, Q)
     stages = np.ldexp(T, -np.arange(math.ceil(math.log2(2.0 * rate * T)) + 1))
     try:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -84,7 +84,7 @@ def _by_marching(A: Floats, G: Floats, Q: Floats, S: Floats, tau: Floats) -> tup
     Columns of x are the states that each state alone, at the greatest time to go, leads to. Raises ValueError if there
     are too many steps.
     """
-    identity, rate = np.eye(len(A)), _rate(A, G, Q)
+    identity, rate = np.eye(len(A)), _fastest_rate(A, G, Q)
     P, costs, moves = S, [], []
     steps = 0
     every, which = np.unique(tau, return_inverse=True)
@@ -123,8 +123,8 @@ def _flow(
 
     Raises ValueError if P, starting from S, does not exist at all times to go up to T.
     """
-    if positive(Q) and positive(S):
-        return np.zeros_like(Q), *_propagate(A, G, Q, tau, _rate(A, G, Q))[:3]
+    if is_semidefinite(Q) and is_semidefinite(S):
+        return np.zeros_like(Q), *_propagate(A, G, Q, tau, _fastest_rate(A, G, Q))[:3]
     # P - S starts from zero. Its Phi, W and V therefore exist exactly as long as P does.
     GS = G @ S
     A, Q = A - GS, A.T @ S + S @ A - S @ GS + Q
@@ -172,7 +172,7 @@ def stable_subspace(H: Floats) -> Floats:
     return 0.5 * (P + P.T)
 
 
-def _rate(A: Floats, G: Floats, Q: Floats) -> float:
+def _fastest_rate(A: Floats, G: Floats, Q: Floats) -> float:
     """Rate of the fastest motion of a Hamiltonian system [1/s]."""
     return float(np.abs(np.linalg.eigvals(hamiltonian(A, G, Q))).max())
 
@@ -205,7 +205,7 @@ def _propagate(
     D = -solve(identity + E[..., :n, :n], E[..., :n, :n])
     W = E[..., :n, n:] + D @ E[..., :n, n:]
     V = E[..., n:, :n] + E[..., n:, :n] @ D
-    escaped, watched = np.zeros(tau.shape, dtype=bool), not positive(Q)
+    escaped, watched = np.zeros(tau.shape, dtype=bool), not is_semidefinite(Q)
     for k in range(int(doublings.max(initial=0.0))):
         more = doublings > k
         if watched:

@@ -12,7 +12,7 @@ from rigidfleet.typing import Floats
 _FOOT = 0.3048  # [m]
 
 
-def low_altitude(height: float, wind: float) -> tuple[Floats, Floats]:
+def low_altitude_gusts(height: float, wind: float) -> tuple[Floats, Floats]:
     """Intensities (3,) [m/s] and lengths (3,) [m] of Dryden's gusts near the ground, by MIL-F-8785C.
 
     Along the wind, across and vertical, h in feet: sigma_w = 0.1 W, sigma_u = sigma_v = sigma_w / (0.177 + 0.000823
@@ -38,13 +38,13 @@ def correlate_evenly(white: Floats, correlation: float) -> Floats:
 
 def correlate_by_distance(white: Floats, points: ArrayLike, length: float) -> Floats:
     """Samples (..., N, 3) with the correlation exp(-distance / length) between agents at points (N, 3) [m]."""
-    mixing = _mixing(np.asarray(points, dtype=np.float64), length)
+    mixing = _correlation_root(np.asarray(points, dtype=np.float64), length)
     by_axis = np.moveaxis(white, -1, 0)
     mixed = by_axis.reshape(-1, len(mixing)) @ mixing.T  # one product, not many small ones
     return np.moveaxis(mixed.reshape(by_axis.shape), 0, -1)
 
 
-def _mixing(points: Floats, length: float) -> Floats:
+def _correlation_root(points: Floats, length: float) -> Floats:
     """The lower root (N, N) of the correlations."""
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     # Nearly coincident places would make the matrix singular to rounding.

@@ -15,10 +15,10 @@ import numpy as np
 from rigidfleet._common.facts import value as show
 from rigidfleet._common.quantities import QUANTITIES
 from rigidfleet.math import falls
-from rigidfleet.math.bernstein import Measure, Measured, greatest_of
+from rigidfleet.math.bernstein import Measure, Measured, greatest_by_measure
 from rigidfleet.math.piecewise import Piecewise, pad
 from rigidfleet.mission.model import Mission
-from rigidfleet.solids.polygons import Region, middle
+from rigidfleet.solids.polygons import Region, curve_middles
 from rigidfleet.typing import Bools, Floats, Ints
 
 #: How far a worst value may be from the worst of the curve: of a fence, and of a fall [m].
@@ -88,7 +88,7 @@ class Boundaries:
             _Boundary("people", k, partial(self._falls, region), CLOSE_FALL)
             for k, region in areas_of(mission, "people")
         ] + [
-            _Boundary(name, k, partial(_outside, region, kind_of[k] == "inclusion"), CLOSE)
+            _Boundary(name, k, partial(_distance_outside, region, kind_of[k] == "inclusion"), CLOSE)
             for name in ("fence", "soft_fence")
             for k, region in areas_of(mission, name)
         ]
@@ -107,7 +107,7 @@ class Boundaries:
         """Where vehicles fall to levels [m] that fail at states (K, N, 3): places (K, N, 2) [m]."""
         k = np.broadcast_to(self.k, r.shape[:2])
         tau = falls.fall_time(r[..., 2] - level, v[..., 2], k, self.wind[2], self.g)
-        return falls.landing(r, v, tau, k, self.wind)
+        return falls.landing_places(r, v, tau, k, self.wind)
 
     def ends(self, r: Floats, v: Floats) -> Floats:
         """Where these falls end (K, N, 3) [m]: on the ground, or at z = 0 without one.
@@ -130,7 +130,7 @@ class Boundaries:
     def _falls(self, region: Region, points: Floats, who: Ints) -> Measured:
         """How near people falls from curves (M, 6, P) of agents (M,) go: minus distances [m], see `Measure`."""
         levels = np.linspace(region.ceiling, region.floor, _LEVELS)
-        m, k = middle(points)[..., None], self.k[who][:, None]
+        m, k = curve_middles(points)[..., None], self.k[who][:, None]
         low, high = points.min(axis=2)[..., None], points.max(axis=2)[..., None]
 
         def times(x: Floats) -> Floats:
@@ -141,12 +141,12 @@ class Boundaries:
         first, last = (tau, tau) if points.shape[2] == 1 else (times(low), times(high))
         off = (points - m)[:, [0, 1, 3, 4]].reshape(len(m), 2, 2, -1)
         spread = np.linalg.norm(off, axis=2).max(axis=2)
-        place = falls.landing(m[:, None, :3, 0], m[:, None, 3:, 0], tau, k, self.wind)
-        away = region.across(place.reshape(-1, 2)).reshape(tau.shape) - self.radius[who][:, None]
+        place = falls.landing_places(m[:, None, :3, 0], m[:, None, 3:, 0], tau, k, self.wind)
+        away = region.distance(place.reshape(-1, 2)).reshape(tau.shape) - self.radius[who][:, None]
         blown = np.linalg.norm(self.wind[:2])
         speed = np.maximum(np.linalg.norm(m[:, 3:5], axis=1), blown)
         early = np.maximum(last - tau, tau - first)
-        reach = spread[:, :1] + spread[:, 1:] * falls.weights(k, last)[0] + speed * early
+        reach = spread[:, :1] + spread[:, 1:] * falls.drag_integrals(k, last)[0] + speed * early
 
         def least(away: Floats, way: Floats) -> Floats:
             return 0.5 * (away[:, 1:] + away[:, :-1] - way).min(axis=1)
@@ -156,9 +156,9 @@ class Boundaries:
         return -least(away, way), np.full(len(m), 0.5), -least(away - reach, more)
 
 
-def _outside(region: Region, inclusion: bool, points: Floats, _: Ints) -> Measured:
+def _distance_outside(region: Region, inclusion: bool, points: Floats, _: Ints) -> Measured:
     """How far curves (M, 6, P) are on the wrong side of a fence [m], see `Measure`."""
-    value, bound = region.most(points[:, :3], outside=inclusion)
+    value, bound = region.depth(points[:, :3], outside=inclusion)
     return value, np.full(len(value), 0.5), bound
 
 
@@ -173,7 +173,7 @@ class BoundaryWatch:
         self._waiting: list[tuple[Floats, Floats]] = []
         self._left: Bools | None = None
 
-    def take(self, clock: Floats, points: Floats, left: Bools) -> None:
+    def take_steps(self, clock: Floats, points: Floats, left: Bools) -> None:
         """Take steps with starts and lengths (S, 2) [s], and control points (S, N, 6, P) of positions and velocities.
 
         Agents ``left`` (N,) count.
@@ -195,9 +195,9 @@ class BoundaryWatch:
         for k in range(0, len(way.pieces), some):
             part = way.part(k, k + some)
             both = part, part.rate()
-            points = [Piecewise(x.time, pad(x.pieces, powers)).bernstein() for x in both]
+            points = [Piecewise(x.time, pad(x.pieces, powers)).control_points() for x in both]
             clock = np.column_stack([part.time[:-1], np.diff(part.time)])
-            self.take(clock, np.concatenate(points, axis=2), left)
+            self.take_steps(clock, np.concatenate(points, axis=2), left)
 
     def search(self) -> dict[str, Worst]:
         """The worst values of all steps so far, by quantity."""
@@ -235,7 +235,7 @@ class BoundaryWatch:
             ) -> Measured:
                 return x.measure(p, who[curve])
 
-            peak = greatest_of(points[step, who], measure, lambda _, x=x: x.close, least)
+            peak = greatest_by_measure(points[step, who], measure, lambda _, x=x: x.close, least)
             if peak.curve >= 0:
                 t, h = clock[step[peak.curve]].tolist()
                 self._keep(x, peak.value, t + peak.place * h, int(agents[who[peak.curve]]))

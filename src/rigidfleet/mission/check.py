@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import MOTIONS
 from rigidfleet.errors import MissionError
-from rigidfleet.formation.graphs import count_within
+from rigidfleet.formation.graphs import count_pairs_within
 from rigidfleet.formation.shapes import SHAPES
 from rigidfleet.mission import (
     avoidance,
@@ -31,7 +31,7 @@ from rigidfleet.mission import (
 )
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, look_up, model_of, suggest_shape
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key
 from rigidfleet.mission.schema import Agents, Contents, MissionHeader, Regulator, Start, Tracking
 
 #: Models of the single tables. Obstacles, phases, fences and people are arrays of tables.
@@ -64,7 +64,7 @@ def checked_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
     """
     m = Draft(data, origin, defaults())
     m.n = _count(data)
-    m.keep((), _sizes(m))
+    m.record_breaches((), _sizes(m))
     if m.findings:  # the other checks would take long
         raise MissionError(m.findings)
     _tables(m)
@@ -89,7 +89,7 @@ def checked_parts(data: Mapping[str, Any], origin: str) -> dict[str, Any]:
         (("agents", "fixed"), _fixed_agents),
         ((), avoidance.rules),
     ):
-        m.keep(path, rules(m))
+        m.record_breaches(path, rules(m))
     if m.findings:
         raise MissionError(m.findings)
     return m.parts
@@ -156,7 +156,7 @@ def _with_points(m: Draft, agents: Any) -> Any:
     if not isinstance(position, dict):
         return agents
     start = m.validate(Start, position, path)
-    if start is None or not m.right((), "agents"):
+    if start is None or not m.is_valid((), "agents"):
         return None
     try:
         points = start.points()
@@ -188,10 +188,10 @@ def _agents(m: Draft) -> Breaches:
     if agents is None:
         return
     for key in ("mass", "velocity", "radius", "thrust_limit"):
-        yield from m.one_each(agents, key)
+        yield from m.one_per_agent(agents, key)
     # Without a formation, nothing divides by distances: the start may be one that others flew.
     shaped = look_up(m.data, ("formations",))
-    for i, j in formations.coincident(agents.position) if shaped else ():
+    for i, j in formations.coincident_pairs(agents.position) if shaped else ():
         problem = f"agents {i + 1} and {j + 1} start at the same point"
         yield Breach(("position", j), problem, "move them apart", agents.position[j])
     if max(agents.mass, default=1.0) > bounds.MASS_RATIO * min(agents.mass, default=1.0):
@@ -203,7 +203,7 @@ def _agents(m: Draft) -> Breaches:
     if math.inf in (written if isinstance(written, list) else [written]):
         yield Breach("thrust_limit", "is not finite", "omit it for no limit")
     unlimited = all(math.isinf(limit) for limit in agents.thrust_limit)
-    if agents.saturate and unlimited and m.right(("agents",), "thrust_limit"):
+    if agents.saturate and unlimited and m.is_valid(("agents",), "thrust_limit"):
         yield Breach("saturate", "no limit to saturate at is given", "give thrust_limit [N]")
 
 
@@ -212,7 +212,7 @@ def _fixed_agents(m: Draft) -> Breaches:
     if m.findings or not m.agents.fixed:
         return
     agents, d = m.agents, m.disturbances
-    yield from phases.members(m, agents.fixed)
+    yield from phases.agents_exist_once(m, agents.fixed)
     lost = d is not None and d.lost
     n, solver = len(agents.position), m.constraint.solver
     for wrong, problem, remedy in (
@@ -236,7 +236,7 @@ def _touching(m: Draft) -> Breaches:
         slots = form.slot_array(n)
         places |= {} if slots is None else {f"in '{name}'": slots}
     for where, points in places.items():
-        pairs = count_within(points, 2 * max(agents.radius))
+        pairs = count_pairs_within(points, 2 * max(agents.radius))
         if pairs > bounds.TOUCHING:
             problem = (
                 f"with the largest radius, {pairs:,} pairs of agents touch {where};"
@@ -252,7 +252,7 @@ def _gains(m: Draft) -> Breaches:
     c = m.constraint
     if c.stabilisation == "none":
         return
-    if not m.right(("constraint",), "stabilisation", "alpha", "beta", "gamma"):
+    if not m.is_valid(("constraint",), "stabilisation", "alpha", "beta", "gamma"):
         return
     poles = "three poles at -p: alpha = 1.5 p, beta = sqrt(3) p, gamma = p^3"
     for key, needed in (("alpha", "> 0"), ("beta", "> 0"), ("gamma", ">= 0")):
@@ -261,7 +261,7 @@ def _gains(m: Draft) -> Breaches:
             remedy = f"use a stable gain ({poles}) or stabilisation = 'none' for no feedback"
             yield Breach(key, f"is unstable, must be {needed}", remedy, gain)
     bound = 2 * c.alpha * c.beta**2
-    if bound <= c.gamma and m.right(("constraint",), "alpha", "beta"):
+    if bound <= c.gamma and m.is_valid(("constraint",), "alpha", "beta"):
         problem = f"is unstable, must be below 2 alpha beta^2 = {bound:.6g}"
         yield Breach("gamma", problem, f"lower gamma or raise alpha or beta ({poles})", c.gamma)
 
@@ -277,7 +277,7 @@ def _regulators(m: Draft) -> Breaches:
     keys = ("horizon", "Q", "S")
     for weights, below in ((m.lqr, ()), (m.lqr.attitude, ("attitude",))):
         path = ("lqr", *below)
-        if m.right(("lqr",), *keys) and m.right(path, *keys):
+        if m.is_valid(("lqr",), *keys) and m.is_valid(path, *keys):
             if weights.horizon == "infinite" and weights.Q[0] < _NO_WEIGHT:
                 problem = (
                     f"an infinite horizon needs a weight of at least {_NO_WEIGHT:g} on the error"
@@ -288,7 +288,7 @@ def _regulators(m: Draft) -> Breaches:
                 problem = "with Q and S zero the regulator does nothing"
                 remedy = "for example, give S = [1e3, 1e2]"
                 yield Breach((*below, "S"), problem, remedy, weights.S)
-        if m.right(("lqr",), "R") and m.right(path, "R"):
+        if m.is_valid(("lqr",), "R") and m.is_valid(path, "R"):
             inherited = look_up(m.data, (*path, "R")) is None
             yield from _bounded_gains(weights, () if inherited else below, ".".join(path))
 
@@ -306,14 +306,14 @@ def _tracking(m: Draft) -> Breaches:
     if m.tracking.Q[0] < _NO_WEIGHT:
         problem = f"tracking needs a weight of at least {_NO_WEIGHT:g} on the position error"
         yield Breach("Q", problem, "for example, give Q = [4.0, 4.0]")
-    if m.right(("tracking",), "Q"):
+    if m.is_valid(("tracking",), "Q"):
         yield from _bounded_gains(m.tracking, (), "tracking")
 
 
 def _allocation(m: Draft) -> Breaches:
     """The torque is divided by the method that divides it."""
-    if m.right(("allocation",), "method"):
-        yield from idle(m.allocation, "torque_split", "method", "pinv")
+    if m.is_valid(("allocation",), "method"):
+        yield from idle_key(m.allocation, "torque_split", "method", "pinv")
 
 
 def _limits(m: Draft) -> Breaches:
@@ -335,13 +335,13 @@ def _limits(m: Draft) -> Breaches:
 def _yaw(m: Draft) -> Breaches:
     """The yaw of vehicles has what its kind needs, and no more."""
     yaw = m.yaw
-    if not m.right(("yaw",), "kind", "yaw_deg", "point"):
+    if not m.is_valid(("yaw",), "kind", "yaw_deg", "point"):
         return
     if yaw.kind == "towards" and yaw.point is None:
         remedy = "add point: the point to look at, [x, y, z] [m]"
         yield Breach("point", "is missing", remedy)
     for key, kind in (("yaw_deg", "fixed"), ("point", "towards")):
-        yield from idle(yaw, key, "kind", kind)
+        yield from idle_key(yaw, key, "kind", kind)
 
 
 def _corners(box: Any, below: Keys) -> Breaches:
@@ -357,11 +357,11 @@ def _obstacles(m: Draft) -> Breaches:
     things = []
     for k, data in enumerate(m.tables("obstacles")):
         path = ("obstacles", k)
-        if (kind := m.kind(data, path, obstacles.KINDS)) is None:
+        if (kind := m.model_of_kind(data, path, obstacles.KINDS)) is None:
             continue
         name = "ground" if kind is obstacles.Ground else f"{data['kind']} {k + 1}"
         if (thing := m.validate(kind, data, path, {"name": name})) is not None:
-            m.keep(path, obstacles.rules(m, thing, path))
+            m.record_breaches(path, obstacles.rules(m, thing, path))
             if isinstance(thing, obstacles.Box):
                 yield from _corners(thing, path)
             things.append(thing)
@@ -375,10 +375,10 @@ def _areas(m: Draft) -> Breaches:
         for k, data in enumerate(m.tables(table)):
             path = (table, k)
             if (area := m.validate(kind, data, path, {"name": f"{word} {k + 1}"})) is not None:
-                m.keep(path, fences.rules(m, area, path))
+                m.record_breaches(path, fences.rules(m, area, path))
                 areas.append(area)
         m.parts[table] = tuple(areas)
-    if m.people and m.right((), "gravity") and m.gravity < 1.0:
+    if m.people and m.is_valid((), "gravity") and m.gravity < 1.0:
         yield Breach(
             "gravity", "is too low for falls onto people", "raise it, or remove [[people]]"
         )

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rigidfleet.mission.rules import Breach, Breaches, Draft, idle
+from rigidfleet.mission.rules import Breach, Breaches, Draft, idle_key
 from rigidfleet.mission.schema import Disturbances, Gusts
 from rigidfleet.mission.vehicles import NOT_SAMPLED
 from rigidfleet.typing import Floats
@@ -36,9 +36,9 @@ def gust_step(gusts: Gusts, wind: float) -> float:
 def intensity(gusts: Gusts, wind: float) -> Floats:
     """Standard deviations (3,) of gusts [m/s]: along a steady wind of a given speed [m/s], across it, and vertical."""
     if gusts.intensity is None:
-        from rigidfleet.math.turbulence import low_altitude
+        from rigidfleet.math.turbulence import low_altitude_gusts
 
-        return low_altitude(gusts.altitude or 0.0, wind)[0]
+        return low_altitude_gusts(gusts.altitude or 0.0, wind)[0]
     return np.broadcast_to(np.array(gusts.intensity, dtype=np.float64), 3)
 
 
@@ -48,16 +48,16 @@ def rules(m: Draft) -> Breaches:
     if d is None:
         return
     for key in ("drag", "mass_error"):
-        yield from m.one_each(d, key, alone=", or a single number")
+        yield from m.one_per_agent(d, key, alone=", or a single number")
     drag = d.drag if isinstance(d.drag, tuple) else (d.drag,)
     if (any(d.wind) or d.gusts is not None) and not any(c is None or c > 0 for c in drag):
         problem = "without drag, wind and gusts have no effect"
         yield Breach("drag", problem, "give a drag > 0 [N s/m] or omit it")
-    if d.gusts is not None and m.right(_GUSTS, "model"):
-        m.keep(_GUSTS, _gusts(m, d.gusts, any(d.wind)))
+    if d.gusts is not None and m.is_valid(_GUSTS, "model"):
+        m.record_breaches(_GUSTS, _gusts(m, d.gusts, any(d.wind)))
     noise, keys = d.noise, ("position", "velocity", "delay", "dropped")
     silent = noise is not None and not any(getattr(noise, key) for key in keys)
-    if silent and m.right((_TABLE, "noise"), *keys):
+    if silent and m.is_valid((_TABLE, "noise"), *keys):
         yield Breach("noise", "is zero", "give position [m] or velocity [m/s] > 0")
     if m.flies_vehicles:
         return
@@ -76,7 +76,7 @@ def _gusts(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         if gusts.time_scale is None:
             yield Breach("time_scale", "is missing", "add the correlation time of the gusts [s]")
         for key in ("length", "altitude", "airspeed"):
-            yield from idle(gusts, key, "model", "dryden")
+            yield from idle_key(gusts, key, "model", "dryden")
         if gusts.intensity is None:
             yield Breach("intensity", "is missing", spread)
     else:
@@ -88,7 +88,7 @@ def _gusts(m: Draft, gusts: Gusts, wind: bool) -> Breaches:
         if gusts.length is gusts.altitude is None:
             remedy = "add length [m], or altitude [m] to derive it"
             yield Breach("length", "is missing", remedy)
-        if gusts.airspeed is None and not wind and m.right((_TABLE,), "wind"):
+        if gusts.airspeed is None and not wind and m.is_valid((_TABLE,), "wind"):
             problem = "is missing, and there is no wind to replace it"
             yield Breach("airspeed", problem, "add airspeed [m/s] or wind")
         if gusts.intensity is None and (gusts.altitude is None or not wind):

@@ -14,7 +14,7 @@ from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys
 from rigidfleet.mission.rules import Breach, Breaches, Draft
 from rigidfleet.mission.values import Coordinate, Flag, Part, key, required_key
-from rigidfleet.solids.polygons import Region, some_cross
+from rigidfleet.solids.polygons import Region, edges_cross
 from rigidfleet.typing import Floats
 
 #: Farthest corner from the origin [m]: beyond, longitude and latitude are taken to be swapped, or the origin wrong.
@@ -120,11 +120,11 @@ def rules(m: Draft, area: Area, path: Keys) -> Breaches:
     ways = [name for name in ("polygon", "coordinates", "file") if getattr(area, name) is not None]
     if area.file is not None:
         yield Breach("file", NOT_A_FILE, "load the mission from its file, or give coordinates")
-    elif len(ways) != 1 and m.right(path, "polygon", "coordinates"):
+    elif len(ways) != 1 and m.is_valid(path, "polygon", "coordinates"):
         problem = "is missing" if not ways else "is given together with coordinates"
         yield Breach("polygon", problem, "give one of polygon, coordinates and file", None)
     elif area.coordinates is not None and m.geodetic_origin is None:
-        if m.right((), "geodetic_origin"):
+        if m.is_valid((), "geodetic_origin"):
             remedy = "add [geodetic_origin] with latitude_deg and longitude_deg, or give metres"
             yield Breach("coordinates", "needs to know where the mission's origin is", remedy, None)
     elif ways:
@@ -153,14 +153,14 @@ def flaw(polygons: Sequence[Sequence[Floats]]) -> tuple[str, str] | None:
     edges = Region.of_rings(rings).edges
     if (np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1) < bounds.LENGTH.least).any():
         return "has two corners in a row at one place", "give each corner once"
-    if some_cross(edges):
+    if edges_cross(edges):
         return "has edges that cross", "give the corners in their order; polygons may not overlap"
 
     if any(_width(ring) < _NARROW for ring in rings):
         return "bounds no area: its corners lie on a line", "give corners around it"
     areas = [Region.of_rings([ring]) for ring in rings]
     some = [ring[:: max(1, len(ring) // _SOME)] for ring in rings]  # all are on the same side
-    inside = np.array([[x.across(r).min() < -_INSIDE for x in areas] for r in some])
+    inside = np.array([[x.distance(r).min() < -_INSIDE for x in areas] for r in some])
     first = np.cumsum([0, *(len(polygon) for polygon in polygons)])
     # In a polygon, and not in its holes, an odd number of rings is around.
     odd = inside.sum(axis=1) % 2 == 1

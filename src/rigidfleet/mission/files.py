@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.toml import text_says, to_toml
+from rigidfleet._common.toml import text_has_data, to_toml
 from rigidfleet.errors import Finding, MissionError, TrajectoryError
 from rigidfleet.mission import bounds
-from rigidfleet.mission.text import unread
+from rigidfleet.mission.text import read_error
 
 #: What stands before the digest of a file.
 _DIGEST = "SHA-256 "
@@ -90,7 +90,7 @@ def with_files(data: dict[str, Any], text: str, path: Path) -> tuple[dict[str, A
             named.table["colour"] = [*colours]
             put += f"\ncolour = {json.dumps(colours)}"
         text = line.sub(lambda m, put=put: m[1] + put, text, count=1)
-    if digests and not text_says(text, data):  # where a file is named within a line
+    if digests and not text_has_data(text, data):  # where a file is named within a line
         text = "".join(digests) + to_toml(data)
     return data, text
 
@@ -206,7 +206,7 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
         raise _file_error(name, "", error) from None
     for doubt in read.notes:
         if isinstance(doubt, Doubt):
-            raise unread(
+            raise read_error(
                 name, doubt, "say units or axes beside the file: units = 'ms', axes = 'ned'"
             )
     curves, notes = [*read.curves], [*read.notes]
@@ -217,10 +217,10 @@ def _read_trajectories(_: bytes, name: str, *, yaw: bool, said: dict[str, str]) 
         curves = [least_jerk_curve(c.between(begin, end)) for c in curves]
     else:
         begin = min(c.time[0] for c in curves)
-        curves = [c.on(np.union1d(begin, c.time), stays=True) for c in curves]
+        curves = [c.refine(np.union1d(begin, c.time), stays=True) for c in curves]
     if yaw and any(np.isnan(curve.pieces[:, 3]).any() for curve in curves):
         why = next((note for note in read.notes if "yaw" in note), "has no yaw")
-        raise unread(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
+        raise read_error(name, why, "remove yaw = 'file', or give a file with a yaw and its unit")
     rows = [curve_to_rows(c._replace(pieces=np.nan_to_num(c.pieces))) for c in curves]
     return Content(rows, notes=notes)
 
@@ -231,7 +231,7 @@ _NOWHERE, _MARK = 9000.0, -999.0
 FILL = "fill the cells, for example from their neighbours, or cut the map"
 
 
-def without_data(heights: Any) -> str:
+def missing_cells(heights: Any) -> str:
     """Where heights (I, J) [m] have cells without data, as elevation models mark them (NaN, -9999, -32768, ...)."""
     z = np.asarray(heights, dtype=float)
     cells = np.argwhere(~(np.abs(z) < _NOWHERE) | (z == _MARK))
@@ -259,13 +259,13 @@ def _read_heights(data: bytes, name: str) -> Content:
         heights = np.asarray(heights, dtype=float)
     except (ValueError, EOFError, OSError):
         remedy = "give rows of equal length, separated by commas, or an NPY array"
-        raise unread(name, "is not a table of numbers", remedy) from None
-    if heights.ndim == 2 and (why := without_data(heights)):
-        raise unread(name, why, FILL)
+        raise read_error(name, "is not a table of numbers", remedy) from None
+    if heights.ndim == 2 and (why := missing_cells(heights)):
+        raise read_error(name, why, FILL)
     if heights.ndim != 2 or not heights.size:
         remedy = "give two or more rows of heights [m]"
-        raise unread(name, "is not a table of numbers", remedy)
+        raise read_error(name, "is not a table of numbers", remedy)
     if heights.size > bounds.HEIGHTS:
         problem = f"has {heights.size:,} heights; the maximum is {bounds.HEIGHTS:,}"
-        raise unread(name, problem, "use a coarser grid")
+        raise read_error(name, problem, "use a coarser grid")
     return Content(heights.tolist())

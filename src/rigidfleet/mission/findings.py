@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
-from rigidfleet._common.renamed import successor
+from rigidfleet._common.renamed import rename_hint
 from rigidfleet._common.toml import toml_key
 from rigidfleet.errors import Finding
 from rigidfleet.formation.shapes import POLYGONS, SHAPES
@@ -66,7 +66,7 @@ class FindingCollector:
         key = _key_path(path)
         if (key, problem) in self._findings:
             return
-        kind = _kind(path, problem)
+        kind = _counting_key(path, problem)
         if problem == _UNKNOWN or _ANY in kind:
             self._told[kind] += 1
             if self._told[kind] > _TOLD:
@@ -76,10 +76,10 @@ class FindingCollector:
 
     def add_unknown_key(self, path: Keys, known: Iterable[str]) -> None:
         """Record an unknown key of a table. Only the first ones get a suggestion, as finding one takes long."""
-        guess = self._told[_kind(path, _UNKNOWN)] < _TOLD
+        guess = self._told[_counting_key(path, _UNKNOWN)] < _TOLD
         self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
 
-    def right(self, path: Keys, *keys: str) -> bool:
+    def is_valid(self, path: Keys, *keys: str) -> bool:
         """Whether there is no finding so far at or below these keys of a table."""
         return not self._wrong or not any((*path, key) in self._wrong for key in keys)
 
@@ -91,8 +91,8 @@ class FindingCollector:
         self.add((key,), "must be an array of tables", f"write [[{key}]] above each table")
         return []
 
-    def kind(self, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
-        """Return the model for the `kind` of a table, or None with a finding."""
+    def model_of_kind(self, data: Any, path: Keys, kinds: Mapping[str, type[Any]]) -> Any:
+        """Return the model for the `model_of_kind` of a table, or None with a finding."""
         choice = f"use one of {', '.join(kinds)}"
         if not isinstance(data, dict):
             self.add(path, "must be a table", f"write [[{path[0]}]] above it")
@@ -120,7 +120,7 @@ class FindingCollector:
         except ValidationError as error:
             errors = error.errors(include_url=False)
         for error in errors:
-            self._structural(error, kind, path)
+            self._add_structural_error(error, kind, path)
         wrong = {error["loc"][0] for error in errors}
         rest = {key: value for key, value in data.items() if key not in wrong}
         needed = {key for key, field in kind.model_fields.items() if field.is_required()}
@@ -130,7 +130,7 @@ class FindingCollector:
         except ValidationError:
             return None
 
-    def _structural(self, error: Any, kind: type[Part], prefix: Keys) -> None:
+    def _add_structural_error(self, error: Any, kind: type[Part], prefix: Keys) -> None:
         """Record one of pydantic's errors."""
         here, path, owner, inner = look_up(self.data, prefix, {}), prefix, kind, kind
         for step in error["loc"]:
@@ -187,7 +187,7 @@ def suggest_shape(word: object) -> str:
 def unknown_key(key: object, known: Iterable[str]) -> tuple[str, str]:
     """Problem and remedy of an unknown key."""
     names = list(known)
-    suggestion = successor(key) or suggest(key, names)
+    suggestion = rename_hint(key) or suggest(key, names)
     return _UNKNOWN, suggestion or f"remove it; known keys: {', '.join(names)}"
 
 
@@ -200,7 +200,7 @@ def _key_path(path: Keys) -> str:
     return "".join(map(step, path)).removeprefix(".")
 
 
-def _kind(path: Keys, problem: str) -> Keys:
+def _counting_key(path: Keys, problem: str) -> Keys:
     """Key by which findings are counted: their path with any index, and one key for all unknown keys of a table."""
     path = path[:-1] if problem == _UNKNOWN else path
     return tuple(_ANY if isinstance(step, int) else step for step in path)
@@ -237,7 +237,7 @@ def _problem_and_remedy(error: Any, path: Keys, owner: type[Part]) -> tuple[str,
             return "is missing", f"add {meaning or name}"
         case "literal_error":
             words = _words(context["expected"])
-            suggestion = successor(name, error["input"]) or suggest(error["input"], words)
+            suggestion = rename_hint(name, error["input"]) or suggest(error["input"], words)
             usual = "none" if error["input"] in _OFF and "none" in words else words[0]
             return f"must be {context['expected']}", suggestion or f"use {usual}"
         case "greater_than_equal" if 0 < context["ge"] < 1 and not error["input"] > 0:

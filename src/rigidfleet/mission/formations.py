@@ -26,12 +26,12 @@ _DARK = "#000000"
 _MOST_CLIQUES = 5e6
 
 
-def sound(m: FindingCollector, name: str) -> bool:
+def is_sound(m: FindingCollector, name: str) -> bool:
     """Whether a formation has no findings."""
-    return m.right(("formations",), name)
+    return m.is_valid(("formations",), name)
 
 
-def coincident(points: ArrayLike) -> list[tuple[int, int]]:
+def coincident_pairs(points: ArrayLike) -> list[tuple[int, int]]:
     """Pairs (first, later) of points (N, 3) [m] that are closer than half the smallest length."""
     p, apart = np.asarray(points, dtype=np.float64), bounds.LENGTH.least / 2
     if len(p) < 2:
@@ -72,7 +72,7 @@ def rules(m: Draft) -> Breaches:
         path = ("formations", name)
         if (form := m.validate(Formation, data, path)) is not None:
             m.formations[name] = form
-            m.keep(path, _formation(m, form, name))
+            m.record_breaches(path, _formation(m, form, name))
 
 
 def _formation(m: Draft, form: Formation, name: str) -> Breaches:
@@ -80,7 +80,7 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
     path, n = ("formations", name), m.n
     if n is not None and (form.rest is not None or form.agents is not None):
         m.formations[name] = form = yield from _with_rest(m, form, n, path)
-    right = m.right(path, "shape", "size", "slots", "distances")
+    right = m.is_valid(path, "shape", "size", "slots", "distances")
     if form.shape is not None and form.slots is not None:
         yield Breach("slots", "a shape has its own slots", "give either shape and size or slots")
     if right and form.shape is None and form.size is not None:
@@ -105,7 +105,7 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
             fewer = ", or rest = 'sides' for the others" if len(form.slots) < n else ""
             remedy = f"give one slot per agent, {n} in all{fewer}"
             yield Breach("slots", f"has {len(form.slots)} slots for {n} agents", remedy, None)
-        for i, j in coincident(form.slots):
+        for i, j in coincident_pairs(form.slots):
             yield Breach(("slots", j), f"is the same point as slot {i + 1}", "move the slots apart")
     if form.tolerance is not None and "tolerance_share" in form.model_fields_set:
         problem = "has no effect beside tolerance, which is in metres"
@@ -113,11 +113,11 @@ def _formation(m: Draft, form: Formation, name: str) -> Breaches:
     if isinstance(form.colour, tuple) and len(form.colour) != n:
         problem = f"has {len(form.colour)} colours for {n} agents"
         yield Breach("colour", problem, "give one colour, or one per slot", None)
-    if m.right(path, "edges"):
+    if m.is_valid(path, "edges"):
         yield from _edges(m, form, n, path)
-    if form.distances is not None and m.right(path, "edges", "distances"):
+    if form.distances is not None and m.is_valid(path, "edges", "distances"):
         yield from _distances(form, form.distances, n)
-    if (form.dimension or m.data.get("dimension")) == 2 and sound(m, name):
+    if (form.dimension or m.data.get("dimension")) == 2 and is_sound(m, name):
         slots = form.slot_array(n)
         if slots is not None and distance_geometry.dimension(slots) > 2:
             problem = "the slots do not lie in a plane, but the dimension is 2"
@@ -137,7 +137,7 @@ def _with_rest(m: Draft, form: Formation, n: int, path: Keys) -> Generator[Breac
             yield Breach("agents", f"is more than the {n} agents", "give fewer")
             return form
         yield from _shape(m, form, form.shape, form.agents, path)
-        if not m.right(path, "shape", "size"):
+        if not m.is_valid(path, "shape", "size"):
             return form
         made = form.slot_array(form.agents)
         assert made is not None  # a shape has them
@@ -176,7 +176,7 @@ def _shape(m: Draft, form: Formation, shape: str, n: int | None, path: Keys) -> 
     if shape not in shapes.SHAPES:
         yield Breach("shape", "unknown shape", suggest_shape(shape))
     elif form.size is None:
-        if m.right(path, "size"):
+        if m.is_valid(path, "size"):
             yield Breach("size", "is missing", "add size, the edge length [m]")
     elif n is not None:
         try:
@@ -214,7 +214,7 @@ def _graph(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
         yield Breach("reach", f"has no effect with edges '{form.edges}'", "remove it")
     if form.edges == "complete":
         return
-    right = m.right(path, "shape", "size", "slots")
+    right = m.is_valid(path, "shape", "size", "slots")
     if form.distances is not None or (right and form.shape is form.slots is None):
         remedy = "list the pairs, or give shape and size and omit distances"
         yield Breach("edges", "needs slots, and takes its distances from them", remedy)
@@ -224,7 +224,7 @@ def _graph(m: Draft, form: Formation, n: int, path: Keys) -> Breaches:
     slots = form.slot_array(n)
     assert slots is not None  # there are a shape or slots
     if form.edges == "neighbours":
-        many = graphs.count_neighbours(slots, form.reach)
+        many = graphs.count_neighbour_edges(slots, form.reach)
         if many > most_edges(n):
             problem = f"joins {many:,} pairs of {n:,} agents; the maximum is {most_edges(n):,}"
             remedy = "reduce it; 1.9 includes second neighbours"

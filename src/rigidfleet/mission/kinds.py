@@ -185,7 +185,7 @@ class Attitude(Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete(cls, data: Any) -> Any:
+    def _complete_angles(cls, data: Any) -> Any:
         if isinstance(data, dict) and any(angle in data for angle in ANGLES):
             return dict.fromkeys(ANGLES, 0.0) | data
         return data
@@ -538,9 +538,9 @@ class Follow(Cruising):
 
     @model_validator(mode="before")
     @classmethod
-    def _lasting(cls, data: Any) -> Any:
+    def _complete_duration(cls, data: Any) -> Any:
         if isinstance(data, dict) and not {"until", "duration", "settle"} & data.keys():
-            return data | {"duration": data.get("travel") or _time_of(data.get("trajectories"))}
+            return data | {"duration": data.get("travel") or _duration_of(data.get("trajectories"))}
         return data
 
     @cached_property
@@ -571,7 +571,7 @@ class Follow(Cruising):
         return {"travel": length if whole is None else seconds(whole)}
 
 
-def _time_of(trajectories: Any) -> float:
+def _duration_of(trajectories: Any) -> float:
     """Duration [s] of the longest of trajectories whose form is not checked yet; 1 if it has errors."""
     try:
         longest = max(math.fsum(row[0] for row in rows) for rows in trajectories)

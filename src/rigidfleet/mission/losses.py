@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.text import agent_names
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import sound
+from rigidfleet.mission.formations import is_sound
 from rigidfleet.mission.kinds import AnyPhase, seconds
 from rigidfleet.mission.obstacles import is_ground
 from rigidfleet.mission.rules import Breach, Breaches, Draft
@@ -33,7 +33,7 @@ def rules(m: Draft) -> Breaches:
     """Vehicles and links that can be lost, what can follow, and a ground for landings."""
     d: Disturbances | None = m.disturbances
     yield from _abort(m)
-    grounded = not m.right((), "obstacles") or any(map(is_ground, m.obstacles))
+    grounded = not m.is_valid((), "obstacles") or any(map(is_ground, m.obstacles))
     for k, p in enumerate(m.phases):
         if p.grounded and not grounded:
             yield Breach(("phases", k, "kind"), *_NO_GROUND)
@@ -45,7 +45,7 @@ def rules(m: Draft) -> Breaches:
         path = (_TABLE, "stuck", k)
         yield from agents_exist(m, (*path, "agent"), (one.agent,))
         yield from in_time(m, one.time, path)
-    if d.stuck and m.network is None and m.right((), "network"):
+    if d.stuck and m.network is None and m.is_valid((), "network"):
         problem = "needs vehicles that fly by themselves: without [network], one law commands all"
         yield Breach((_TABLE, "stuck"), problem, "add [network], or remove it", None)
     for key, needed in ON_LOSS.items():
@@ -59,7 +59,7 @@ def rules(m: Draft) -> Breaches:
     if d.hold_until is not None and d.hold_until <= first:
         problem = f"is not after the first loss at {first:g} s"
         yield Breach((_TABLE, "hold_until"), problem, "give a later time or remove it")
-    yield from _tracked(m, first, "loss", "brake", "on_loss = 'continue'")
+    yield from _slots_tracked(m, first, "loss", "brake", "on_loss = 'continue'")
     if d.on_loss == "land":
         if not grounded:
             yield Breach((_TABLE, "on_loss"), *_NO_GROUND)
@@ -83,10 +83,10 @@ def _abort(m: Draft) -> Breaches:
     if begins >= m.end:
         problem = f"and the reaction of {options.reaction:g} s are not before the end of the mission at {m.end:g} s"
         yield Breach(("abort", "at"), problem, "give an earlier time or remove it")
-    yield from _tracked(m, begins, "abort", "slow down", "abort at another time")
+    yield from _slots_tracked(m, begins, "abort", "slow down", "abort at another time")
 
 
-def _tracked(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
+def _slots_tracked(m: Draft, when: float, what: str, does: str, other: str) -> Breaches:
     """Slots are tracked in what may be under way at a loss or abort at a time [s]; words of it, and another remedy."""
     for k, p in under_way(m.phases, when):
         if p.control != "tracking":
@@ -159,7 +159,7 @@ def _landings(m: Draft, d: Disturbances, n: int, first: float) -> Breaches:
             remedy = suggest(name, forms) or f"formations: {', '.join(forms)}"
             yield Breach(where, "there is no such formation", remedy)
             return
-        slots = forms[name].slot_array(n) if sound(m, name) else None
+        slots = forms[name].slot_array(n) if is_sound(m, name) else None
         words = "it has no slots to track" if slots is None else _uneven(slots, radius)
         if words:
             remedy = "name a level formation, such as a line or a square"

@@ -15,7 +15,7 @@ from pydantic import PrivateAttr
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
 from rigidfleet._common.renamed import with_earlier_names
 from rigidfleet._common.text import agent_names, first_few
-from rigidfleet._common.toml import plain_data, to_toml
+from rigidfleet._common.toml import to_toml, to_toml_data
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.assignment import assign_slots, downwash_metric
 from rigidfleet.formation.distance_geometry import distances
@@ -30,7 +30,7 @@ from rigidfleet.mission.kinds import Establish, Phase
 from rigidfleet.mission.obstacles import Ground, Obstacle, is_ground
 from rigidfleet.mission.phases import end_of_phases
 from rigidfleet.mission.schema import DRAG, Aborting, Contents
-from rigidfleet.mission.text import parse_toml, unread
+from rigidfleet.mission.text import parse_toml, read_error
 from rigidfleet.mission.vehicles import VehicleModel, resolve
 from rigidfleet.solids.distance import height_below
 from rigidfleet.solids.records import Solids, join
@@ -72,9 +72,9 @@ def _compute_once(method: Callable[[Any, Any], A]) -> Callable[[Any, Any], A]:
     @wraps(method)
     def wrapper(self: Mission, name: Any) -> A:
         key = wrapper.__name__, name
-        if key not in self._made:
-            self._made[key] = method(self, name)
-        made = self._made[key]
+        if key not in self._computed_arrays:
+            self._computed_arrays[key] = method(self, name)
+        made = self._computed_arrays[key]
         return made if made is None or made.dtype.kind == "i" else made.copy()
 
     return wrapper
@@ -158,11 +158,11 @@ class Mission(Contents, Shown):
         if not isinstance(data, Mapping):
             raise wrong_type("a dict with the keys of a mission", data)
         try:
-            copied = plain_data(data)
+            copied = to_toml_data(data)
         except TypeError as error:
-            raise unread(origin, str(error), "use numbers, strings, lists and dicts") from None
+            raise read_error(origin, str(error), "use numbers, strings, lists and dicts") from None
         except RecursionError:
-            raise unread(origin, "is nested too deeply", "use the keys of a mission") from None
+            raise read_error(origin, "is nested too deeply", "use the keys of a mission") from None
         return cls.from_plain(copied, origin)
 
     def rewritten(self, data: Mapping[str, Any], origin: str | None = None) -> Self:
@@ -232,7 +232,7 @@ class Mission(Contents, Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the mission as a dictionary, as written. Edit it and pass it to `Mission.from_dict`."""
-        return plain_data(self._data)
+        return to_toml_data(self._data)
 
     @property
     def text(self) -> str:
@@ -391,7 +391,7 @@ class Mission(Contents, Shown):
         return taken.attitude == "free" or not self.formations[taken.formation].knows_slots
 
     @cached_property
-    def _made(self) -> dict[tuple[str, str], Any]:
+    def _computed_arrays(self) -> dict[tuple[str, str], Any]:
         return {}
 
     @_compute_once
@@ -604,16 +604,16 @@ class Mission(Contents, Shown):
     @property
     def abandons_at(self) -> float:
         """Time [s] at which the flight leaves its plan, for a loss that is answered or an abort; infinity if never."""
-        return min(self._loss_and_order)
+        return min(self._loss_and_abort_times)
 
     @property
     def aborts(self) -> bool:
         """Whether it then aborts, by [abort]."""
-        loss, abort = self._loss_and_order
+        loss, abort = self._loss_and_abort_times
         return abort < loss
 
     @property
-    def _loss_and_order(self) -> tuple[float, float]:
+    def _loss_and_abort_times(self) -> tuple[float, float]:
         """Times [s] at which the others brake after a loss, and at which the flight aborts; infinity if never."""
         options, loss = self.aborting, math.inf if self.on_loss == "continue" else self.first_loss
         order = math.inf if options.at is None else options.at
@@ -636,6 +636,6 @@ def _damping(slots: bytes, edges: bytes, masses: bytes) -> float:
     r, pairs = np.frombuffer(slots).reshape(1, -1, 3), np.frombuffer(edges, np.int64).reshape(-1, 2)
     J = constraint_jacobian.jacobian(r, pairs)
     least, most = _DAMPING
-    (singular,) = constraint_jacobian.smallest_of(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
+    (singular,) = constraint_jacobian.smallest_value(J, np.frombuffer(masses))  # of mbar J M^-1 J^T
     w = float(singular) ** 2
     return min(max(w / 4, least), most)

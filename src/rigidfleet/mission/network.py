@@ -21,7 +21,7 @@ def rules(m: Draft) -> Breaches:
         problem = f"leaves each of {m.n:,} vehicles less than one broadcast a second"
         yield Breach("budget", problem, f"give at least {m.n} Hz, or remove it")
     for key in ("late", "drift") if net.clocks else ():
-        yield from m.one_each(net.clocks, key, "clocks", alone=", or a single number")
+        yield from m.one_per_agent(net.clocks, key, "clocks", alone=", or a single number")
     for k, one in enumerate(net.outages):
         yield from agents_exist(m, ("outages", k, "between"), one.between)
         if one.end <= one.start:

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from rigidfleet.math.attitude import dcm_from_euler
 from rigidfleet.mission import bounds, values
-from rigidfleet.mission.files import FILL, NOT_A_FILE, without_data
+from rigidfleet.mission.files import FILL, NOT_A_FILE, missing_cells
 from rigidfleet.mission.findings import FindingCollector, Keys
 from rigidfleet.mission.rules import Breach, Breaches
 from rigidfleet.mission.values import Part, key, models_by_kind, required_key
@@ -60,7 +60,7 @@ class Solid(Part):
             The points of a hull lie in a plane.
         """
         ways, times = self.motion
-        return records.single(self.form, times, ways, self.there)
+        return records.one_solid(self.form, times, ways, self.there)
 
 
 class Moving(Solid):
@@ -231,7 +231,7 @@ class Ground(Part):
     @cached_property
     def solid(self) -> Solids:
         """The ground as arrays."""
-        return records.single(records.half_space(self.height))
+        return records.one_solid(records.half_space(self.height))
 
 
 Obstacle = Annotated[Box | Ground | Sphere | Cylinder | Hull | Heights, Field(discriminator="kind")]
@@ -252,7 +252,7 @@ def rules(m: FindingCollector, thing: Any, path: Keys) -> Breaches:
         yield from _motion(m, thing, path)
     if isinstance(thing, Cylinder) and math.dist(*thing.ends) < bounds.LENGTH.least:
         yield Breach("ends", "has both ends at the same place", "give the centres of its two ends")
-    if isinstance(thing, Hull) and m.right(path, "points", "waypoints", "times"):
+    if isinstance(thing, Hull) and m.is_valid(path, "points", "waypoints", "times"):
         try:
             thing.solid  # noqa: B018
         except ValueError as error:
@@ -270,7 +270,7 @@ def _motion(m: FindingCollector, thing: Moving, path: Keys) -> Breaches:
         yield Breach("velocity", "has no effect with waypoints", "remove one of them")
     elif ways is None or times is None:
         for one, other in ("waypoints", "times"), ("times", "waypoints"):
-            if getattr(thing, one) is not None and m.right(path, other):
+            if getattr(thing, one) is not None and m.is_valid(path, other):
                 yield Breach(other, f"is missing: {one} need it", f"add {other}")
     elif len(ways) != len(times) or len(ways) < 2:
         problem = f"has {len(times)} entries for {len(ways)} waypoints"
@@ -285,7 +285,7 @@ def _heights(m: FindingCollector, thing: Heights, path: Keys) -> Breaches:
         yield Breach("file", NOT_A_FILE, "load the mission from its file, or give heights")
         return
     if thing.heights is None:
-        if m.right(path, "heights"):
+        if m.is_valid(path, "heights"):
             yield Breach("heights", "is missing", "add heights, or a file with them")
         return
     rows = {len(row) for row in thing.heights}
@@ -294,7 +294,7 @@ def _heights(m: FindingCollector, thing: Heights, path: Keys) -> Breaches:
         problem = f"has rows of {min(rows, default=0)} to {max(rows, default=0)} heights, {len(thing.heights)} of them"
         remedy = "give two rows or more, all of the same length, two or more"
         yield Breach("heights", problem, remedy, None)
-    elif why := without_data(thing.heights):
+    elif why := missing_cells(thing.heights):
         yield Breach("heights", why, FILL, None)
     elif count > bounds.HEIGHTS:
         problem = f"has {count:,} heights; the maximum is {bounds.HEIGHTS:,}"

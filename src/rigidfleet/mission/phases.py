@@ -16,7 +16,7 @@ from rigidfleet.formation import distance_geometry
 from rigidfleet.mission import bounds
 from rigidfleet.mission.files import NOT_A_FILE
 from rigidfleet.mission.findings import Keys, suggest
-from rigidfleet.mission.formations import sound
+from rigidfleet.mission.formations import is_sound
 from rigidfleet.mission.kinds import (
     ANGLES,
     KINDS,
@@ -53,7 +53,7 @@ def rules(m: Draft) -> Breaches:
     phases = yield from _phases(m)
     m.parts["phases"] = tuple(p for p in phases if p is not None)
     _check(m, phases)
-    end = end_of_phases(m.phases) if m.right((), "phases") else math.nan
+    end = end_of_phases(m.phases) if m.is_valid((), "phases") else math.nan
     # With automatic durations it is not known; the mission is checked again when they are.
     m.end = None if math.isnan(end) else end
 
@@ -61,21 +61,21 @@ def rules(m: Draft) -> Breaches:
 def _check(m: Draft, phases: Written) -> None:
     """Check phases together, then each with what it needs."""
     lengths: Lengths = [None] * len(phases)
-    m.keep(("phases",), _names(phases))
-    m.keep((), _times(m, phases, lengths))
+    m.record_breaches(("phases",), _names(phases))
+    m.record_breaches((), _times(m, phases, lengths))
     for k, p in enumerate(phases):
         if p is not None:
             path = ("phases", k)
-            m.keep(path, _motion(m, p, k, lengths[k]))
-            if m.right(path, "control"):
-                m.keep(path, _control(m, p))
+            m.record_breaches(path, _motion(m, p, k, lengths[k]))
+            if m.is_valid(path, "control"):
+                m.record_breaches(path, _control(m, p))
                 if own := _OWN.get(p.kind):
-                    m.keep(path, own(m, p, k, lengths[k]))
-    m.keep((), _formations(m, phases))
+                    m.record_breaches(path, own(m, p, k, lengths[k]))
+    m.record_breaches((), _formations(m, phases))
     for k, p in enumerate(phases):
         if p is not None:
             for rules in _arrival(m, p), _smoothness(m, p, k), _automatic(m, p, k):
-                m.keep(("phases", k), rules)
+                m.record_breaches(("phases", k), rules)
 
 
 def end_of_phases(phases: Sequence[AnyPhase]) -> float:
@@ -95,13 +95,13 @@ def _phases(m: Draft) -> Generator[Breach, None, list[Any]]:
     body = m.data.get("architecture") == "body"
     phases: list[Any] = []
     for k, data in enumerate(m.tables("phases")):
-        if (model := m.kind(data, ("phases", k), KINDS)) is None:
+        if (model := m.model_of_kind(data, ("phases", k), KINDS)) is None:
             phases.append(None)
             continue
         control = model.body_control if body else "tracking"
         defaults = {"name": f"{data['kind']} {k + 1}", "control": control}
         phases.append(m.validate(model, data, ("phases", k), defaults))
-    if not phases and m.right((), "phases"):
+    if not phases and m.is_valid((), "phases"):
         yield Breach(
             "phases", "there is no phase", "add [[phases]], one for each step of the flight", None
         )
@@ -124,7 +124,7 @@ def _times(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
     last: float | None = 0.0
     for k, p in enumerate(phases):
         path = ("phases", k)
-        if p is None or not m.right(path, *_ENDINGS):
+        if p is None or not m.is_valid(path, *_ENDINGS):
             first = last = None
             continue
         endings = [e for e in _ENDINGS if getattr(p, e) is not None]
@@ -165,7 +165,7 @@ def _times(m: Draft, phases: Written, lengths: Lengths) -> Breaches:
 def _motion(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
     """The travel or blend of a phase is not longer than the phase."""
     lasts = p.least_time
-    if not m.right(("phases", k), "reference", *_ENDINGS):
+    if not m.is_valid(("phases", k), "reference", *_ENDINGS):
         return
     if p.shaping is not None and p.shaping.reference == "step":
         if "blend" in p.model_fields_set:
@@ -184,7 +184,7 @@ def _motion(m: Draft, p: Phase, k: int, longest: float | None) -> Breaches:
 def _samples(m: Draft, end: float | None) -> Breaches:
     """A result has samples, and not too many."""
     step, n = m.output_step, m.n or 0
-    if not end or not m.right((), "output_step", "formations"):
+    if not end or not m.is_valid((), "output_step", "formations"):
         return
     switches = 2 * len(m.tables("phases"))  # one sample per step, and two at each change of phase
     samples = end / step + switches
@@ -234,14 +234,14 @@ def _control(m: Draft, p: Phase) -> Breaches:
 
 def _turn(m: Draft, p: Turn, k: int, _: float | None) -> Breaches:
     """A turn has a target angle."""
-    if p.attitude_deg is None and m.right(("phases", k), *ANGLES):
+    if p.attitude_deg is None and m.is_valid(("phases", k), *ANGLES):
         remedy = f"give at least one of {', '.join(reversed(ANGLES))}"
         yield Breach((), "has no target angle", remedy, p.name)
 
 
 def _establish(m: Draft, p: Establish, k: int, _: float | None) -> Breaches:
     """A commanded attitude has an effect."""
-    if not m.right(("phases", k), "attitude", *ANGLES):
+    if not m.is_valid(("phases", k), "attitude", *ANGLES):
         return
     written = m.data["phases"][k]
     angles = [key for key in ANGLES if key in written]
@@ -262,7 +262,7 @@ def _orbit(m: Draft, p: Orbit, k: int, longest: float | None) -> Breaches:
         yield Breach("control", problem, "use control = 'tracking'")
     if p.settle is not None:
         yield Breach("settle", "an orbit never settles", "end it by duration or until")
-    if not m.right(("phases", k), "radius"):
+    if not m.is_valid(("phases", k), "radius"):
         return
     rate = abs(np.deg2rad(p.rate_deg_s))
     turns = rate * (longest or 0.0) / (2 * np.pi)
@@ -302,14 +302,14 @@ def _vertical(m: Draft, p: Any, k: int, longest: float | None) -> Breaches:
         where = "until" if p.until is not None else "duration"
         problem = "does not say how long a staggered phase lasts"
         yield Breach(where, problem, "give its duration in seconds")
-    yield from members(m, p.agents, "agents")
+    yield from agents_exist_once(m, p.agents, "agents")
 
 
 def _go(m: Draft, p: Go, k: int, longest: float | None) -> Breaches:
     """A way can be found and flown: tracked slots, an end, and formations that exist."""
     yield from _tracked_way(m, p, k, longest)
     for name in p.formations or ():
-        yield from _exists(m, name, "formations")
+        yield from _formation_exists(m, name, "formations")
 
 
 #: Greatest jumps of position [m] and velocity [m/s] within a trajectory: those of numbers rounded in a file.
@@ -323,7 +323,7 @@ def _follow(m: Draft, p: Follow, k: int, longest: float | None) -> Breaches:
         problem, remedy = "is missing", "give the name of a file with trajectories"
         if p.file is not None:
             problem, remedy = NOT_A_FILE, "load the mission from its file"
-        if m.right(("phases", k), "file", "trajectories"):
+        if m.is_valid(("phases", k), "file", "trajectories"):
             yield Breach("file", problem, remedy)
         return
     count = len(p.trajectories)
@@ -404,7 +404,7 @@ _OWN: dict[str, Callable[[Draft, Any, int, float | None], Breaches]] = {
 }
 
 
-def members(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
+def agents_exist_once(m: Draft, agents: Sequence[int], *where: str) -> Breaches:
     """Agents, such as those that take off or land, exist, and are named once."""
     beyond = [i for i in agents if m.n is not None and i > m.n]
     if beyond:
@@ -423,28 +423,28 @@ def _formations(m: Draft, phases: Written) -> Breaches:
     slotted: set[str] = set()  # names of formations that have slots to track
     for k, p in enumerate(phases):
         path = ("phases", k)
-        if p is None or not m.right(path, "formation", "reference"):
+        if p is None or not m.is_valid(path, "formation", "reference"):
             held = None if p is None or p.shaping is not None else held
             continue
         if (shaping := p.shaping) is not None:
-            yield from _exists(m, shaping.formation, *path, "formation")
+            yield from _formation_exists(m, shaping.formation, *path, "formation")
             form = forms.get(shaping.formation)
             if p.establishing is None and held == "":
                 problem = "no formation has been established yet"
                 yield Breach(
                     (*path, "kind"), problem, "use kind = 'establish' for the first formation"
                 )
-            drawn = m.data["phases"][k].get("attitude") == "drawn" and m.right(path, "attitude")
+            drawn = m.data["phases"][k].get("attitude") == "drawn" and m.is_valid(path, "attitude")
             if drawn and form is not None and not form.knows_slots:
                 problem = f"formation '{shaping.formation}' is given by distances alone, which have no axes"
                 remedy = "remove it, give the formation slots, or command an attitude by yaw_deg"
                 yield Breach((*path, "attitude"), problem, remedy)
-            if m.n is not None and form is not None and sound(m, shaping.formation):
+            if m.n is not None and form is not None and is_sound(m, shaping.formation):
                 yield from _blendable(shaping, form, m.n, path)
             held = shaping.formation
         form = forms.get(held) if held else None
-        tracked = p.control == "tracking" and m.right(path, "control")
-        if not tracked or m.n is None or form is None or not held or not sound(m, held):
+        tracked = p.control == "tracking" and m.is_valid(path, "control")
+        if not tracked or m.n is None or form is None or not held or not is_sound(m, held):
             continue
         if held in slotted:
             continue
@@ -456,7 +456,7 @@ def _formations(m: Draft, phases: Written) -> Breaches:
             slotted.add(held)
 
 
-def _exists(m: Draft, name: str, *where: str | int) -> Breaches:
+def _formation_exists(m: Draft, name: str, *where: str | int) -> Breaches:
     """A formation exists."""
     known = m.data.get("formations", {})
     if isinstance(known, dict) and name not in known:
@@ -484,7 +484,7 @@ def _blendable(p: Shaping, form: Formation, n: int, path: Keys) -> Breaches:
 
 def _smoothness(m: Draft, p: Phase, k: int) -> Breaches:
     """A smooth mission can be smooth, and others use nothing that only smooth ones have."""
-    if not m.right((), "smoothness"):
+    if not m.is_valid((), "smoothness"):
         return
     through = getattr(p, "through", ())
     if not m.smooth:
@@ -502,7 +502,7 @@ def _smoothness(m: Draft, p: Phase, k: int) -> Breaches:
         problem = "jumps, but the mission has smoothness = 'jerk'"
         yield Breach("reference", problem, "use reference = 'shape' or 'distances'")
     times = [at.time for at in through if at.time is not None]
-    if not times or not m.right(("phases", k), "through"):
+    if not times or not m.is_valid(("phases", k), "through"):
         return
     arrival = (p.steering.travel if p.steering is not None else None) or p.duration
     if len(times) < len(through):
@@ -520,7 +520,7 @@ def _smoothness(m: Draft, p: Phase, k: int) -> Breaches:
 
 def _automatic(m: Draft, p: Phase, k: int) -> Breaches:
     """Times that follow from the limits have limits to follow from."""
-    keys = [key for key in p.automatic if m.right(("phases", k), key)]
+    keys = [key for key in p.automatic if m.is_valid(("phases", k), key)]
     if not keys or not m.smooth:
         return
     if p.control != "tracking":
@@ -536,7 +536,7 @@ def _automatic(m: Draft, p: Phase, k: int) -> Breaches:
     limits = m.limits
     bounded = [limits.speed, limits.acceleration, limits.jerk, limits.tilt_deg]
     limited = m.agents is None or all(math.isfinite(f) for f in m.agents.thrust_limit)
-    if not limited and all(limit is None for limit in bounded) and m.right((), "limits"):
+    if not limited and all(limit is None for limit in bounded) and m.is_valid((), "limits"):
         problem = "needs a limit that bounds it, and the mission has none"
         remedy = "give limits.speed, acceleration, jerk or tilt_deg, or agents.thrust_limit"
         yield Breach(keys[0], problem, remedy)
@@ -550,7 +550,7 @@ def _arrival(m: Draft, p: Phase) -> Breaches:
     if m.smooth and p.control == "tracking":
         remedy = "give travel, or end by until or duration"
         yield Breach("settle", "a smooth way needs a time of arrival", remedy, None)
-    elif m.right((), "lqr"):
+    elif m.is_valid((), "lqr"):
         for key, weights, used in (
             ("lqr", m.lqr, "position" in steering.meets),
             ("lqr.attitude", m.lqr.attitude, steering.attitude_deg is not None),

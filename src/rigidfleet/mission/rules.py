@@ -1,7 +1,7 @@
 """Rules of a mission: when each is broken, where, what the problem is, and its remedy.
 
 A rule is a condition in a generator that is about one table and yields a `Breach`. The modules beside this one have the
-rules of their tables; `Draft.keep` is the one place that records what is broken.
+rules of their tables; `Draft.record_breaches` is the one place that records what is broken.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Breach(NamedTuple):
 Breaches = Iterator[Breach]
 
 
-def idle(part: Any, key: str, other: str, *acts: str) -> Breaches:
+def idle_key(part: Any, key: str, other: str, *acts: str) -> Breaches:
     """A key that is written has no effect but with one of some values of another key."""
     if key in part.model_fields_set and getattr(part, other) not in acts:
         problem = f"has no effect with {other} '{getattr(part, other)}'"
@@ -74,7 +74,7 @@ class Draft(FindingCollector):
         """Whether acceleration and jerk of the references are to be continuous."""
         return self.smoothness == "jerk"
 
-    def one_each(self, part: Any, key: str, *where: str, alone: str = "") -> Breaches:
+    def one_per_agent(self, part: Any, key: str, *where: str, alone: str = "") -> Breaches:
         """A list has one entry per agent; ``alone`` says what else may stand in its place."""
         entries = getattr(part, key)
         if isinstance(entries, tuple) and self.n not in (None, len(entries)):
@@ -83,7 +83,7 @@ class Draft(FindingCollector):
                 (*where, key), problem, f"give one entry per agent, {self.n} in all{alone}"
             )
 
-    def keep(self, path: Keys, breaches: Breaches) -> None:
+    def record_breaches(self, path: Keys, breaches: Breaches) -> None:
         """Record the rules that are broken in the table at a path.
 
         A key that has had an error before gets no other, since that may follow from the wrong value; a table may.

@@ -53,7 +53,7 @@ class ShowFormation(NamedTuple):
     table: str
 
 
-def scene(shape: str, agents: int, spacing: float) -> ShowFormation:
+def shape_scene(shape: str, agents: int, spacing: float) -> ShowFormation:
     """A named shape whose nearest two agents are a spacing [m] apart.
 
     Raises
@@ -100,7 +100,7 @@ def _with_rest(one: ShowFormation, agents: int) -> ShowFormation:
     return ShowFormation(one.name, slots, one.table + line)
 
 
-def show(
+def show_text(
     name: str, scenes: Sequence[ShowFormation], *, agents: int, spacing: float, mass: float = _MASS,
     thrust_limit: float | None = None, file: str = "",
 ) -> str:  # fmt: skip
@@ -127,7 +127,7 @@ def show(
     if not scenes:
         raise ValueError("a show needs formations")
     ground = "grid" if agents in shapes.SHAPES["grid"].agents else "line"
-    pads = scene(ground, agents, spacing)._replace(name="pads")
+    pads = shape_scene(ground, agents, spacing)._replace(name="pads")
     tables, scenes = {"pads": pads}, [_with_rest(one, agents) for one in scenes]
     for i, one in enumerate(scenes):
         key, k = one.name, 2

@@ -68,24 +68,24 @@ def read_text(path: str | Path) -> str:
     except FileNotFoundError:
         raise MissionError([_not_found(origin)]) from None
     except IsADirectoryError:
-        raise unread(origin, "is a folder", "give the path of a mission file in it") from None
+        raise read_error(origin, "is a folder", "give the path of a mission file in it") from None
     except PermissionError:
         problem = "cannot be read: permission denied"
-        raise unread(origin, problem, "change its permissions") from None
+        raise read_error(origin, problem, "change its permissions") from None
     except (OSError, ValueError) as error:
         problem = f"cannot be read ({error})"
-        raise unread(origin, problem, "give the path of a mission file") from None
+        raise read_error(origin, problem, "give the path of a mission file") from None
     remedy = "give the path of a mission file (TOML)"
     if len(data) > bounds.BYTES:
-        raise unread(origin, f"is larger than {bounds.BYTES >> 20} MiB", remedy)
+        raise read_error(origin, f"is larger than {bounds.BYTES >> 20} MiB", remedy)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         remedy = remedy if b"\0" in data else "save it as UTF-8"
-        raise unread(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
+        raise read_error(origin, f"is not UTF-8 text (byte {error.start + 1})", remedy) from None
 
 
-def unread(origin: str, problem: str, remedy: str) -> MissionError:
+def read_error(origin: str, problem: str, remedy: str) -> MissionError:
     """The error of a text that cannot be read."""
     return MissionError([Finding(origin, "", None, problem, remedy)])
 
@@ -105,7 +105,7 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
         The text is not valid TOML or exceeds the bounds on the text of a mission.
     """
     if beyond := bounds.excess(text):
-        raise unread(origin, beyond, "reduce it; docs/missions.md lists the bounds")
+        raise read_error(origin, beyond, "reduce it; docs/missions.md lists the bounds")
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -118,4 +118,4 @@ def parse_toml(text: str, origin: str) -> dict[str, Any]:
         remedy = "correct it; toml.io describes the format"
     except RecursionError:
         problem, remedy = "is nested too deeply", "use the keys of a mission"
-    raise unread(origin, problem, remedy)
+    raise read_error(origin, problem, remedy)

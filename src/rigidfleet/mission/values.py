@@ -79,21 +79,21 @@ _T = TypeVar("_T")
 _Other = TypeVar("_Other")
 
 
-def _form(value: object) -> str:
+def _list_or_one(value: object) -> str:
     return "list" if isinstance(value, list | tuple) else "one"
 
 
-def _wording(value: object) -> str:
+def _word_or_one(value: object) -> str:
     return "word" if isinstance(value, str) else "one"
 
 
 #: One value, or a list in its place; one value, or as many as there are agents; a value, or a word in its place.
 _OneOrList = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_form)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("list")], Discriminator(_list_or_one)
 ]
 _PerAgent = _OneOrList[_T, tuple[_T, ...]]
 _ValueOrWord = Annotated[
-    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_wording)
+    Annotated[_T, Tag("one")] | Annotated[_Other, Tag("word")], Discriminator(_word_or_one)
 ]
 _Two, _Three = (Field(min_length=n, max_length=n) for n in (2, 3))
 Vector = Annotated[tuple[Coordinate, ...], _Three]

@@ -121,7 +121,7 @@ def validate_vehicles(m: Draft) -> None:
             m.add(path, "is not a table", f"write a table [vehicles.{name}]")
         elif (vehicle := m.validate(Vehicle, data, path)) is not None:
             before = len(m.findings)
-            m.keep(path, _model(vehicle))
+            m.record_breaches(path, _model(vehicle))
             if len(m.findings) == before:
                 m.vehicles[name] = vehicle
 

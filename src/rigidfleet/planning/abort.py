@@ -27,7 +27,7 @@ from rigidfleet.foreign.curves import curve_to_rows
 from rigidfleet.formation.assignment import assign_slots, downwash_metric, pairs_nearer_than
 from rigidfleet.kernel.problem import septic_polynomial
 from rigidfleet.math import falls, proximity
-from rigidfleet.math.piecewise import Piecewise, common_knots, pad, refine
+from rigidfleet.math.piecewise import Piecewise, common_knots, pad, refine_knots
 from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.boundaries import Boundaries, BoundaryWatch, Worst, boundary_in_words
 from rigidfleet.mission.kinds import Follow, Land
@@ -163,7 +163,7 @@ class Abort:
         return self.home.reason
 
     @property
-    def stops(self) -> float:
+    def stop_time(self) -> float:
         """When those that go home have stopped on the plan [s]."""
         return self.begins + self.waits + self.slows
 
@@ -173,7 +173,7 @@ class Abort:
         return self.begins + sum(step.duration for step in self.steps)
 
     @property
-    def least(self) -> Certificate:
+    def certificate(self) -> Certificate:
         """The least separation that is promised, in mission time: what is proved, less what vehicles are off."""
         best, t = _APART_FOR_EVER, self.begins
         for step in self.steps:
@@ -182,14 +182,14 @@ class Abort:
             t += step.duration
         return best
 
-    def at(self, time: Floats) -> Floats:
+    def positions_at(self, time: Floats) -> Floats:
         """Positions (K, N, 3) [m] at mission times (K,) [s] from `begins` on; at rest after the last step."""
-        return _in_a_row([step.way for step in self.steps]).at(
+        return _concatenate([step.way for step in self.steps]).at(
             np.minimum(time, self.end) - self.begins
         )
 
 
-def _in_a_row(curves: Sequence[Piecewise]) -> Piecewise:
+def _concatenate(curves: Sequence[Piecewise]) -> Piecewise:
     """Curves from 0 [s], one after the other, with 8 powers."""
     ends = np.cumsum([0.0, *(float(x.time[-1]) for x in curves)])
     times = [x.time[1:] + t for x, t in zip(curves, ends, strict=False)]
@@ -197,21 +197,21 @@ def _in_a_row(curves: Sequence[Piecewise]) -> Piecewise:
     return Piecewise(np.concatenate([[0.0], *times]), np.concatenate(pieces))
 
 
-def _from_rest(start: Floats, end: Floats, time: float) -> Piecewise:
+def _rest_to_rest(start: Floats, end: Floats, time: float) -> Piecewise:
     """Straight ways between places (N, 3) [m], from rest to rest in a time [s]."""
     rest = np.zeros((3, 2, *start.shape))
     states = np.concatenate([np.stack([start, end])[None], rest])
     return Piecewise.hermite(np.array([0.0, time]), states)
 
 
-def _clock(begin: float, time: float, progress: Floats) -> Piecewise:
+def _path_clock(begin: float, time: float, progress: Floats) -> Piecewise:
     """The time along a path, from a beginning on, for a time [s]: it goes on by a polynomial (P,) of its share."""
     piece = progress * time ** (1.0 - np.arange(float(len(progress))))
     piece[0] = begin
     return Piecewise(np.array([0.0, time]), piece[None])
 
 
-def _at_rates(x: Floats, rates: Floats) -> Floats:
+def _states_by_clock(x: Floats, rates: Floats) -> Floats:
     """Position and three derivatives (4, K, N, 3) by the time, along a path and its clock (3, K)."""
     first, second, third = rates[:, :, None, None]  # and the chain rule
     jerk = x[3] * first**3 + 3.0 * x[2] * first * second + x[1] * third
@@ -219,7 +219,7 @@ def _at_rates(x: Floats, rates: Floats) -> Floats:
 
 
 class Aborts:
-    """Ways home of the vehicles that are left, from any time of a plan: of each second (`every`), or one time (`at`).
+    """Ways home of the vehicles left, from any time of a plan: of each second (`all_aborts`), or one (`abort_at`).
 
     A mission's own `abort.to` may be replaced by another one.
     """
@@ -283,7 +283,7 @@ class Aborts:
             time = np.linspace(leg.start, leg.end, steps)
             own = np.unique([reference.t0 + reference.T_b, *reference.knots, *motion.knots])
             if len(own) < 4 * steps:  # where the plan's own polynomials change
-                time = refine(time, own, _NEAR)
+                time = refine_knots(time, own, _NEAR)
             states = slot_derivatives(reference, motion, time, 4).swapaxes(0, 1)
             times.append(time[1:])
             pieces.append(Piecewise.hermite(time, states).pieces)
@@ -323,13 +323,13 @@ class Aborts:
         first, last = (begin, end)[turn]
         inside = plan.time[(plan.time > first) & (plan.time < last)]
         fine = np.linspace(0.0, duration, 50 * len(time))
-        time = refine(time, np.interp(inside, clock.at(fine)[turn], fine[turn]), _NEAR)
+        time = refine_knots(time, np.interp(inside, clock.at(fine)[turn], fine[turn]), _NEAR)
         s = clock.states(time, 4)
-        ends = tuple(x[:, turn] for x in plan.on(s[0, turn]).ends(4))[turn]
+        ends = tuple(x[:, turn] for x in plan.refine(s[0, turn]).ends(4))[turn]
         rates = s[1:, :-1], s[1:, 1:]
-        return Piecewise.of_ends(time, *map(_at_rates, ends, rates))
+        return Piecewise.of_ends(time, *map(_states_by_clock, ends, rates))
 
-    def along(self, name: str, clock: Piecewise) -> Step:
+    def step_along(self, name: str, clock: Piecewise) -> Step:
         """A step along the plan by a clock, either way: its least separation is that which the legs it meets prove."""
         begin, end = clock.at(clock.time[[0, -1]]).tolist()
         first, last = sorted((begin, end))
@@ -350,7 +350,7 @@ class Aborts:
         """A step of ways that keep a separation, if they are so much off it [m]."""
         way = make()
         end = way.at(way.time[-1:])[0]
-        return Step(name, make, float(way.time[-1]), end, least, self._off(way) + off, **how)
+        return Step(name, make, float(way.time[-1]), end, least, self._slack(way) + off, **how)
 
     def slow_down(self, begins: float) -> tuple[Step, str]:
         """Slow down along the plan from a time on [s], in the least time that keeps the limits, or fly to its landing.
@@ -366,13 +366,13 @@ class Aborts:
         speed = float(np.linalg.norm(v, axis=1).max())
         first = max(_STEEPEST * speed / BRAKING, math.sqrt(_BENT * speed / JERK))
         time, over = self._time_along(
-            first, self.limits, lambda time: _clock(begins, time, _SLOWING)
+            first, self.limits, lambda time: _path_clock(begins, time, _SLOWING)
         )
         if begins + 0.5 * time >= self.end and self.lands:
             # What goes on beyond the end goes on down.
-            clock = _clock(begins, max(self.end - begins, _LEAST), _ON)
-            return self.along("to its end", clock), ""
-        problem, step = "", self.along("slow down", _clock(begins, time, _SLOWING))
+            clock = _path_clock(begins, max(self.end - begins, _LEAST), _ON)
+            return self.step_along("to its end", clock), ""
+        problem, step = "", self.step_along("slow down", _path_clock(begins, time, _SLOWING))
         if over.max(initial=0.0) > _KEPT:
             q = self.limits[int(over.argmax())].of
             problem = f"slowing down would break the limit of {q.name_in_words}"
@@ -391,7 +391,7 @@ class Aborts:
             at, *rates = clock(time).states(time * share, 4)
             states = self.plan.states(at, 4)
             allowed = np.maximum(self._shares(limits, states), _USED)
-            return self._shares(limits, _at_rates(states, np.array(rates))) / allowed
+            return self._shares(limits, _states_by_clock(states, np.array(rates))) / allowed
 
         return least_time(first, excess)
 
@@ -402,7 +402,7 @@ class Aborts:
         who, x = self.left, x.swapaxes(0, 1)[:, :, self.left]
         return np.array([(q.values(x, who) / q.most[who]).max() for q in limits])
 
-    def _off(self, way: Piecewise) -> float:
+    def _slack(self, way: Piecewise) -> float:
         """By how much nearer than on their way two vehicles may be in flight [m].
 
         Drag in proportion to the speed holds vehicles off their ways that fly differently, as tracking answers to it.
@@ -421,7 +421,7 @@ class Aborts:
 
     def _straight(self, name: str, start: Floats, end: Floats) -> Step:
         """The step of straight ways (N, 3) [m], from rest to rest and in step, in the least time that keeps limits."""
-        states = _from_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
+        states = _rest_to_rest(start, end, 1.0).states(np.linspace(0.0, 1.0, _LOOKS), 4)
         allowed = np.maximum(self._shares(self.home_limits, 0.0 * states), _USED)  # at rest
 
         def excess(time: float) -> Floats:
@@ -432,7 +432,7 @@ class Aborts:
         longest = float(np.linalg.norm(end - start, axis=1).max())
         time, _ = least_time(_FASTEST * longest / (DESCENT if lands else SPEED), excess)
         least = in_step(start, end, time, self.radius, self.lost) or _APART_FOR_EVER
-        return self._step(name, partial(_from_rest, start, end, time), least, 0.0, lands=lands)
+        return self._step(name, partial(_rest_to_rest, start, end, time), least, 0.0, lands=lands)
 
     def obstruction(self, step: Step, begin: float) -> str:
         """What keeps a step from being flown, from a time [s] on; "" if nothing does.
@@ -496,7 +496,7 @@ class Aborts:
 
     # -- ways home from rest ------------------------------------------------------------------------------
 
-    def home(self, stop: Step, begin: float) -> Home:
+    def way_home(self, stop: Step, begin: float) -> Home:
         """The way from where all rest after a step along the plan, at a time [s]; that of equal places is planned once.
 
         If nothing leads home from there, back along the plan to where a way does.
@@ -505,30 +505,30 @@ class Aborts:
         assert path is not None
         key = np.round(r, _SAME).tobytes() + (np.array([begin]).tobytes() if self.moves else b"")
         if key not in self._known:
-            home = self.search(r, begin)
-            if home.reason and np.isfinite(self.places(r)).all():
-                home = next(self._back(path, begin), home)
+            home = self.straight_ways_home(r, begin)
+            if home.reason and np.isfinite(self.landing_places(r)).all():
+                home = next(self._ways_back(path, begin), home)
             self._known[key] = home._replace(number=len(self._known))
         return self._known[key]
 
-    def _back(self, path: float, begin: float) -> Iterator[Home]:
+    def _ways_back(self, path: float, begin: float) -> Iterator[Home]:
         """Ways home from farther and farther back along the plan, from a time along it where all rest at a time [s]."""
         for far in np.append(np.arange(_BACK, path, _BACK), path).tolist():
 
             def clock(time: float, far: float = far) -> Piecewise:
-                return _clock(path, time, -far / time * _BLEND)
+                return _path_clock(path, time, -far / time * _BLEND)
 
             time, _ = self._time_along(_FASTEST * far, self.home_limits, clock)
-            home = self.search(self.plan.at(np.array([path - far]))[0], begin + time)
+            home = self.straight_ways_home(self.plan.at(np.array([path - far]))[0], begin + time)
             if home.way:
-                step = self.along("back", clock(time))
+                step = self.step_along("back", clock(time))
                 if not self.obstruction(step, begin):
                     yield Home((step, *home.steps), f"back along the plan, and {home.way}")
 
-    def search(self, r: Floats, begin: float) -> Home:
+    def straight_ways_home(self, r: Floats, begin: float) -> Home:
         """Straight ways home from places (N, 3) [m] where all rest at a time [s]."""
         left, goal = self.left, r.copy()
-        goal[left] = self.places(r)[left]  # lost ones stay
+        goal[left] = self.landing_places(r)[left]  # lost ones stay
         if not np.isfinite(goal).all():
             reason = "there is no ground to land on: add [[obstacles]] with kind = 'ground'"
             return Home(reason=reason)
@@ -538,7 +538,7 @@ class Aborts:
         for way in ("to any place",) if self.to == "any" else own:
             steps: list[Step] = []
             problem, t = "", begin
-            for name, a, b in self._stops(way, r, goal, off):
+            for name, a, b in self._landing_ways(way, r, goal, off):
                 if np.abs(b - a).max() > 1e-9:
                     steps.append(self._straight(name, a, b))
                     problem = problem or self.obstruction(steps[-1], t)
@@ -549,7 +549,7 @@ class Aborts:
             reasons.append(f"{way}: {problem}")
         return Home(reason="; ".join(reasons))
 
-    def _stops(
+    def _landing_ways(
         self, way: str, r: Floats, goal: Floats, off: float
     ) -> list[tuple[str, Floats, Floats]]:
         """Names of straight ways, from places to others (N, 3) [m] on the ground, if vehicles are off theirs [m].
@@ -578,14 +578,14 @@ class Aborts:
         """The own places (n, 3) of those left; where a lost vehicle lies on one, that of a lost one if it is free."""
         if not self.wrecked.size:
             return own
-        every = self.places(r)
+        every = self.landing_places(r)
         near = proximity.obstacle_clearances(every, self.radius, self.wrecks, _EVER)[0] < _PACE
         own, spare, taken = own.copy(), every[self.lost & ~near], np.flatnonzero(near[self.left])
         count = min(len(spare), len(taken))
         own[taken[:count]] = spare[:count]
         return own
 
-    def places(self, r: Floats) -> Floats:
+    def landing_places(self, r: Floats) -> Floats:
         """Landing places (N, 3) [m] of the vehicles' centres.
 
         Where they stood at the start; if they did not stand on the ground, a square grid below where they stop.
@@ -605,17 +605,17 @@ class Aborts:
 
     # -- aborts -------------------------------------------------------------------------------------------
 
-    def every(self) -> Iterator[Abort]:
+    def all_aborts(self) -> Iterator[Abort]:
         """The abort of each `step` of the flight."""
         end = self.end - self.options.reaction
         for k in range(1 + max(0, math.floor(end / self.options.step - 1e-9))):
-            yield self.at(k * self.options.step)
+            yield self.abort_at(k * self.options.step)
 
-    def at(self, ordered: float) -> Abort:
+    def abort_at(self, ordered: float) -> Abort:
         """What follows from an order at a time [s]."""
-        return self._leaving(ordered) if self.options.agents else self._of_all(ordered)
+        return self._of_leavers(ordered) if self.options.agents else self._for_all(ordered)
 
-    def _of_all(self, ordered: float) -> Abort:
+    def _for_all(self, ordered: float) -> Abort:
         """What follows for all at once."""
         begins = ordered + self.options.reaction
         phase = self.legs[self.leg_at(begins)].phase
@@ -627,11 +627,11 @@ class Aborts:
             return Abort(ordered, begins, (step,), Home((), "lands as planned"))
         if problem := problem or self.obstruction(step, begins):
             return Abort(ordered, begins, (step,), Home(reason=problem))
-        home = self.home(step, begins + step.duration)
+        home = self.way_home(step, begins + step.duration)
         return Abort(ordered, begins, (step, *home.steps), home, 0.0, step.duration)
 
     @cached_property
-    def _alone(self) -> Aborts:
+    def _leavers(self) -> Aborts:
         """The aborts of those that leave, who land where the plan leads them, if it lands."""
         stay = np.ones(self.mission.n_agents, dtype=np.bool_)
         stay[np.array(self.options.agents) - 1] = False
@@ -641,14 +641,14 @@ class Aborts:
             alone.start = self.plan.at(np.array([self.end]))[0]
         return alone
 
-    def _leaving(self, ordered: float) -> Abort:
+    def _of_leavers(self, ordered: float) -> Abort:
         """Some vehicles go home, as soon as they come near no other one; the others fly the plan on."""
-        begins, end, who = ordered + self.options.reaction, self.end, self._alone.left
+        begins, end, who = ordered + self.options.reaction, self.end, self._leavers.left
         order = np.concatenate([who, np.setdiff1d(self.left, who)])
         problem = "there is no time left"
-        plan = self.along("", _clock(begins, max(end - begins, SHORTEST), _ON)).least
+        plan = self.step_along("", _path_clock(begins, max(end - begins, SHORTEST), _ON)).least
         for waits in np.arange(0.0, end - begins, self.options.step).tolist():
-            alone = self._alone._of_all(ordered + waits)
+            alone = self._leavers._for_all(ordered + waits)
             if alone.reason:
                 problem = alone.reason
                 continue
@@ -674,17 +674,21 @@ class Aborts:
         ways = [Piecewise.hermite(last, states).later(-last[0])]
         if last[0] > begins:
             ways.insert(0, self.plan.between(begins, last[0]).later(-begins))
-        on = _in_a_row(ways)
+        on = _concatenate(ways)
         before = [on.between(0.0, waits)] if waits else []
-        own = _in_a_row([*before, *(step.way for step in steps)])
+        own = _concatenate([*before, *(step.way for step in steps)])
         knots = common_knots([own, on])
-        own, way, who = own.on(knots, stays=True), on.on(knots, stays=True), self._alone.left
+        own, way, who = (
+            own.refine(knots, stays=True),
+            on.refine(knots, stays=True),
+            self._leavers.left,
+        )
         way.pieces[:, who] = own.pieces[:, who]
         return way
 
     # -- who does not hear --------------------------------------------------------------------------------
 
-    def if_not_heard(self, abort: Abort) -> list[Worst]:
+    def nearness_if_not_heard(self, abort: Abort) -> list[Worst]:
         """How near each vehicle comes to another one if it does not hear the order and flies on, until the others rest.
 
         Distances between surfaces [m], at samples.
@@ -696,7 +700,7 @@ class Aborts:
         time = np.arange(abort.begins, min(abort.end, self.end), step)
         if len(left) < 2 or not len(time):
             return []
-        on, others = self.plan.at(time)[:, left], abort.at(time)[:, left]
+        on, others = self.plan.at(time)[:, left], abort.positions_at(time)[:, left]
         nearest = [KDTree(b).query(a, 2) for a, b in zip(on, others, strict=True)]
         far, whom = np.array([x for x, _ in nearest]), np.array([x for _, x in nearest])
         itself = whom[..., 0] == np.arange(len(left))
@@ -737,15 +741,15 @@ def _levels(distance: float, p: Floats, q: Floats) -> Ints:
 
     Of two that are one above the other at first, the higher one gets the higher level.
     """
-    near, level = neighbours(distance, p, q), np.full(len(p), -1)
+    near, level = neighbours_on_ways(distance, p, q), np.full(len(p), -1)
     for i in np.argsort(p[:, 2], kind="stable").tolist():
         others = np.array([j for j in near[i] if level[j] >= 0], dtype=np.int64)
         under = others[np.linalg.norm((p[others] - p[i])[:, :2], axis=1) < distance]
-        level[i] = first_free(level[others], int(level[under].max(initial=-1)) + 1)
+        level[i] = first_free_level(level[others], int(level[under].max(initial=-1)) + 1)
     return level
 
 
-def neighbours(distance: float, p: Floats, q: Floats) -> list[list[int]]:
+def neighbours_on_ways(distance: float, p: Floats, q: Floats) -> list[list[int]]:
     """Of each vehicle, the others that come nearer than a distance [m], seen from above, on ways from p to q (N, 3)."""
     near: list[list[int]] = [[] for _ in p]
     for i, j in pairs_nearer_than(distance, p * _ABOVE, q * _ABOVE).tolist():
@@ -754,7 +758,7 @@ def neighbours(distance: float, p: Floats, q: Floats) -> list[list[int]]:
     return near
 
 
-def first_free(taken: Ints, least: int = 0) -> int:
+def first_free_level(taken: Ints, least: int = 0) -> int:
     """The first level from a least one on that is not taken."""
     return next(k for k in itertools.count(least) if k not in taken)
 

@@ -30,7 +30,7 @@ def avoidance_in_flight(
     solids = join([thing.solid for thing in mission.obstacles])
     reach = np.inf if settings.sensing_range is None else settings.sensing_range
     drag = np.where([model.point for model in models], mission.drag / mass, 0.0)
-    return avoidance.avoidance(
+    return avoidance.avoidance_arrays(
         period=flight.every * flight.steps * flight.h,
         b=braking_accelerations(models, mission.gravity, mission.disturbances),
         lift=limit / mass,
@@ -38,7 +38,7 @@ def avoidance_in_flight(
         g=mission.gravity,
         radius=np.array(mission.agents.radius, dtype=float),
         solids=solids,
-        seen=avoidance.sight(
+        seen=avoidance.initial_sight(
             solids, reach, settings.sensing_noise, settings.obstacle_acceleration, settings.seed
         ),
         separation=separation,

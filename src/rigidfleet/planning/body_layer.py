@@ -44,7 +44,7 @@ class Detour:
     scale: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))  # and two derivatives
 
     @property
-    def none(self) -> bool:
+    def is_none(self) -> bool:
         """Whether there is none."""
         rest = self.scale - [1.0, 0.0, 0.0]
         return not (self.x.any() or self.omega.any() or rest.any() or self.rotation_vector.any())
@@ -63,7 +63,7 @@ class Detour:
             ]
         )  # fmt: skip
 
-    def end(self, still: bool) -> None:
+    def end_if_small(self, still: bool) -> None:
         """Take it as ended if it is small; ``still``: nothing else is asked of it."""
         rest = self.scale - [1.0, 0.0, 0.0]
         parts = self.x, self.omega, self.rotation_vector, rest
@@ -71,7 +71,7 @@ class Detour:
             self.x, self.Q, self.omega = np.zeros((3, 3)), np.eye(3), np.zeros((2, 3))
             self.scale = np.array([1.0, 0.0, 0.0])
 
-    def at(self, dt: float, accelerations: Floats, h: float) -> Detour:
+    def state_after(self, dt: float, accelerations: Floats, h: float) -> Detour:
         """The deviation after dt [s], if its second derivatives go linearly to those asked for (7,) within h [s]."""
         share = dt / h
 

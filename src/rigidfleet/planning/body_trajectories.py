@@ -85,7 +85,7 @@ def _responses(laws: Lqr, tracking: Tracking, length: float, rest: float) -> tup
 def stopping_motion(start: Pose, t0: float, arrival: float) -> Motion:
     """From a pose to rest with continuous acceleration and jerk, in one piece of degree 6; the pose decides where."""
     cm = np.stack([start.r, start.v, start.a, start.jerk])
-    begin = np.concatenate([cm, rotation_of(start, start.T)], axis=1)
+    begin = np.concatenate([cm, rotation_to_pose(start, start.T)], axis=1)
     piece = splines.stopping_piece(arrival - t0, begin)
     return as_motion(np.array([t0, arrival]), piece, start.T)
 
@@ -107,8 +107,8 @@ def smooth_motion(
     times = np.array([0.0, *(at.time or np.nan for at in through), total])
     if np.isnan(times).any():
         times = splines.best_times(total, *meets)
-    phi = np.stack([rotation_of(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
-    turn = Piecewise.hermite(times[[0, -1]], phi).on(times).pieces
+    phi = np.stack([rotation_to_pose(start, goal.T), np.stack([zero, goal.omega, zero, zero])], 1)
+    turn = Piecewise.hermite(times[[0, -1]], phi).refine(times).pieces
     cm = splines.minimum_snap(times, *meets)
     return as_motion(t0 + times, np.concatenate([cm, turn], axis=1), goal.T)
 
@@ -120,7 +120,7 @@ def points_passed(through: Sequence[Through], motion: Motion) -> tuple[dict[str,
     return tuple(at | {"time": t} for at, t in zip(points, times, strict=True))
 
 
-def rotation_of(start: Pose, T1: Floats) -> Floats:
+def rotation_to_pose(start: Pose, T1: Floats) -> Floats:
     """Rotation vector phi [rad] from an attitude T1 (3, 3) to that of a pose, and three derivatives (4, 3).
 
     Exp(phi) = T1 T^T, differentiated by the pose's body rates.
@@ -186,7 +186,7 @@ def orbit_motion(
     lacking = carried[None]
     if smooth:
         cm = np.stack([start.v, start.a, start.jerk])
-        full = np.concatenate([cm, rotation_of(start, attitude)[1:]], axis=1)
+        full = np.concatenate([cm, rotation_to_pose(start, attitude)[1:]], axis=1)
         lacking = full - states(np.zeros(1), np.zeros((0, 6)))[1:, 0]
     length, fastest = t_end - t0, max(abs(first), abs(rate))
     run_in = min(blend, length)

@@ -10,9 +10,9 @@ import numpy as np
 from rigidfleet.formation.assignment import closest_approach
 from rigidfleet.kernel.problem import SHAPE, Reference, septic_polynomial
 from rigidfleet.math import proximity
-from rigidfleet.math.piecewise import about
+from rigidfleet.math.piecewise import expand_about
 from rigidfleet.mission import Phase
-from rigidfleet.planning.derivatives import of_agents
+from rigidfleet.planning.derivatives import reference_of_agents
 from rigidfleet.typing import Bools, Floats
 
 #: Greatest size of slots, in bytes, whose least separation is cached.
@@ -68,7 +68,7 @@ def _of_some(reference: Reference, radius: Floats, lost: Bools | None) -> Certif
     """Certificate of the slots of vehicles that are not ``lost`` (N,)."""
     left = None if lost is None else np.flatnonzero(~lost)
     if left is not None:
-        reference, radius = of_agents(reference, left), radius[left]
+        reference, radius = reference_of_agents(reference, left), radius[left]
     if len(radius) < 2:
         return None
     some = reference
@@ -128,7 +128,7 @@ def of_ways(
         half = np.repeat(np.diff(knots) / 2, n - 1 - i)
         middle = np.repeat((knots[:-1] + knots[1:]) / 2, n - 1 - i)
         other = np.tile(np.arange(i + 1, n), len(knots) - 1)
-        c = about(c, half)
+        c = expand_about(c, half)
         while len(c):
             distance = np.linalg.norm(c[..., 0], axis=1)
             direction = c[..., 0] / np.where(distance > 0.0, distance, 1.0)[:, None]
@@ -140,7 +140,7 @@ def of_ways(
                 best = float(separation[k]), float(middle[k]), (i, int(other[k]))
             open_ = separation - fall < best[0] - CLOSE
             c, half, middle, other = c[open_], half[open_] / 2, middle[open_], other[open_]
-            c = np.concatenate([about(c, -half), about(c, half)])
+            c = np.concatenate([expand_about(c, -half), expand_about(c, half)])
             middle = np.concatenate([middle - half, middle + half])
             half, other = np.tile(half, 2), np.tile(other, 2)
     return Certificate(best[0] - CLOSE, best[1], best[2], "conservative advancement")

@@ -16,7 +16,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import proximity, series
 from rigidfleet.math.piecewise import piece_at
 from rigidfleet.mission import Obstacle
-from rigidfleet.planning.derivatives import of_agents, slot_derivatives
+from rigidfleet.planning.derivatives import reference_of_agents, slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.solids.records import Solids
 from rigidfleet.typing import Floats, Ints
@@ -71,7 +71,7 @@ def _bounds(knots: Floats, ways: Floats, begin: Floats, end: Floats) -> tuple[Fl
     return size, rate
 
 
-def pace(planned: PlannedPhase) -> Floats:
+def speed_bounds(planned: PlannedPhase) -> Floats:
     """Bounds (K - 1, N) [m/s] of the speeds between the samples of a planned phase."""
     time = planned.time
     return greatest_speeds(*planned.leg.paths, time[:-1], time[1:])
@@ -97,7 +97,7 @@ class _Spans(NamedTuple):
     who: Ints  # (n,) agents
     halved: int
 
-    def of(self, rows: Ints, columns: Ints) -> _Spans:
+    def select(self, rows: Ints, columns: Ints) -> _Spans:
         """Some spans, of some of the agents."""
         both = np.ix_(rows, columns)
         kept = (x[both] for x in (self.near, self.far, self.speed))
@@ -107,14 +107,14 @@ class _Spans(NamedTuple):
 def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Floats) -> Closest:
     """Least clearance of a planned phase to an obstacle in continuous time.
 
-    ``speed`` is the `pace` of the phase. Where the room between two samples might not do, the plan is evaluated in the
-    middle, and so on.
+    ``speed`` is the `speed_bounds` of the phase. Where the room between two samples might not do, the plan is evaluated
+    in the middle, and so on.
     """
     (reference, motion), solid = planned.leg.paths, thing.solid
     met: Obstacle | _Thing = thing
     time, position = planned.time, planned.position
     if np.isfinite(solid.there).any():
-        time, position, speed = _while_there(planned, *solid.there[0].tolist(), speed)
+        time, position, speed = _path_while_present(planned, *solid.there[0].tolist(), speed)
         met = _Thing(solid._replace(there=np.array([[-np.inf, np.inf]])))
     if not len(time):
         return Closest(np.inf, 0, float(planned.time[0]), np.inf)
@@ -136,17 +136,17 @@ def closest(planned: PlannedPhase, thing: Obstacle, radius: Floats, speed: Float
         if spans.halved == _HALVINGS or done > _IN_ALL:
             least = min(least, float(low.min()))
             continue
-        spans = spans.of(np.flatnonzero(open_.any(axis=1)), np.flatnonzero(open_.any(axis=0)))
+        spans = spans.select(np.flatnonzero(open_.any(axis=1)), np.flatnonzero(open_.any(axis=0)))
         rows, columns = np.arange(len(spans.first)), np.arange(len(spans.who))
         # Not all are near at the same time.
         if len(rows) > 1 and len(rows) * len(columns) > _AT_ONCE:
             halves = np.array_split(np.argsort(spans.first, kind="stable"), 2)
-            todo.extendleft(spans.of(half, columns) for half in halves)
+            todo.extendleft(spans.select(half, columns) for half in halves)
             continue
         done += len(rows) * len(columns)
         half = 0.5 * spans.length
         middle, who = spans.first + half, spans.who
-        r = slot_derivatives(of_agents(reference, who), motion, middle, 1)[:, 0]
+        r = slot_derivatives(reference_of_agents(reference, who), motion, middle, 1)[:, 0]
         between, _ = proximity.obstacle_clearances(r, radius[who], [met], middle)
         k, i = np.unravel_index(int(between.argmin()), between.shape)
         if between[k, i] < best:
@@ -167,7 +167,7 @@ class _Thing(NamedTuple):
     solid: Solids
 
 
-def _while_there(
+def _path_while_present(
     planned: PlannedPhase, since: float, until: float, speed: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Times (K,) of a phase from one time to another [s], positions (K, N, 3), and speeds (K - 1, N) between them."""

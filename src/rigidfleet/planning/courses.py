@@ -33,7 +33,7 @@ from rigidfleet.planning.body_trajectories import (
     as_motion,
     orbit_motion,
     regulated_motion,
-    rotation_of,
+    rotation_to_pose,
     smooth_motion,
     stopping_motion,
 )
@@ -164,7 +164,7 @@ def _vertical(mission: Mission, phase: Vertical, now: PhaseState, t_end: float) 
             travel = min(phase.travel or math.inf, t_end - now.t)
             lift = Lift(np.outer(rise - up[2], now.goal.T[:, 2]), travel)
     else:
-        up[2] = -max(0.0, height(mission, now))
+        up[2] = -max(0.0, height_above_landing(mission, now))
         v[2] = -min(TOUCH_DOWN, -up[2] / (arrival - now.t))
     goal = copy_with(now.goal, r=now.goal.r + up, v=v, omega=np.zeros(3))
     return Course(goal, arrival, partial(smooth_motion, now.pose, goal, now.t, arrival), lift)
@@ -185,7 +185,7 @@ def _follow(mission: Mission, phase: Follow, now: PhaseState, t_end: float) -> C
     knots, pieces = way.time * scale, way.pieces * scale ** -np.arange(float(way.pieces.shape[-1]))
     T1 = np.eye(3) if phase.turns_away else pose.T
     begin = np.concatenate(
-        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_of(pose, T1)], 1
+        [np.stack([pose.r, pose.v, pose.a, pose.jerk]), rotation_to_pose(pose, T1)], 1
     )
     lift, fade = None, min(_FADED, float(knots[-1]))
     body = np.zeros((len(pieces), 6, pieces.shape[-1]))
@@ -267,7 +267,7 @@ def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     assert now.goal is not None
     assert now.slots is not None
     n = mission.n_agents
-    place, ground = now.goal.r[2] + now.slots @ now.goal.T[:, 2], _grounds(mission, now)
+    place, ground = now.goal.r[2] + now.slots @ now.goal.T[:, 2], _heights_below(mission, now)
     if phase.level is None:
         up = np.minimum(ground + (ABOVE + mission.fleet.radius) - place, 0.0)
     else:
@@ -277,7 +277,7 @@ def rises(mission: Mission, phase: Vertical, now: PhaseState) -> Floats:
     return np.where(goes if now.lost is None else goes & ~now.lost, up, 0.0)
 
 
-def _grounds(mission: Mission, now: PhaseState) -> Floats:
+def _heights_below(mission: Mission, now: PhaseState) -> Floats:
     """Height (N,) [m] of what is below each vehicle at the pose to hold; of a lost one, the least of the others'.
 
     Raises
@@ -298,13 +298,13 @@ def _grounds(mission: Mission, now: PhaseState) -> Floats:
     return np.where(flying, heights, heights[flying].min())
 
 
-def height(mission: Mission, now: PhaseState) -> float:
+def height_above_landing(mission: Mission, now: PhaseState) -> float:
     """How far [m] the lowest vehicle is above the height at which a landing ends, at the pose to hold."""
     assert now.goal is not None
     assert now.slots is not None
     left = np.ones(mission.n_agents, dtype=np.bool_) if now.lost is None else ~now.lost
     below = now.goal.r[2] + now.slots @ now.goal.T[:, 2] - mission.fleet.radius
-    return float(below[left].min() - _grounds(mission, now).min()) - ABOVE
+    return float(below[left].min() - _heights_below(mission, now).min()) - ABOVE
 
 
 def _course_to(

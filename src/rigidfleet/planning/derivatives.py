@@ -55,7 +55,7 @@ def slot_derivatives(
     return derivatives.transpose(3, 0, 2, 1)
 
 
-def of_agents(reference: Reference, who: Ints) -> Reference:
+def reference_of_agents(reference: Reference, who: Ints) -> Reference:
     """The reference of some agents' slots."""
     if len(who) == len(reference.p0):
         return reference
@@ -71,7 +71,7 @@ def slots_by_own_clocks(reference: Reference, motion: Motion, time: Floats, tau:
     """
     out = np.empty((len(time), 4, tau.shape[1], 3))
     for i in range(tau.shape[1]):
-        alone = of_agents(reference, np.array([i]))
+        alone = reference_of_agents(reference, np.array([i]))
         own, (s, slope) = time + tau[:, i, 0], tau[:, i, 1:3].T[..., None]
         inside = np.maximum(own, motion.knots[0])
         r, v, a, j = slot_derivatives(alone, motion, inside, 4)[:, :, 0].swapaxes(0, 1)
@@ -219,31 +219,31 @@ def yaw_along(
         v = on_grid[1, :2, :, 0]
         from_body = yaw_of(body, on_grid, Yaw())[0, :, 0]
         start = np.where(np.hypot(*v) > SLOW, np.arctan2(v[1], v[0]), from_body)
-    terms = np.ascontiguousarray(_steering(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
+    terms = np.ascontiguousarray(_yaw_terms(on_grid)[0].transpose(2, 0, 1))  # (times, 3, N)
     between = terms[len(ends) :]
     grid = np.empty((len(ends), len(start)))
     grid[0] = start
     for k, h in enumerate(np.diff(ends)):
         y, middle = grid[k], between[k]
-        k1 = _turning(y, terms[k])
-        k2 = _turning(y + 0.5 * h * k1, middle)
-        k3 = _turning(y + 0.5 * h * k2, middle)
-        k4 = _turning(y + h * k3, terms[k + 1])
+        k1 = _yaw_rate(y, terms[k])
+        k2 = _yaw_rate(y + 0.5 * h * k1, middle)
+        k3 = _yaw_rate(y + 0.5 * h * k2, middle)
+        k4 = _yaw_rate(y + h * k3, terms[k + 1])
         grid[k + 1] = y + h / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
     angles = grid
     if not np.array_equal(time, ends):
-        rates = _turning(grid, terms[: len(ends)].swapaxes(0, 1))
+        rates = _yaw_rate(grid, terms[: len(ends)].swapaxes(0, 1))
         angles = _hermite(ends, grid, rates, time)
     known = max(len(ends) - 3, 0)
     angles = angles.T
-    now, (A_dot, B_dot, C_dot) = _steering(slots)
+    now, (A_dot, B_dot, C_dot) = _yaw_terms(slots)
     cos, sin = np.cos(angles), np.sin(angles)
-    first = _turning(angles, now)
+    first = _yaw_rate(angles, now)
     second = A_dot + B_dot * cos + C_dot * sin + first * (now[2] * cos - now[1] * sin)
     return np.stack([angles, first, second]), (float(ends[known]), grid[known])
 
 
-def _steering(slots: Floats) -> tuple[Floats, Floats]:
+def _yaw_terms(slots: Floats) -> tuple[Floats, Floats]:
     """Terms A, B, C (3, N, K) of yaw' = A + B cos yaw + C sin yaw of kind "along", and their rates, from `slot_series`.
 
     |v| - h . v becomes (|v|^2 - |v| h . v) / sqrt(|v|^2 + SLOW^2), which is smooth at rest.
@@ -267,8 +267,8 @@ def _steering(slots: Floats) -> tuple[Floats, Floats]:
     return np.stack(terms), np.stack(rates)
 
 
-def _turning(yaw: Floats, terms: Floats) -> Floats:
-    """Rate of yaw "along" [rad/s] at yaws (...) from the `_steering` terms (3, ...)."""
+def _yaw_rate(yaw: Floats, terms: Floats) -> Floats:
+    """Rate of yaw "along" [rad/s] at yaws (...) from the `_yaw_terms` terms (3, ...)."""
     return terms[0] + terms[1] * np.cos(yaw) + terms[2] * np.sin(yaw)
 
 

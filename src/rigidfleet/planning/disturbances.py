@@ -74,17 +74,17 @@ def _gusts(mission: Mission, gusts: Gusts, wind: Floats, step: float) -> Floats:
     u, sigma = np.empty(white[0].shape), intensity(gusts, speed)
     if gusts.model == "first-order":
         assert gusts.time_scale is not None  # checked on entry
-        np.multiply(filters.first_order(white[0], step, gusts.time_scale), sigma, out=u)
+        np.multiply(filters.gauss_markov(white[0], step, gusts.time_scale), sigma, out=u)
     else:
         if gusts.altitude is not None:
-            _, length = turbulence.low_altitude(gusts.altitude, speed)
+            _, length = turbulence.low_altitude_gusts(gusts.altitude, speed)
         else:
             length = np.broadcast_to(np.array(gusts.length, dtype=np.float64), 3)
         tau = length / (gusts.airspeed or speed)
-        u[..., 0] = sigma[0] * filters.first_order(white[0, ..., 0], step, tau[0])
+        u[..., 0] = sigma[0] * filters.gauss_markov(white[0, ..., 0], step, tau[0])
         by_sample = white.swapaxes(0, 1)
         for axis in (1, 2):
-            u[..., axis] = sigma[axis] * filters.second_order(by_sample[..., axis], step, tau[axis])
+            u[..., axis] = sigma[axis] * filters.dryden_gust(by_sample[..., axis], step, tau[axis])
     return (u.reshape(-1, 3) @ _wind_axes(wind)).reshape(u.shape)
 
 
@@ -102,7 +102,7 @@ def _places(mission: Mission) -> Floats:
     return mission.fleet.position.copy() if slots is None else slots
 
 
-def held_in_place(problem: Problem, fixed: Ints) -> Problem:
+def with_fixed_agents(problem: Problem, fixed: Ints) -> Problem:
     """The problem in which agents (F,), from 0, never move: for the equations of motion their mass is infinite."""
     m, true = problem.vehicles.m.copy(), problem.disturbance.inverse.copy()
     m[fixed], true[fixed] = math.inf, 0.0

@@ -17,7 +17,7 @@ from rigidfleet.typing import Floats
 _PIVOT, _EARLY = 2.0 - math.sqrt(3.0), 16
 
 
-def first_order(white: Floats, step: float, tau: float) -> Floats:
+def gauss_markov(white: Floats, step: float, tau: float) -> Floats:
     """Gauss-Markov process (K, ...) of unit variance and autocorrelation exp(-|t| / tau).
 
     x_{k+1} = a x_k + sqrt(1 - a^2) e_k with a = exp(-step / tau), stationary from the start (Uhlenbeck and
@@ -28,7 +28,7 @@ def first_order(white: Floats, step: float, tau: float) -> Floats:
     return _recursion(x, math.exp(-step / tau))
 
 
-def second_order(white: Floats, step: float, tau: float) -> Floats:
+def dryden_gust(white: Floats, step: float, tau: float) -> Floats:
     """Dryden's transverse process (K, ...), unit variance, autocorrelation exp(-s) (1 - s / 2), s = |t| / tau.
 
     Its spectrum is that of (1 + sqrt(3) tau s) / (1 + tau s)^2, the lateral and vertical filter of MIL-F-8785C. In
@@ -85,7 +85,7 @@ def _recursion(x: Floats, a: float) -> Floats:
     from rigidfleet.kernel.engine import native  # loads the compiled kernel
 
     z = np.ascontiguousarray(x)
-    native.follow(z.reshape(len(z), -1), np.full(len(z), a))
+    native.recurse(z.reshape(len(z), -1), np.full(len(z), a))
     return z
 
 
@@ -101,8 +101,8 @@ def spline_coefficients(samples: Floats, scale: float = 1.0, part: int | None = 
     flat, width = np.ascontiguousarray(samples).reshape(n, -1), math.prod(shape)
     table = np.empty((n + 2, width))
     c, (factors, shares) = table[1:-1], _elimination(n)
-    native.follow_multiples(flat, (part or 0) * width, scale * shares, c, factors)
-    native.follow(c, factors, backward=True)
+    native.recurse_multiples(flat, (part or 0) * width, scale * shares, c, factors)
+    native.recurse(c, factors, backward=True)
     table[0], table[-1] = 2.0 * c[0] - c[1], 2.0 * c[-1] - c[-2]
     return table.reshape(n + 2, *shape)
 

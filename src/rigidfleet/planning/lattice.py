@@ -57,12 +57,12 @@ class FreeSpace(NamedTuple):
 
         Beyond ``most`` (..., M) [m] the distance does not matter.
         """
-        least = self.apart(r, radius, most)
+        least = self.room_beside_obstacles(r, radius, most)
         if self.has_fence:
             least = np.minimum(least, np.minimum(r - self.fence[0], self.fence[1] - r).min(axis=-1))
         return least
 
-    def apart(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
+    def room_beside_obstacles(self, r: Floats, radius: Floats, most: Floats | float) -> Floats:
         """The same from obstacles alone."""
         return proximity.obstacle_clearances(r, radius, self.obstacles, most=most)[0]
 
@@ -118,7 +118,7 @@ def keeps_room(
         middle = low + length / 2
         place = a[who] + middle[:, None] * (b - a)[who]
         wanted = need + way[who] * length / 2
-        room = space.apart(place[:, None] + path(middle), radius, wanted)
+        room = space.room_beside_obstacles(place[:, None] + path(middle), radius, wanted)
         free[who[(room < need).any(axis=1)]] = False
         open_ = free[who] & (room < wanted).any(axis=1)
         who, low, length = who[open_], low[open_], length / 2
@@ -131,7 +131,7 @@ def keeps_room(
     return free
 
 
-def staying(layer: Layer) -> Path:
+def constant_path(layer: Layer) -> Path:
     """The path of a layer that does not change."""
     return lambda share: np.broadcast_to(layer.offsets, (len(share), *layer.offsets.shape))
 
@@ -173,7 +173,7 @@ class Lattice:
         edges = self.all_edges[:, free[self.all_edges].all(axis=0)]
         still = np.zeros(len(radius))
         a, b = self.points[edges[0]], self.points[edges[1]]
-        self.edges = edges[:, keeps_room(space, a, b, staying(layer), still, radius, need)]
+        self.edges = edges[:, keeps_room(space, a, b, constant_path(layer), still, radius, need)]
         self.common = index[
             np.ix_(*(np.searchsorted(axes[k], common[k]) for k in range(3)))
         ].ravel()
@@ -283,7 +283,7 @@ class Roadmap:
         a, b = np.repeat(a, near.shape[1]), b[near.ravel()]
         p, q = one.points[a], two.points[b]
         still = np.zeros(len(self.radius))
-        good = keeps_room(self.space, p, q, staying(layer), still, self.radius, self.need)
+        good = keeps_room(self.space, p, q, constant_path(layer), still, self.radius, self.need)
         cost = np.linalg.norm(p - q, axis=1)[good]
         return a[good] + self.first[0, k], b[good] + self.first[f, k], cost
 
@@ -325,7 +325,7 @@ class Roadmap:
     def _free(self, a: Stop, b: Stop) -> bool:
         """Whether the motion from one stop to another is proved: straight in one layer, or a change on the spot."""
         (p, i), (q, j) = a, b
-        path, ways = staying(self.layers[i]), np.zeros(len(self.radius))
+        path, ways = constant_path(self.layers[i]), np.zeros(len(self.radius))
         if i != j:
             change = next((c for c in self.changes if {c.before, c.after} == {i, j}), None)
             if change is None or not np.array_equal(p, q):
@@ -366,7 +366,7 @@ class Roadmap:
         ]
         return [s for s, again in zip(stops, alike, strict=True) if not again]
 
-    def _rooms(self) -> Iterator[tuple[Ints, Ints, Floats]]:
+    def _rooms_of_motions(self) -> Iterator[tuple[Ints, Ints, Floats]]:
         """Nodes of the world's lattice that a motion or a change joins, proved or not, and the room there [m]."""
         row, first = self.lattices[0], self.first[0]
         for k, x in enumerate(row):
@@ -386,7 +386,7 @@ class Roadmap:
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-        tail, head, room = map(np.concatenate, zip(*self._rooms(), strict=True))
+        tail, head, room = map(np.concatenate, zip(*self._rooms_of_motions(), strict=True))
         # Of places that are as narrow, the one nearest to the straight way.
         along = end[0] - begin[0]
         beside = np.cross(self.points[tail] - begin[0], along / max(np.linalg.norm(along), 1e-9))

@@ -59,7 +59,7 @@ def candidate_shapes(mission: Mission, phase: Go, own: str) -> Iterator[Candidat
             yield CandidateShape(name, slots, stage)
 
 
-def frames(obstacles: Sequence[Obstacle]) -> list[Floats]:
+def lattice_axes(obstacles: Sequence[Obstacle]) -> list[Floats]:
     """Axes (3, 3) of the lattices: the world's, and those of boxes that are turned about the vertical."""
     rotations = [np.eye(3)]
     for thing in obstacles:
@@ -99,7 +99,7 @@ def narrow_yaws(slots: Floats, start: Angles, axes: list[Floats]) -> set[float]:
     return yaws
 
 
-def changes(
+def layer_changes(
     mission: Mission, shapes: Sequence[CandidateShape], angles: Sequence[Angles]
 ) -> Iterator[Change]:
     """Turns and changes of shape, each between two layers; layers are all angles of the first shape, and so on."""
@@ -109,17 +109,17 @@ def changes(
             for j in range(i + 1, count):
                 if angle_between(angles[i], angles[j]) < _HALF:
                     yield Change(
-                        s * count + i, s * count + j, *_turning(shape.slots, angles[i], angles[j])
+                        s * count + i, s * count + j, *_turn_path(shape.slots, angles[i], angles[j])
                     )
     for s, one in enumerate(shapes):
         for t in range(s + 1, len(shapes)):
             for i in range(count):
-                folding = _folding(mission, one, shapes[t], angles[i])
+                folding = _fold_path(mission, one, shapes[t], angles[i])
                 if folding is not None:
                     yield Change(s * count + i, t * count + i, *folding)
 
 
-def _turning(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats]:
+def _turn_path(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats]:
     """Offsets of slots that turn on the spot from one attitude to another, and their ways (N,) [m]."""
     A, B = (att.dcm_from_euler(np.deg2rad(x)) for x in (before, after))
     phi = att.rotation_vector_from_dcm(A @ B.T)
@@ -129,7 +129,7 @@ def _turning(slots: Floats, before: Angles, after: Angles) -> tuple[Path, Floats
     )
 
 
-def _folding(
+def _fold_path(
     mission: Mission, one: CandidateShape, two: CandidateShape, angles: Angles
 ) -> tuple[Path, Floats] | None:
     """Offsets and ways of a change of shape, as references blend it; None if agents come too near each other."""

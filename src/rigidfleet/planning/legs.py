@@ -143,7 +143,7 @@ class Leg:
         """Time [s] at which the phase is expected to end: one that ends by settling, soon after it reaches its goal."""
         if self.phase.settle is None:
             return self.t_end
-        return self.start + settling_length(self.phase, self.constraint, self._time_near_goal())
+        return self.start + settling_duration(self.phase, self.constraint, self._time_near_goal())
 
     def _time_near_goal(self) -> float:
         """Time [s] from the start from which on the body is planned to be as near its goal as the phase asks for."""
@@ -175,9 +175,9 @@ class Leg:
             pose = None
         elif not self.smooth:
             pose = Pose(pose.r, pose.v, pose.T, pose.omega)
-        return self.handed_on(t, r, v, frame, pose)
+        return self.next_start(t, r, v, frame, pose)
 
-    def handed_on(
+    def next_start(
         self, t: float, r: Floats, v: Floats, frame: Floats | None, pose: Pose | None
     ) -> PhaseState:
         """The state from which the next phase starts if this one ends at t [s], with the agents at r and v (N, 3)."""
@@ -190,7 +190,7 @@ class Leg:
         )  # fmt: skip
 
 
-def at_start(mission: Mission) -> PhaseState:
+def state_at_start(mission: Mission) -> PhaseState:
     """The state in which a mission starts."""
     frame = None if mission.body_frame is None else mission.drawn_attitude
     return PhaseState(0.0, mission.fleet.position, mission.fleet.velocity, frame=frame)
@@ -321,7 +321,7 @@ def latest_end(phase: Phase, start: float) -> float:
     return start + seconds(phase.duration or (phase.settle or Settle()).timeout)
 
 
-def settling_length(phase: Phase, constraint: Constraint, reached: float = 0.0) -> float:
+def settling_duration(phase: Phase, constraint: Constraint, reached: float = 0.0) -> float:
     """Expected duration [s] of a phase that ends by settling: soon after its motion.
 
     Errors of distances have to settle; the goal is ``reached`` so long after the start [s].
@@ -338,6 +338,6 @@ def phase_spans(mission: Mission) -> list[tuple[float, float]]:
     for phase in mission.phases:
         begin, end = end, latest_end(phase, end)
         if phase.settle is not None:
-            end = begin + settling_length(phase, mission.constraint)
+            end = begin + settling_duration(phase, mission.constraint)
         spans.append((begin, end))
     return spans

@@ -19,7 +19,7 @@ from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math.bernstein import SIZES
 from rigidfleet.mission import Mission
 from rigidfleet.mission.schema import Limits
-from rigidfleet.planning.derivatives import of_agents, slot_derivatives
+from rigidfleet.planning.derivatives import reference_of_agents, slot_derivatives
 from rigidfleet.planning.vehicles import air_force
 from rigidfleet.typing import Floats, Ints
 
@@ -59,7 +59,7 @@ def limits_of(
 ) -> list[Limit]:
     """The limits that a mission sets to its references, or other ``limits`` in place of its own.
 
-    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.reserves`).
+    With ``reserve`` (N,) [s], quantities are the greatest that vehicles reach (`planning.vehicles.lag_times`).
     """
     limits, n = limits or mission.limits, mission.n_agents
     mass, up = mission.fleet.mass, np.array([0.0, 0.0, mission.gravity])
@@ -110,11 +110,11 @@ def use_of_limits(
     best: list[Reached | None] = [None] * len(limits)
     for first in range(0, n, step):
         who = np.arange(first, min(first + step, n))
-        x = slot_derivatives(of_agents(reference, who), motion, time, 4)
+        x = slot_derivatives(reference_of_agents(reference, who), motion, time, 4)
         for k, limit in enumerate(limits):
             if not np.isfinite(limit.most[who]).any():
                 continue
-            highest = _highest(limit, reference, motion, time, x, who, fine=fine)
+            highest = _greatest_share(limit, reference, motion, time, x, who, fine=fine)
             before = best[k]
             if before is None or highest.share > before.share:
                 best[k] = highest
@@ -132,7 +132,7 @@ def _grid(reference: Reference, motion: Motion, begin: float, end: float) -> Flo
     return np.unique(np.concatenate([np.linspace(begin, end, _PHASE), inside, knots, blend]))
 
 
-def _highest(
+def _greatest_share(
     limit: Limit,
     reference: Reference,
     motion: Motion,
@@ -156,7 +156,7 @@ def _highest(
         low, high = time[max(k - 1, 0)], time[min(k + 1, len(time) - 1)]
         for _ in range(_TIMES):
             near = np.linspace(low, high, _FINE)
-            y = slot_derivatives(of_agents(reference, agent), motion, near, 4)
+            y = slot_derivatives(reference_of_agents(reference, agent), motion, near, 4)
             values = (limit.values(y, agent) / limit.most[agent])[:, 0]
             j = int(values.argmax())
             best = max(best, (values[j], near[j], int(agent[0])))

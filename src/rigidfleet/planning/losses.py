@@ -27,8 +27,8 @@ from rigidfleet.planning.abort import (
     phases_of,
     state_to_leave,
 )
-from rigidfleet.planning.clearance import CLOSE, closest, pace
-from rigidfleet.planning.courses import height, rises
+from rigidfleet.planning.clearance import CLOSE, closest, speed_bounds
+from rigidfleet.planning.courses import height_above_landing, rises
 from rigidfleet.planning.legs import Leg, depart, leg_from, leg_of, phase_spans
 from rigidfleet.planning.limits import use_of_limits
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase
@@ -82,8 +82,8 @@ def answer_to(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Leg
     if not mission.aborts:
         return Answer(after_loss(mission, now, plan))
     legs = plan()
-    abort = Aborts(mission, legs, now.lost).at(now.t - mission.aborting.reaction)
-    phases, least = phases_of(mission, abort.steps, "abort: "), abort.least.separation
+    abort = Aborts(mission, legs, now.lost).abort_at(now.t - mission.aborting.reaction)
+    phases, least = phases_of(mission, abort.steps, "abort: "), abort.certificate.separation
     promise = least if abort.way and math.isfinite(least) else None
     return Answer(legs_from(mission, state_to_leave(legs, now), phases), abort.reason, promise)
 
@@ -98,7 +98,7 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     def then(make: Callable[[float], Phase], *, freely: bool = False) -> bool:
         """Add the leg of a phase; with ``freely``, only if it leads into nothing. Return whether it was added."""
         nonlocal now
-        leg = _shortest(mission, now, make, SHORTEST)
+        leg = _shortest_leg(mission, now, make, SHORTEST)
         if freely and _hits(mission, leg):
             return False
         legs.append(leg)
@@ -135,13 +135,13 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
     each = partial(land, agents=everyone)
     ways = [(each, -float(rises(mission, each(duration=1.0), now).min()))]
     if shaped:  # together, unless something is below some
-        ways.insert(0, (land, height(mission, now)))
+        ways.insert(0, (land, height_above_landing(mission, now)))
     for make, depth in ways:
         if depth <= 0.0:
             return legs
         least = max(_PEAK_SPEED * depth / DESCENT, SHORTEST)
         least = max(math.sqrt(_PEAK_ACCELERATION * depth / _DESCENDING), least)
-        down = _shortest(mission, now, lambda t, make=make: make(duration=t), least)
+        down = _shortest_leg(mission, now, lambda t, make=make: make(duration=t), least)
         if not _hits(mission, down):
             break
     return [*legs, down]
@@ -150,11 +150,11 @@ def after_loss(mission: Mission, now: PhaseState, plan: Callable[[], Sequence[Le
 def _hits(mission: Mission, leg: Leg) -> bool:
     """Whether a leg leads a slot into an obstacle or the ground."""
     planned = planned_phase(leg, FEWEST_SAMPLES)
-    near = (closest(planned, x, leg.radius, pace(planned)) for x in mission.obstacles)
+    near = (closest(planned, x, leg.radius, speed_bounds(planned)) for x in mission.obstacles)
     return any(x.clearance < -CLOSE for x in near)
 
 
-def _shortest(
+def _shortest_leg(
     mission: Mission, now: PhaseState, make: Callable[[float], Phase], least: float
 ) -> Leg:
     """The leg of a phase of the shortest time from ``least`` [s] on, to within a tenth, that keeps the limits.

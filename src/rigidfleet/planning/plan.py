@@ -47,7 +47,7 @@ from rigidfleet.planning import solvers
 from rigidfleet.planning.body_trajectories import points_passed
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.courses import regulators
-from rigidfleet.planning.disturbances import held_in_place, without
+from rigidfleet.planning.disturbances import with_fixed_agents, without
 from rigidfleet.planning.legs import Leg
 from rigidfleet.planning.reference import PhaseState, Pose, copy_as, copy_with, pose_at
 from rigidfleet.planning.tolerances import (
@@ -116,7 +116,7 @@ class PhasePlan(Leg):
             **({"through": list(self.through)} if self.through else {}),
         }
 
-    def stay(self, t: float) -> dict[str, Any] | None:
+    def stay_target(self, t: float) -> dict[str, Any] | None:
         """What the phase promises of its end at t [s] beside its target; None for nothing.
 
         A phase that stays comes to rest, and keeps the attitude commanded before if it tracks slots. Another one goes
@@ -139,10 +139,10 @@ class PhasePlan(Leg):
             table |= {"attitude": att.quaternion_from_dcm(T).tolist(), "rates": goal.omega.tolist()}
         return table if len(table) > 1 else None
 
-    def state(self) -> Floats:
+    def initial_state(self) -> Floats:
         """The kernel's state vector (n,) at the start; `rigidfleet.kernel.dynamics` says what it holds."""
         now, masses = self.before, self.masses
-        integral = now.integral.of(self.edges, 0.0)
+        integral = now.integral.values_of(self.edges, 0.0)
         if self.frame is None:
             return np.concatenate([now.r.ravel(), now.v.ravel(), integral])
         q = att.quaternion_from_dcm(self.frame)
@@ -175,7 +175,7 @@ class PhasePlan(Leg):
         share = min(max(_RESIDUAL * self.integrator.rtol, _LEAST_RESIDUAL), _MOST_RESIDUAL)
         return share, _FLOOR * float(self.velocity_tolerance().min())  # over a step of 1 s
 
-    def release(self, lost: Bools, parted: Bools) -> Bools:
+    def remove_lost_edges(self, lost: Bools, parted: Bools) -> Bools:
         """Remove the edges of vehicles ``lost`` (N,) and links ``parted`` (L,); return which edges (m,) are kept."""
         n = len(lost)
         pairs = self.links_lost[0][parted]
@@ -183,7 +183,7 @@ class PhasePlan(Leg):
         kept = ~np.any(lost[self.edges], axis=1) & ~np.isin(keys, pairs[:, 0] * n + pairs[:, 1])
         self.edges, self.distances = self.edges[kept], self.distances[kept]
         self.__dict__.pop("tolerances", None)
-        self.method = solvers.choose(len(lost), self.edges, self.constraint.solver)
+        self.method = solvers.choose_method(len(lost), self.edges, self.constraint.solver)
         self.problem = without(self.problem, kept, lost, self.damping(lost), large=self.large)
         return kept
 
@@ -198,7 +198,7 @@ class PhasePlan(Leg):
             pose = Pose(w.body[0].copy(), w.body[1].copy(), w.T_ref.copy(), w.body[3].copy())
             pose = pose_at(self.problem.motion, t) if self.smooth else pose
         return copy_with(
-            self.handed_on(t, w.r.copy(), w.v.copy(), frame, pose),
+            self.next_start(t, w.r.copy(), w.v.copy(), frame, pose),
             integral=self.before.integral.with_values(self.edges, y[6 * n : 6 * n + m]),
             reference=self.before.reference.with_values(self.edges, self.distances),
         )
@@ -226,14 +226,14 @@ def plan_phase(
     phase, shaping, now, name = leg.phase, leg.phase.shaping, leg.departure.now, leg.formation
     masses = mission.fleet.mass.copy()
     edges = mission.formation_edges(name) if name else np.zeros((0, 2), dtype=np.int64)
-    method = solvers.choose(len(masses), edges, mission.constraint.solver)
+    method = solvers.choose_method(len(masses), edges, mission.constraint.solver)
     _refuse(mission, phase, leg.start, edges if method == "dense" else edges[:0])
     d1 = mission.formation_distances(name) if name else np.zeros(0)
     if shaping is None:
-        d1 = now.reference.of(edges, d1)
+        d1 = now.reference.values_of(edges, d1)
     reference = leg.reference
     if shaping is not None or now.blend is None:
-        d0 = now.reference.of(edges, lambda: distance_geometry.distances(now.r, edges))
+        d0 = now.reference.values_of(edges, lambda: distance_geometry.distances(now.r, edges))
         # Distances are those of the slots where these have the lengths commanded.
         agree = shaping is None and phase.control == "tracking" and _agree(d1, reference.p0, edges)
         reference = reference._replace(kind=SHAPE if agree else reference.kind, d0=d0, d1=d1)
@@ -264,7 +264,7 @@ def plan_phase(
         external=_limit_steps(external or External(), motion, reference),
     )  # fmt: skip
     if mission.agents.fixed:
-        problem = held_in_place(problem, np.array(mission.agents.fixed) - 1)
+        problem = with_fixed_agents(problem, np.array(mission.agents.fixed) - 1)
     plan = copy_as(
         PhasePlan, leg, reference=reference, masses=masses, problem=problem, edges=edges, distances=d1,
         attached=leg.before.slots is not None or phase.control != "open",
@@ -278,7 +278,7 @@ def plan_phase(
         lost = np.zeros(len(masses), dtype=np.bool_) if now.lost is None else now.lost
         parted = plan.links_lost[1] <= now.t
         if lost.any() or parted.any():
-            plan.release(lost, parted)
+            plan.remove_lost_edges(lost, parted)
     return plan
 
 
@@ -307,7 +307,7 @@ def _refuse(mission: Mission, phase: Phase, start: float, edges: Ints) -> None:
             f" {start:.2f} s. Give it a duration instead of until"
         )
     n, solver = mission.n_agents, mission.constraint.solver
-    size = solvers.equations(n, len(edges), solver)
+    size = solvers.system_size(n, len(edges), solver)
     if phase.shaping is not None and size > solvers.MOST_DENSE:
         raise StoppedError(
             f"phase '{phase.name}' takes '{phase.shaping.formation}', whose {len(edges):,} edges between"

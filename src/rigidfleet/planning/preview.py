@@ -9,7 +9,7 @@ import numpy as np
 from rigidfleet.mission import Mission
 from rigidfleet.planning.certificate import Certificate
 from rigidfleet.planning.derivatives import slot_derivatives
-from rigidfleet.planning.legs import Leg, at_start, leg_of
+from rigidfleet.planning.legs import Leg, leg_of, state_at_start
 from rigidfleet.typing import Floats
 
 #: Samples of a planned phase: their number, or the time between them [s], within bounds.
@@ -69,7 +69,7 @@ def preview(mission: Mission, phases: int | None = None) -> tuple[list[PlannedPh
     possible = len(mission.phases) * min(most, FEWEST_SAMPLES) // FEWEST_SAMPLES
     most = max(most, FEWEST_SAMPLES)
     wanted = mission.phases[:phases]
-    now = at_start(mission)
+    now = state_at_start(mission)
     for phase in wanted[:possible]:
         leg = leg_of(mission, phase, now)
         if not leg.known:

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.arrays import same
+from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.formation import distance_geometry
 from rigidfleet.kernel.problem import Motion, Reference
 from rigidfleet.math import attitude as att
@@ -29,7 +29,7 @@ class ByEdge:
     edges: Ints = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     values: Floats = field(default_factory=lambda: np.zeros(0))
 
-    def of(self, edges: Ints, other: Floats | float | Callable[[], Floats]) -> Floats:
+    def values_of(self, edges: Ints, other: Floats | float | Callable[[], Floats]) -> Floats:
         """Values (m,) of edges (m, 2), i < j; ``other`` (m,) for new edges, or (B, m), then of so many flights.
 
         A function of ``other`` values is called only where edges may be new.
@@ -56,7 +56,7 @@ class ByEdge:
 
     def _has(self, edges: Ints) -> bool:
         """Whether these are its edges, in the same order: most phases have those of the phase before."""
-        return same(edges, self.edges)
+        return arrays_equal(edges, self.edges)
 
 
 def _keys(edges: Ints) -> Ints:
@@ -157,10 +157,10 @@ def reference_kind(
         return "squares"
     edges = mission.formation_edges(phase.formation)
     lengths = mission.formation_distances(phase.formation)
-    return _leads(before, target, edges, lengths)
+    return _leading_kind(before, target, edges, lengths)
 
 
-def _leads(
+def _leading_kind(
     before: Floats, target: Floats, edges: Ints, lengths: Floats
 ) -> Literal["shape", "squares"]:
     """Kind of reference that leads from slots to others, whose edges have lengths (m,) [m] asked for."""

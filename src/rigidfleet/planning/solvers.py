@@ -28,17 +28,17 @@ WORDS: dict[Method, str] = {
 }
 
 
-def equations(n: int, m: int, solver: str) -> int:
+def system_size(n: int, m: int, solver: str) -> int:
     """Size of the dense system of ``m`` edges between ``n`` agents under a law."""
     return min(m, 3 * n) if solver == "iterated" else m
 
 
-def choose(n: int, edges: Ints, solver: str) -> Method:
+def choose_method(n: int, edges: Ints, solver: str) -> Method:
     """The method for ``n`` agents, edges (m, 2) and a law (`Constraint.solver`).
 
     Laws that need eigenvalues ("spectral", "pinv") are solved densely at any size.
     """
-    size = equations(n, len(edges), solver)
+    size = system_size(n, len(edges), solver)
     if solver == "exact" and size >= FROM_ELIMINATION and elimination_steps(n, edges) is not None:
         return "elimination"
     return "sparse" if solver in ("iterated", "exact") and size >= FROM_SPARSE else "dense"

@@ -19,11 +19,11 @@ from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import ways
 from rigidfleet.planning.body_trajectories import points_passed
 from rigidfleet.planning.courses import course_conflict
-from rigidfleet.planning.legs import Departure, Leg, at_start, depart, leg_from
+from rigidfleet.planning.legs import Departure, Leg, depart, leg_from, state_at_start
 from rigidfleet.planning.limits import Limit, Reached, limits_of, use_of_limits
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transitions import expand_phases
-from rigidfleet.planning.vehicles import reserves
+from rigidfleet.planning.vehicles import lag_times
 
 #: Shortest and longest time tried [s], and the number of times tried.
 _SHORTEST, _LONGEST, _TRIES = 0.1, 1e5, 60
@@ -87,7 +87,7 @@ def complete_times(mission: Mission) -> Mission:
     if last is None:
         return mission
     tables = mission.to_dict()["phases"]
-    now = at_start(mission)
+    now = state_at_start(mission)
     for k, phase in enumerate(mission.phases[: last + 1]):
         report(f"timing '{phase.name}'")
         leg = timed_leg(mission, phase, now, k)
@@ -115,13 +115,13 @@ def timed_leg(mission: Mission, phase: Phase, now: PhaseState, number: int) -> L
         raise ways.error_of_key(mission, number, key, None, problem, remedy)
     if not phase.automatic:
         return leg_from(mission, phase, departure)
-    phase = _shared_out(mission, phase, departure)
-    shortest, vary = _SHORTEST, partial(_moving, phase)
+    phase = _with_point_times(mission, phase, departure)
+    shortest, vary = _SHORTEST, partial(_with_travel, phase)
     if phase.duration == AUTO and phase.shaping is not None and phase.shaping.blend != AUTO:
-        shortest, vary = phase.shaping.least_time, partial(_lasting, phase)
+        shortest, vary = phase.shaping.least_time, partial(_with_duration, phase)
     time, worst = _least(mission, vary, departure, shortest)
     if time is None:
-        problem = f"no time keeps the limits of the mission: {said(worst, phase)}"
+        problem = f"no time keeps the limits of the mission: {reached_in_words(worst, phase)}"
         remedy = f"raise {worst.limit.of.key}, or change the way"
         raise ways.error_of_key(mission, number, phase.automatic[0], AUTO, problem, remedy)
     if time > shortest:
@@ -135,12 +135,12 @@ def least_time(mission: Mission, leg: Leg) -> tuple[str, float | None]:
     The least time keeps all limits of the mission, and is found to within 1 %.
     """
     length = {"until": None, "settle": None, "duration": leg.end - leg.start}
-    phase = _shared_out(mission, leg.phase.model_copy(update=length), leg.departure)
-    time, _ = _least(mission, partial(_moving, phase), leg.departure, _SHORTEST)
+    phase = _with_point_times(mission, leg.phase.model_copy(update=length), leg.departure)
+    time, _ = _least(mission, partial(_with_travel, phase), leg.departure, _SHORTEST)
     return phase.time_key, time
 
 
-def broken(mission: Mission, leg: Leg) -> list[Reached]:
+def broken_limits(mission: Mission, leg: Leg) -> list[Reached]:
     """Limits that the reference of a planned leg breaks, the worst first."""
     if leg.phase.control != "tracking":
         return []
@@ -148,7 +148,7 @@ def broken(mission: Mission, leg: Leg) -> list[Reached]:
     return sorted((x for x in over if x.share > 1.0 + SLACK), key=lambda x: -x.share)
 
 
-def said(worst: Reached, phase: Phase) -> str:
+def reached_in_words(worst: Reached, phase: Phase) -> str:
     """What is reached of a limit, in words."""
     q, most = worst.limit.of, worst.limit.most[worst.agent]
     return (
@@ -168,7 +168,7 @@ def _least(
 
     Vehicles leave a reserve of their limits, unless no time does: of a circle near a limit, for example.
     """
-    if limits is None and (reserve := reserves(mission)).any():
+    if limits is None and (reserve := lag_times(mission)).any():
         fastest = _least(mission, vary, departure, shortest, limits_of(mission, reserve=reserve))
         if fastest[0] is not None:
             return fastest
@@ -203,7 +203,7 @@ def _least(
     return high, worst
 
 
-def _moving(phase: Phase, time: float) -> Phase:
+def _with_travel(phase: Phase, time: float) -> Phase:
     """A phase whose motion takes a time [s]; it does not end before."""
     key = phase.time_key
     times: dict[str, Any] = {key: time}
@@ -213,14 +213,14 @@ def _moving(phase: Phase, time: float) -> Phase:
         elif isinstance(phase.duration, float):
             times["duration"] = max(phase.duration, time)
     if phase.points:
-        before = _arrival(phase)
+        before = _arrival_time(phase)
         times["through"] = tuple(
             at.model_copy(update={"time": (at.time or 0.0) * time / before}) for at in phase.points
         )
     return phase.model_copy(update=times)
 
 
-def _lasting(phase: Phase, time: float) -> Phase:
+def _with_duration(phase: Phase, time: float) -> Phase:
     """A phase that lasts a time [s], whatever the duration of its blend."""
     return phase.model_copy(update={"duration": time})
 
@@ -229,17 +229,17 @@ def _lasting(phase: Phase, time: float) -> Phase:
 _TRIAL = 10.0
 
 
-def _arrival(phase: Phase) -> float:
+def _arrival_time(phase: Phase) -> float:
     """Time [s] from the start to the arrival; a trial if it is automatic."""
     time = getattr(phase, phase.time_key)
     return time if isinstance(time, float) else _TRIAL
 
 
-def _shared_out(mission: Mission, phase: Phase, departure: Departure) -> Phase:
+def _with_point_times(mission: Mission, phase: Phase, departure: Departure) -> Phase:
     """A phase whose points to pass have times, in shares of the whole that then stay."""
     if not phase.points:
         return phase
-    arriving = phase.model_copy(update={phase.time_key: _arrival(phase)})
+    arriving = phase.model_copy(update={phase.time_key: _arrival_time(phase)})
     points = points_passed(phase.points, leg_from(mission, arriving, departure).motion)
     start = departure.now.t
     through = tuple(

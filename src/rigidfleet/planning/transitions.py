@@ -22,8 +22,8 @@ from rigidfleet.math import rigid_body
 from rigidfleet.mission import Mission
 from rigidfleet.mission.kinds import Reshape, Vertical
 from rigidfleet.mission.values import AUTO
-from rigidfleet.planning.abort import Aborts, Step, first_free, neighbours, phases_of
-from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.abort import Aborts, Step, first_free_level, neighbours_on_ways, phases_of
+from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.transfers import transfer
 from rigidfleet.planning.ways import Timed, error_of_key
@@ -89,8 +89,8 @@ def _transition(
     """
     if phase.transition == "ways":
         report(f"looking for ways of the agents in '{phase.name}'")
-        return [_bent(mission, number, table, phase, before, _room(mission, state()))], {}
-    stops = _stops(mission, number, phase, before)
+        return [_with_ways(mission, number, table, phase, before, _box(mission, state()))], {}
+    stops = _layer_slots(mission, number, phase, before)
     if stops is None:
         return [table], {}
     names = [f"{phase.name}: {part}" for part in _PARTS[:2]]
@@ -156,7 +156,7 @@ def _to_own_places(
     )
     steps: tuple[Step, ...] = ()
     if now is not None and now.goal is not None and now.slots is not None and homes.stands:
-        steps, _, problem, _ = homes.search(now.goal.r + now.slots @ now.goal.T, now.t)
+        steps, _, problem, _ = homes.straight_ways_home(now.goal.r + now.slots @ now.goal.T, now.t)
     if not steps:
         remedy = "leave places out, to land below"
         raise mistake("places", "own", problem, remedy)
@@ -173,7 +173,7 @@ def _to_own_places(
 
 def _state_after(mission: Mission, so_far: dict[str, Any], timed: Timed) -> PhaseState | None:
     """The state after phases ``so_far``; None where it is known only in flight."""
-    now, tables = at_start(mission), so_far["phases"]
+    now, tables = state_at_start(mission), so_far["phases"]
     if tables:
         mission = mission.rewritten(so_far)
     for number, phase in enumerate(mission.phases[: len(tables)]):
@@ -184,7 +184,7 @@ def _state_after(mission: Mission, so_far: dict[str, Any], timed: Timed) -> Phas
     return now
 
 
-def _room(mission: Mission, now: PhaseState | None) -> Floats:
+def _box(mission: Mission, now: PhaseState | None) -> Floats:
     """Corners (2, 3) [m], about the centre of mass in body axes, between which vehicles fly from a state on.
 
     These are heights above the ground and within the geofence if the formation is level then, and the geofence's sides
@@ -208,7 +208,7 @@ def _room(mission: Mission, now: PhaseState | None) -> Floats:
     return box
 
 
-def _bent(
+def _with_ways(
     mission: Mission,
     number: int,
     table: dict[str, Any],
@@ -226,7 +226,7 @@ def _bent(
         There are no limits of speed and acceleration, no ways are found, or the blend is too short for them.
     """
     mistake = partial(error_of_key, mission, number)
-    p, q = _ends(mission, number, phase, before)
+    p, q = _slots_at_ends(mission, number, phase, before)
     limits, radius = mission.limits, float(mission.fleet.radius.max())
     if limits.speed is None or limits.acceleration is None:
         problem = "is found within limits of speed and acceleration, and the mission lacks one"
@@ -275,7 +275,7 @@ def _bent(
     return table | keys
 
 
-def _ends(
+def _slots_at_ends(
     mission: Mission, number: int, phase: Reshape, before: str | None
 ) -> tuple[Floats, Floats]:
     """Slots (N, 3) [m] about the centre of mass before and after a phase, in body axes.
@@ -292,11 +292,11 @@ def _ends(
     return p, q
 
 
-def _stops(
+def _layer_slots(
     mission: Mission, number: int, phase: Reshape, before: str | None
 ) -> list[Floats] | None:
     """Slots (N, 3) [m] before and after the three parts of a phase by layers; None if its straight ways will do."""
-    p, q = _ends(mission, number, phase, before)
+    p, q = _slots_at_ends(mission, number, phase, before)
     masses, radius, limits = mission.fleet.mass, mission.fleet.radius, mission.limits
     limit = limits.separation or 0.0
     if phase.transition == AUTO:
@@ -306,7 +306,7 @@ def _stops(
             return None
     apart = 2.0 * float(radius.max()) + limit + limits.separation_allowance
     height = max(apart, 2.0 * float(radius.max()) + (limits.separation_below or 0.0))
-    level = height * _level_of(neighbours(apart, p, q))
+    level = height * _level_of(neighbours_on_ways(apart, p, q))
     one, two = (np.column_stack([x[:, :2], level]) for x in (p, q))
     stops = [p, one, two, q]
     for (a, b), part in zip(pairwise(stops), _PARTS, strict=True):
@@ -326,7 +326,7 @@ def _level_of(near: list[list[int]]) -> Floats:
     """Level (N,) of each agent, ... -1, 0, 1, ..., such that no two that are near each other are within a level."""
     colour = np.full(len(near), -1)
     for i in np.argsort([-len(others) for others in near], kind="stable").tolist():
-        colour[i] = first_free(colour[near[i]])
+        colour[i] = first_free_level(colour[near[i]])
     # The fullest in the middle: 0, 1, -1, 2, -2, ...
     order = np.argsort(-np.bincount(colour), kind="stable")
     place = np.empty(len(order))

@@ -32,7 +32,7 @@ from rigidfleet.planning.derivatives import (
     yaw_of,
 )
 from rigidfleet.planning.disturbances import disturbance
-from rigidfleet.planning.virtual_clock import later
+from rigidfleet.planning.virtual_clock import delay_by
 from rigidfleet.typing import Floats, Ints
 
 #: Rows of random numbers in a block.
@@ -63,7 +63,7 @@ def sampled_flight(mission: Mission, max_step: float = math.inf) -> fleet.Sample
     made = [kernel_vehicle(model, m) for model, m in zip(models, mission.true_mass, strict=True)]
     # A force is held over each step: twenty of them meet a smooth pulse to 1 %
     steps = max(1, math.ceil(1.0 / autopilot.rate / min(autopilot.step, max_step / 10.0) - 1e-9))
-    flight = fleet.flight(
+    flight = fleet.ideal_flight(
         fleet.quadrotors(made, mission.gravity),
         start=0.0,
         h=1.0 / (autopilot.rate * steps),
@@ -109,7 +109,7 @@ def vehicle_lags(mission: Mission) -> list[Lag]:
     ]
 
 
-def reserves(mission: Mission) -> Floats:
+def lag_times(mission: Mission) -> Floats:
     """Times T (N,) [s] by which each vehicle leaves its reference at most (`math.margins.overshoot`); 0 for points.
 
     Its acceleration differs by up to T times the reference's greatest jerk, its velocity by up to T times the greatest
@@ -140,7 +140,7 @@ def air_force(mission: Mission, u: Floats, who: Ints | slice = slice(None)) -> F
     return force
 
 
-def jets(mission: Mission, r: Floats) -> Floats:
+def jet_speeds(mission: Mission, r: Floats) -> Floats:
     """Speed [m/s] of the air downwards at each vehicle due to each other one above, (K, N, N) at r (K, N, 3) [m]."""
     below = r[:, None] - r[:, :, None]
     flow, s, beside = np.zeros(below.shape[:3]), below[..., 2], (below[..., :2] ** 2).sum(axis=-1)
@@ -194,7 +194,7 @@ def network_of(mission: Mission) -> Links:
     if net is None:
         return no_network(n)
     links, reverse = links_of(mission.edges)
-    worsens, recovers = fading(net.loss, net.burst)
+    worsens, recovers = loss_transitions(net.loss, net.burst)
     every, jitter = max(1, round(rate / net.sent_rate(n))), round(net.jitter * rate)
     delay, silence = max(1, round(net.delay * rate)), max(1, round(net.silence * rate))
     # As many messages within the time of silence as are all lost once in a thousand times, and two at least.
@@ -230,7 +230,7 @@ def links_of(edges: Ints) -> tuple[Ints, Ints]:
     return links, np.lexsort(links.T)
 
 
-def fading(loss: float, burst: float | None) -> tuple[float, float]:
+def loss_transitions(loss: float, burst: float | None) -> tuple[float, float]:
     """Probabilities with which a link begins and ends to lose messages, by the share lost and the mean burst.
 
     In a chain of two states, bursts of mean length L end with 1/L, and the share of the bad state is the loss.
@@ -272,7 +272,7 @@ class TickTables:
         self.flight, self.n = flight, mission.n_agents
         self.rate = mission.autopilot.rate
         self.noise = None if d is None else d.noise
-        self.yaw = asked_yaw(mission)
+        self.yaw = commanded_yaw(mission)
         self.linear_drag = np.array([model.linear_drag for model in mission.vehicle_models or ()])
         self.compensated = mission.autopilot.delay_compensation
         #: What states were last measured about: the problem of the path, or a point to stay at.
@@ -297,10 +297,10 @@ class TickTables:
             self._source, self._anchor = None, before
         return before
 
-    def put_off(self, late: float) -> None:
+    def delay_path(self, late: float) -> None:
         """Take the path that states were last measured about as later by some time [s]."""
         if self._source is not None:
-            self._source = later(self._source, late)
+            self._source = delay_by(self._source, late)
 
     def _path_at(self, tick: int, tau: Floats | None) -> Floats:
         """The path (N, 6) at a tick, of each vehicle by its own clock, if it has one."""
@@ -411,7 +411,7 @@ class TickTables:
         return _by_tick(jerk), _by_tick(snap)
 
 
-def asked_yaw(mission: Mission) -> Yaw:
+def commanded_yaw(mission: Mission) -> Yaw:
     """The yaw that a mission asks of its vehicles."""
     yaw = mission.yaw
     return Yaw(yaw.kind, math.radians(yaw.yaw_deg), yaw.point or (0.0, 0.0, 0.0))

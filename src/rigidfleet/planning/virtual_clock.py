@@ -39,25 +39,25 @@ class VirtualClock:
         self.target = 1.0
 
     @property
-    def steady(self) -> bool:
+    def is_steady(self) -> bool:
         """Whether the rate is its target, to rounding."""
         s, first, second = self.rate
         off = max(abs(s - self.target), abs(first) / self.omega, abs(second) / self.omega**2)
         return off <= _STEADY
 
     @property
-    def runs(self) -> bool:
+    def runs_in_real_time(self) -> bool:
         """Whether it runs as real time does."""
         return self.target == 1.0 and self.rate == (1.0, 0.0, 0.0)
 
-    def lead(self, target: float, omega: float) -> None:
+    def aim(self, target: float, omega: float) -> None:
         """Set the target, and while the clock is steady also the bandwidth omega [1/s]."""
-        if self.steady:
+        if self.is_steady:
             self.rate = self.target, 0.0, 0.0
             self.omega = min(max(omega, _SLOWEST), _FASTEST)
         self.target = target
 
-    def ahead(self, dt: Floats | float, target: float | None = None) -> Floats:
+    def progress_in(self, dt: Floats | float, target: float | None = None) -> Floats:
         """Progress of tau [s], s and two derivatives (4, ...) after times dt [s], with a target held from now.
 
         For three equal lags, s - u = exp(-omega t) (A + B t + C t^2 / 2).
@@ -79,26 +79,26 @@ class VirtualClock:
 
     def advance(self, dt: float) -> float:
         """Run for dt [s]; returns by how much the delay has grown [s]."""
-        if self.runs:
+        if self.runs_in_real_time:
             return 0.0
-        progress, s, first, second = self.ahead(dt).tolist()
+        progress, s, first, second = self.progress_in(dt).tolist()
         self.rate = min(max(s, 0.0), 1.0), first, second
-        if self.steady:
+        if self.is_steady:
             self.rate = self.target, 0.0, 0.0
         lost = max(dt - progress, 0.0)
         self.delay += lost
         return lost
 
-    def when(self, progress: float, dt: float) -> float:
+    def time_of_progress(self, progress: float, dt: float) -> float:
         """Time [s], at most dt, after which tau will have made a progress [s]."""
         low, high = 0.0, dt
         for _ in range(60):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.ahead(middle)[0] < progress else (low, middle)
+            low, high = (middle, high) if self.progress_in(middle)[0] < progress else (low, middle)
         return high
 
 
-def later(problem: Problem, delay: float) -> Problem:
+def delay_by(problem: Problem, delay: float) -> Problem:
     """A problem whose references come later by a delay [s]."""
     reference, motion = problem.reference, problem.motion
     if delay == 0.0:

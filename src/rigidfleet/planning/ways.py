@@ -23,9 +23,9 @@ from rigidfleet.mission import Mission, Phase
 from rigidfleet.mission.kinds import ANGLES, Go
 from rigidfleet.mission.values import AUTO
 from rigidfleet.planning import layers
-from rigidfleet.planning.clearance import closest, pace
-from rigidfleet.planning.lattice import FreeSpace, Lattice, Layer, Roadmap, Way, staying
-from rigidfleet.planning.legs import Leg, at_start, latest_end
+from rigidfleet.planning.clearance import closest, speed_bounds
+from rigidfleet.planning.lattice import FreeSpace, Lattice, Layer, Roadmap, Way, constant_path
+from rigidfleet.planning.legs import Leg, latest_end, state_at_start
 from rigidfleet.planning.preview import FEWEST_SAMPLES, planned_phase, samples_per_phase
 from rigidfleet.planning.reference import PhaseState
 from rigidfleet.solids.records import corners, extent
@@ -59,7 +59,7 @@ def find_ways(mission: Mission, timed: Timed) -> Mission:
         There is no way, none was found that can be proved, or a phase cannot begin one.
     """
     while (k := next((k for k, p in enumerate(mission.phases) if p.replaced), None)) is not None:  # fmt: skip
-        now, phase = at_start(mission), cast("Go", mission.phases[k])
+        now, phase = state_at_start(mission), cast("Go", mission.phases[k])
         for number, before in enumerate(mission.phases[:k]):
             leg = timed(mission, before, now, number)
             if not leg.known:
@@ -101,7 +101,7 @@ class _Search:
 
     # -- what there is to choose from ------------------------------------------------------------------
 
-    def _near(self) -> list[Any]:
+    def _near_obstacles(self) -> list[Any]:
         """Obstacles at rest that may stand in the way."""
         low, high = self._domain
         return [
@@ -162,17 +162,17 @@ class _Search:
             if best is not None and best[1].cost <= _SHORT * straight + self.reach:
                 break
         if best is None:
-            raise self._none(roadmap)
+            raise self._no_way_error(roadmap)
         return best[0], best[0].shorten(best[1])
 
     def _roadmap(
         self, shapes: list[layers.CandidateShape], need: float, known: dict[Any, Lattice], *, more: bool
     ) -> Roadmap:  # fmt: skip
-        frames = layers.frames(self._near())
+        frames = layers.lattice_axes(self._near_obstacles())
         fence = self.mission.limits.geofence
         box = np.array([[-np.inf] * 3, [np.inf] * 3])
         box = box if fence is None else np.array([fence.min, fence.max]) + [[need], [-need]]
-        space = FreeSpace(self._near(), box)
+        space = FreeSpace(self._near_obstacles(), box)
         roll, pitch, yaw_before = self.start
         yaws = {yaw_before + yaw for yaw in _YAWS} if more else set()
         for shape in shapes:
@@ -198,9 +198,9 @@ class _Search:
             count = np.clip(np.ceil((high - low) / (2.0 * self.reach)), *_EVEN).astype(int)
             even = map(np.linspace, low, high, count)
             common.append([np.unique([*a, *b]) for a, b in zip(even, ends.T, strict=True)])
-        changes = list(layers.changes(self.mission, shapes, angles))
+        changes = list(layers.layer_changes(self.mission, shapes, angles))
         if not self.each:  # the one ball that covers all neither turns nor changes
-            stays = staying(nodes[0])
+            stays = constant_path(nodes[0])
             changes = [c._replace(path=stays, ways=np.zeros(1)) for c in changes]
         return Roadmap(space, nodes, changes, self.radius, need, frames, common, known)
 
@@ -209,7 +209,7 @@ class _Search:
     def _parts(self, roadmap: Roadmap, way: Way) -> Iterator[tuple[str, dict[str, Any], float]]:
         """Name, keys and greatest way [m] of an agent, of each phase of a way."""
         changes = {frozenset((c.before, c.after)): float(c.ways.max()) for c in roadmap.changes}
-        written = self._written()
+        written = self._names_in_file()
         for (a, i), (b, j) in pairwise(zip(way.places, way.layers, strict=True)):
             layer = roadmap.layers[j]
             if i == j:
@@ -223,7 +223,7 @@ class _Search:
                 keys: dict[str, Any] = {"kind": "turn"} | _angles(layer.angles)
                 yield f"turn to {layer.angles[2]:.4g}°", keys, changes[frozenset((i, j))]
 
-    def _written(self) -> dict[str, str]:
+    def _names_in_file(self) -> dict[str, str]:
         """Names of formations as the file has them, by those that they have here."""
         tables = self.mission.to_dict()["phases"]
         return {
@@ -285,14 +285,14 @@ class _Search:
         for number in range(k, k + len(tables)):
             leg = self.timed(tried, tried.phases[number], now, number)
             now = leg.after
-            lacking = max(lacking, self._lacking(tried, leg))
+            lacking = max(lacking, self._missing_clearance(tried, leg))
         return tried, lacking
 
-    def _lacking(self, mission: Mission, leg: Leg) -> float:
+    def _missing_clearance(self, mission: Mission, leg: Leg) -> float:
         """How much [m] the clearance of a planned leg is below what is asked for; negative if it is kept."""
         planned = planned_phase(leg, max(samples_per_phase(mission), FEWEST_SAMPLES))
         low, high = planned.position.min(axis=(0, 1)), planned.position.max(axis=(0, 1))
-        speed, need, radius = pace(planned), self.phase.clearance, mission.fleet.radius
+        speed, need, radius = speed_bounds(planned), self.phase.clearance, mission.fleet.radius
         least = math.inf
         for thing in mission.obstacles:
             a, b = extent(thing.solid)
@@ -316,11 +316,11 @@ class _Search:
 
     # -- what to say -----------------------------------------------------------------------------------
 
-    def _none(self, roadmap: Roadmap) -> MissionError:
+    def _no_way_error(self, roadmap: Roadmap) -> MissionError:
         """What stands in the way, and how much is missing."""
         mistake = partial(self.mistake, "position", self.phase.position)
         for what, place, layer in (("start", self.begin, 0), ("goal", self.end, self._last)):
-            room, agent, thing = self._nearest(roadmap, place, layer)
+            room, agent, thing = self._tightest(roadmap, place, layer)
             if room < roadmap.need:
                 problem = (
                     f"its {what} leaves agent {agent + 1} {room:.2f} m of clearance from {thing}, which is less"
@@ -328,7 +328,7 @@ class _Search:
                 )
                 return mistake(problem, "move it, or ask for less clearance")
         least, place, layer = roadmap.widest((self.begin, 0), (self.end, self._last))
-        x, (_, _, thing) = roadmap.layers[layer], self._nearest(roadmap, place, layer)
+        x, (_, _, thing) = roadmap.layers[layer], self._tightest(roadmap, place, layer)
         where = ", ".join(f"{v:z.2f}" for v in place)
         problem = (
             f"no way is found: at the narrowest place of the best one, ({where}) m, '{x.formation}' at yaw"
@@ -340,7 +340,7 @@ class _Search:
         remedy = "allow a slimmer formation (formations, scales), ask for less clearance, or name points on the way"
         return mistake(problem, remedy)
 
-    def _nearest(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
+    def _tightest(self, roadmap: Roadmap, place: Floats, layer: int) -> tuple[float, int, str]:
         """The least room [m] of an agent at a place, the agent, and what is nearest to it."""
         r, space = place + roadmap.layers[layer].offsets, roadmap.space
         room = space.room(r, roadmap.radius)

@@ -35,7 +35,7 @@ from rigidfleet.plotting.page import summary
 from rigidfleet.plotting.quadrotors import rotors, vehicles
 from rigidfleet.plotting.sketches import formations
 from rigidfleet.plotting.space import trajectory
-from rigidfleet.plotting.style import agent_colours, figure_options, settings
+from rigidfleet.plotting.style import agent_colours, apply_style, figure_options
 from rigidfleet.result import Result, as_result
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def render_figure(
 ) -> dict[str, bytes]:
     """Contents of a figure's files by format; parameters are those of `plot`."""
     figure = _draw_figure(result, name, **look)
-    with settings():
+    with apply_style():
         figure.set_layout_engine(None)  # it is laid out; with "none", matplotlib draws it once more
     return encode_figure(figure, formats, close=not look.get("titles", True))
 
@@ -208,7 +208,7 @@ def encode_figure(
 ) -> dict[str, bytes]:
     """Contents of a figure's files by format; with ``close``, cropped to what is drawn."""
     files = {}
-    with settings():
+    with apply_style():
         box = _content_box(figure) if close else None
         for kind in formats:
             buffer = io.BytesIO()

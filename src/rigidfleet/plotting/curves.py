@@ -171,10 +171,10 @@ def _draw_components(result: Result, axes: Any, column: _Column) -> None:
         for t, goal in targets:
             ax.plot(t, goal[i], **_RING, markeredgewidth=1.0, zorder=4, clip_on=False)
         ax.set_ylabel(f"{name} [{unit}]")
-        show_variation(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit)
+        fit_to_variation(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit)
 
 
-def show_variation(ax: Axes, values: Floats, unit: str) -> None:
+def fit_to_variation(ax: Axes, values: Floats, unit: str) -> None:
     """Note the value if it does not vary; else choose limits so that rounding errors do not fill the axes."""
     if not st.note_if_still(ax, values, unit):
         _widen_limits(ax, 0.1)
@@ -271,7 +271,7 @@ def has_thrust(result: Result) -> bool:
 def draw_thrust(ax: Axes, result: Result) -> None:
     """Thrust of each agent with its limit, from zero; of a log, which has none, the distance from its slot."""
     if not has_thrust(result):
-        quadrotors.draw_off_slot(ax, result)
+        quadrotors.draw_slot_distance(ax, result)
         return
     ax.set_ylabel("thrust [N]")
     panel = Panel(ax, result, result.thrust, "N", result.extreme("thrust"))
@@ -331,7 +331,7 @@ def disturbance(result: Result) -> Figure:
     force = np.where(result.left, np.linalg.norm(result.disturbance_force, axis=2), np.nan)
     if Panel(above, result, force, "N").draw():
         st.draw_agents_legend(above, result.n_agents)
-    quadrotors.draw_off_slot(below, result)
+    quadrotors.draw_slot_distance(below, result)
     return fig
 
 
@@ -507,6 +507,6 @@ def motion(result: Result) -> Figure:
     fig, axes = st.time_figure(result, "Speed, acceleration and jerk", len(drawn), height=1.8)
     for q, ax in zip(drawn, axes[:, 0], strict=True):
         ax.set_ylabel(f"{q.name_in_words.replace(' ', chr(10))} [{display_unit(q.unit)}]")
-        quadrotors.draw_limited(ax, result, q.name)
+        quadrotors.draw_with_limit(ax, result, q.name)
     st.draw_agents_legend(axes[0, 0], result.n_agents)
     return fig

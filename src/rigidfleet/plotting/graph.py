@@ -30,7 +30,7 @@ _DRAWN = 3
 def graphs(mission: Mission, judged: Mapping[str, Rigidity | None]) -> Figure:
     """Graph of each formation with its rigidity; arrows show the first free motions, each in a tone of its own."""
     names = list(mission.formations)
-    with st.settings():
+    with st.apply_style():
         fig, axes = sketches.tiled_figure(len(names), 0.0, 0.1)
         for ax, name in zip(axes, names, strict=True):
             _draw_formation(ax, mission, name, judged.get(name))

@@ -52,14 +52,14 @@ class OffPlan(NamedTuple):
         return np.stack([np.maximum(self.far - self.doubt, 0.0), self.far + self.doubt])
 
     @property
-    def off(self) -> Bools:
+    def is_off(self) -> Bools:
         """Who is surely beyond the limit (K, N)."""
         return self.interval[0] > self.limit
 
     def drifts(self, time: Floats) -> list[Drift]:
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
-        for i, off in enumerate(self.off.T):
+        for i, off in enumerate(self.is_off.T):
             k = np.flatnonzero(off)
             again = (np.diff(k) > 1) & (np.diff(time[k]) >= _SOON)
             for part in np.split(k, np.flatnonzero(again) + 1)[: len(k)]:
@@ -70,7 +70,7 @@ class OffPlan(NamedTuple):
         return drifts
 
 
-def runs(mask: Bools) -> list[tuple[int, int]]:
+def true_runs(mask: Bools) -> list[tuple[int, int]]:
     """Where a mask (K,) is true: the first sample of each run, and the one after its last."""
     ends = np.flatnonzero(np.diff(np.pad(mask, 1).astype(int))).tolist()
     return list(pairwise(ends))[::2]

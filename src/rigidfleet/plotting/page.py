@@ -41,7 +41,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
         st.draw_reference(ax, result.time, wanted[:, i])
         handles.append(st.legend_entry(name, **look))
     _legend_above(ax, handles)
-    curves.show_variation(ax, np.concatenate([flown, wanted]), "deg")
+    curves.fit_to_variation(ax, np.concatenate([flown, wanted]), "deg")
 
 
 # Of trajectories that others made, most panels would be empty.

@@ -9,7 +9,7 @@ import numpy as np
 
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import style as st
-from rigidfleet.plotting.logged import runs
+from rigidfleet.plotting.logged import true_runs
 from rigidfleet.plotting.peaks import Panel, distinct_limits
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
@@ -117,20 +117,20 @@ def vehicles(result: Result) -> Figure:
     fig, axes = st.time_figure(result, title, 3, height=1.9, shares=shares)
     above, middle, below = axes[:, 0]
     above.set_ylabel("tilt [deg]")
-    draw_limited(above, result, "tilt", tilt(result))
+    draw_with_limit(above, result, "tilt", tilt(result))
     st.draw_agents_legend(above, result.n_agents)
-    draw_off_slot(middle, result)
+    draw_slot_distance(middle, result)
     _draw_saturation(below, result, saturated)
     return fig
 
 
-def draw_off_slot(ax: Axes, result: Result) -> None:
+def draw_slot_distance(ax: Axes, result: Result) -> None:
     """Distance of each vehicle from its slot, with the mission's limit."""
     ax.set_ylabel("from the slot [m]")
-    draw_limited(ax, result, "tracking_error")
+    draw_with_limit(ax, result, "tracking_error")
 
 
-def draw_limited(ax: Axes, result: Result, name: str, values: Floats | None = None) -> None:
+def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None = None) -> None:
     """Each agent's values (K, N) of a quantity from zero, with their greatest and the mission's limit."""
     q, between = QUANTITIES[name], result.extreme(name)
     values = samples(result, name).values if values is None else values
@@ -157,7 +157,7 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
         return
     for i, colour in enumerate(st.agent_colours(n)):
         last = np.append(t, t[-1])
-        bars = [(t[a], last[b] - t[a]) for a, b in runs(saturated[:, i])]
+        bars = [(t[a], last[b] - t[a]) for a, b in true_runs(saturated[:, i])]
         ax.broken_barh(bars, (i + 0.6, 0.8), color=colour, linewidth=0.4)
     ax.set_ylim(n + 0.6, 0.4)
     ax.set_yticks(range(1, n + 1))

@@ -13,7 +13,7 @@ from rigidfleet.plotting import curves
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.space import camera, marker_look
 from rigidfleet.result import Result
-from rigidfleet.result.lights import seen_from
+from rigidfleet.result.lights import plane_view
 from rigidfleet.typing import Floats
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def sketch(
     flat = thin and distance_geometry.dimension(p, 1e-3) < 3
     turn, lit = np.eye(3), mission.formation_colours(name)
     if lit:
-        turn = camera(*np.degrees(seen_from(p)))
+        turn = camera(*np.degrees(plane_view(p)))
     elif sideways or not flat:
         turn = camera(-70.0, 30.0 if flat else 16.0)
     words += "" if placed else "; their distances fix no positions"

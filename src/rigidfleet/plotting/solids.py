@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rigidfleet.plotting import style as st
-from rigidfleet.solids.outline import Outline, outline, places
+from rigidfleet.solids.outline import Outline, displacements_at, outline
 from rigidfleet.solids.records import HEIGHTS
 from rigidfleet.typing import Floats
 
@@ -44,7 +44,7 @@ class DrawnObstacle:
         return self.grid is not None
 
     @property
-    def ends(self) -> Floats:
+    def extent(self) -> Floats:
         """Lowest and highest corner (2, 3) [m] of all places at which it is drawn."""
         points = self.surface.triangles.reshape(-1, 3)
         return np.array([f(points, axis=0) + f(self.at, axis=0) for f in (np.min, np.max)])
@@ -65,15 +65,15 @@ def drawn_obstacles(
             if solid.there[0, 0] > end or solid.there[0, 1] < begin:
                 continue
             first, last = np.clip(solid.times[[0, -1]], since, until)
-            at = places(solid, np.linspace(first, last, _PLACES))
-            way = places(solid, np.linspace(since, until, _WAY))
+            at = displacements_at(solid, np.linspace(first, last, _PLACES))
+            way = displacements_at(solid, np.linspace(since, until, _WAY))
         grid = None
         if solid.kind[0] == HEIGHTS:
             (a, b), (wide, deep), (n, m) = solid.origin[0, :2], solid.size[0, 3:5], solid.grid[0]
             x, y = a + np.linspace(0.0, wide, n), b + np.linspace(0.0, deep, m)
             grid = x, y, solid.heights.reshape(n, m)
         shape = DrawnObstacle(thing.name, thing.zone, plain, surface, at, way, grid)
-        if ((shape.ends[1] > low) & (shape.ends[0] < high)).all():
+        if ((shape.extent[1] > low) & (shape.extent[0] < high)).all():
             near_obstacles.append(shape)
     return near_obstacles
 

@@ -12,7 +12,7 @@ from rigidfleet.plotting import areas, solids
 from rigidfleet.plotting import style as st
 from rigidfleet.result import Result
 from rigidfleet.result.lights import has_lights, lights
-from rigidfleet.result.lights import view as seen
+from rigidfleet.result.lights import view_angles as seen
 from rigidfleet.solids.records import corners
 from rigidfleet.typing import Floats
 
@@ -63,7 +63,7 @@ def scene(result: Result) -> Scene:
         low[2] = min(low[2], mission.ground)
     begin, end = float(result.time[0]), float(result.time[-1])
     shapes = solids.drawn_obstacles(mission, begin, end, low - near, high + near)
-    seen_too = [np.clip(shape.ends, low - near, high + near) for shape in shapes]
+    seen_too = [np.clip(shape.extent, low - near, high + near) for shape in shapes]
     for _, rings, _ in areas.areas(mission):
         flat = np.concatenate(rings)
         ends = np.array([[*f(flat, axis=0), z] for f, z in ((np.min, low[2]), (np.max, high[2]))])

@@ -78,7 +78,7 @@ _SHARED: dict[str, Any] = {
 
 
 @contextmanager
-def settings() -> Generator[None]:
+def apply_style() -> Generator[None]:
     """Apply matplotlib's defaults and our style, whatever the user has set; restored at the end."""
     import matplotlib as mpl
 
@@ -96,9 +96,9 @@ def in_style(draw: Draw) -> Draw:
 
     @wraps(draw)
     def draw_in_style(*what: Any, **more: Any) -> Figure:
-        with settings():
+        with apply_style():
             figure = draw(*what, **more)
-            place_words(figure)
+            place_annotations(figure)
             return figure
 
     return draw_in_style
@@ -168,7 +168,7 @@ def blank_figure(wide: float, high: float, layout: Any = None) -> Figure:
     from rigidfleet.plotting.figure import Figure
 
     fig = Figure(figsize=(wide, high), layout=layout)
-    fig.settings = settings
+    fig.settings = apply_style
     return fig
 
 
@@ -324,7 +324,7 @@ def places_around(x: float, y: float) -> list[Place]:
     return near[:6] + beside + near[6:]
 
 
-def place_words(fig: Any) -> None:
+def place_annotations(fig: Any) -> None:
     """Lay the figure out, and move annotated text to where it covers nothing, or least."""
     engine = fig.get_layout_engine()
     if engine is not None:

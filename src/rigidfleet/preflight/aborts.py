@@ -18,7 +18,7 @@ from rigidfleet._common.text import agent_names
 from rigidfleet.mission import Mission
 from rigidfleet.mission.boundaries import Worst
 from rigidfleet.planning.abort import Abort, Aborts
-from rigidfleet.planning.legs import at_start
+from rigidfleet.planning.legs import state_at_start
 from rigidfleet.planning.losses import legs_from
 
 
@@ -38,9 +38,9 @@ class AbortsCheck(Shown):
     unheard: list[list[Worst]]
 
     @property
-    def least(self) -> float:
+    def least_separation(self) -> float:
         """The least separation that all ways home promise [m]."""
-        return min((x.least.separation for x in self.aborts if x.way), default=np.inf)
+        return min((x.certificate.separation for x in self.aborts if x.way), default=np.inf)
 
     def facts(self) -> Sheet:
         """Runs of orders with the same answer, each with its worst numbers."""
@@ -48,8 +48,8 @@ class AbortsCheck(Shown):
         heads = ("ordered [s]", "way home", "takes [s]", "least [m]", "one that does not hear")
         ways = sum(bool(x.way) for x in self.aborts)
         text = f"{name}: a way home from {ways} of {all_} times, {options.step:g} s apart"
-        if np.isfinite(self.least):
-            text += f"; no two vehicles come nearer than {self.least:.2f} m"
+        if np.isfinite(self.least_separation):
+            text += f"; no two vehicles come nearer than {self.least_separation:.2f} m"
         to = "any place" if options.to == "any" else "their own places"
         parts = [
             FactTable(heads, [*self._runs()], ("way home", "one that does not hear")),
@@ -70,12 +70,12 @@ class AbortsCheck(Shown):
                 yield Row((when, f"none: {aborts[0].reason}", None, None, ""), "note")
                 continue
             takes = max(x.end - x.ordered for x in aborts)
-            least = min(x.least.separation for x in aborts)
+            least = min(x.certificate.separation for x in aborts)
             worst = min((each for _, each in run if each), key=min, default=[])
             apart = least if np.isfinite(least) else None
-            yield Row((when, aborts[0].way, takes, apart, self._unheard(worst)))
+            yield Row((when, aborts[0].way, takes, apart, self._unheard_in_words(worst)))
 
-    def _unheard(self, each: list[Worst]) -> str:
+    def _unheard_in_words(self, each: list[Worst]) -> str:
         """What follows if a vehicle does not hear, in words."""
         if not each:
             return ""
@@ -97,9 +97,9 @@ class AbortsCheck(Shown):
             "to": options.to, "reaction_s": options.reaction, "step_s": options.step,
             "aborts": [
                 {
-                    "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stops,
+                    "ordered_s": x.ordered, "begins_s": x.begins, "waits_s": x.waits, "stops_s": x.stop_time,
                     "ends_s": x.end, "way": x.way, "reason": x.reason, "ways": x.home.number,
-                    "separation": _nearest(x.least.separation, x.least.time, *x.least.agents),
+                    "separation": _nearest(x.certificate.separation, x.certificate.time, *x.certificate.agents),
                     "unheard": _nearest(*min(each)) if each else None, "endangered": self._in_danger(each),
                 }
                 for x, each in zip(self.aborts, self.unheard, strict=True)
@@ -152,11 +152,11 @@ def check_aborts(
         No time of a phase keeps the limits of the mission.
     """
     progress("planned paths")
-    aborts = Aborts(mission, legs_from(mission, at_start(mission), mission.phases))
+    aborts = Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
     every: list[Abort] = []
     unheard: list[list[Worst]] = []
-    for abort in aborts.every():
+    for abort in aborts.all_aborts():
         progress(f"way home from {abort.ordered:g} s")
         every.append(abort)
-        unheard.append(aborts.if_not_heard(abort))
+        unheard.append(aborts.nearness_if_not_heard(abort))
     return AbortsCheck(mission, every, unheard)

@@ -23,7 +23,7 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
     if mission.avoidance is None or not mission.avoidance.guard:
         return
     from rigidfleet.kernel.moving import way_to_rest
-    from rigidfleet.kernel.segments import between_segments, from_obstacle
+    from rigidfleet.kernel.segments import segment_distance, segment_to_obstacle
     from rigidfleet.planning.avoidance import avoidance_in_flight
     from rigidfleet.planning.vehicles import sampled_flight
 
@@ -38,11 +38,11 @@ def braking_remarks(mission: Mission) -> Iterator[Remark]:
     for i in range(len(r)):
         far = np.linalg.norm(r - r[i], axis=1) - way - way[i] - a.room - a.room[i]
         for j in np.flatnonzero(far[:i] < worst):
-            room = between_segments(r[i], stop[i], r[j], stop[j]) - a.room[i] - a.room[j]
+            room = segment_distance(r[i], stop[i], r[j], stop[j]) - a.room[i] - a.room[j]
             if room < worst:
                 worst, who = room, f"agents {j + 1} and {i + 1}"
         for o in np.flatnonzero(a.sight.moves == 0):
-            nearest = from_obstacle(r[i], stop[i], o, a.solids, np.nan, a.normal)
+            nearest = segment_to_obstacle(r[i], stop[i], o, a.solids, np.nan, a.normal)
             if nearest[0] - a.reach[i] < worst:
                 worst = nearest[0] - a.reach[i]
                 who = f"agent {i + 1} and '{mission.obstacles[o].name}'"

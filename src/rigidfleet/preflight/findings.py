@@ -18,7 +18,7 @@ from rigidfleet._common.facts import (
     table_of,
     worst_values,
 )
-from rigidfleet._common.plain import plain
+from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.text import agent_names, first_few
 from rigidfleet.math import proximity
 from rigidfleet.math.margins import Margins
@@ -212,16 +212,16 @@ class FormationNetwork:
     unheard: int = 0
 
     @property
-    def borne(self) -> bool:
+    def bears_network(self) -> bool:
         """Whether the mission's own network is within what the formation bears."""
         within = (
             self.loss is not None and self.own_loss <= self.loss and self.own_delay <= self.delay
         )
         return within and (self.growing or 0.0) <= 0.5
 
-    def lesser(self, other: FormationNetwork) -> FormationNetwork:
+    def weaker_of(self, other: FormationNetwork) -> FormationNetwork:
         """The one of both that bears less."""
-        return min(self, other, key=lambda f: (f.borne, f.delay, f.loss or 0.0))
+        return min(self, other, key=lambda f: (f.bears_network, f.delay, f.loss or 0.0))
 
     @property
     def row(self) -> dict[str, Any]:
@@ -332,7 +332,7 @@ class Preflight(Shown):
     margins : what lag and delay the laws bear; None if vehicles have none
     network : what delay and loss of messages each formation bears, by its name; empty without a network
     vehicles : what the planned paths ask of rotors; None if vehicles have none
-    reserve : of the limits, what automatic times leave for lag and drag of vehicles (`planning.vehicles.reserves`) [s]
+    reserve : of the limits, what automatic times leave for lag and drag of vehicles (`planning.vehicles.lag_times`) [s]
     judged_to : mission time [s] up to which paths were checked; infinite if they all were
     remarks : problems and notes
 
@@ -554,7 +554,7 @@ class Preflight(Shown):
                 },
             },
         }
-        return plain(data)
+        return to_json_data(data)
 
 
 def _scene_words(f: FormationCheck) -> str:

@@ -28,7 +28,7 @@ from rigidfleet.rigidity import (
     spectrum,
 )
 from rigidfleet.rigidity.analysis import WHERE, flatten
-from rigidfleet.rigidity.realisations import lead_lengths
+from rigidfleet.rigidity.realisations import follow_lengths
 from rigidfleet.rigidity.spectrum import MOST as LANCZOS
 from rigidfleet.typing import Floats
 
@@ -62,8 +62,8 @@ def check_formations(
         work = _work_time(mission, name, search=search)
         skipped = k > 1 and work > left
         left -= 0.0 if skipped else work
-        check = _outline(mission, name, held[name], skipped=skipped)
-        checks[name] = check if skipped else _analysis(mission, check, search=search)
+        check = _first_check(mission, name, held[name], skipped=skipped)
+        checks[name] = check if skipped else _check_rigidity(mission, check, search=search)
     return [checks[name] for name in mission.formations]
 
 
@@ -75,18 +75,18 @@ def _work_time(mission: Mission, name: str, *, search: bool) -> float:
     return 0.1 * search + 5e-10 * min(m, 3 * n) ** 2 * max(m, 3 * n) + 2e-3
 
 
-def _outline(mission: Mission, name: str, held: _Held, *, skipped: bool) -> FormationCheck:
+def _first_check(mission: Mission, name: str, held: _Held, *, skipped: bool) -> FormationCheck:
     """What needs no decomposition: the method, the spacing of the slots, and the lights."""
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
     spacing = math.inf if slots is None or len(slots) < 2 else float(nearest(slots).min())
     return FormationCheck(
         name, None, held,
-        method=solvers.choose(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
+        method=solvers.choose_method(mission.n_agents, edges, mission.constraint.solver), skipped=skipped,
         spacing=spacing, colours=len({*(mission.formation_colours(name) or ())}),
     )  # fmt: skip
 
 
-def _analysis(mission: Mission, check: FormationCheck, *, search: bool) -> FormationCheck:
+def _check_rigidity(mission: Mission, check: FormationCheck, *, search: bool) -> FormationCheck:
     """The check with the rigidity, or the spectrum of a large formation, and other shapes if they are searched."""
     name = check.name
     slots, edges = mission.formation_slots(name), mission.formation_edges(name)
@@ -249,7 +249,7 @@ def _forecasts(mission: Mission, soft: set[str]) -> dict[str, tuple[int, float]]
             pairs = complete_graph(len(r))
             apart = distance_geometry.distances(slots, pairs)
             edges, lengths = mission.formation_edges(name), mission.formation_distances(name)
-            end = None if torn else lead_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
+            end = None if torn else follow_lengths(r, edges, lengths, 1e-6 * apart.min(), slots)
             most = _SURELY["shape" if phase.shaping is None else phase.shaping.reference]
             most *= mission.formations[name].greatest_error(apart.min())
             off, before = np.inf, out.get(name, (0, 0.0))

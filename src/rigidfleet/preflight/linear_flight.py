@@ -86,7 +86,7 @@ class LinearFlight:
         L, n3, iterations = len(i), 3 * self.n, law.iterations if iterated else 1
         unit = r[i] - r[j]
         unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-        own, other = (_along(unit, x, n3) for x in (i, j))
+        own, other = (_component_map(unit, x, n3) for x in (i, j))
         #: Errors of edges (m, N 3) of places.
         self.edges = (own - other)[i < j]
         inverse = 1.0 / masses
@@ -114,7 +114,7 @@ class LinearFlight:
         self.waits = math.ceil(late / tick - 1e-9)
         orders = _ORDERS if any(not lag.point for lag in lags) else 2
         self._motion, self._early = (
-            _motion_over(t, lags, drag, orders) for t in (tick, self.waits * tick - late)
+            _transition_matrix(t, lags, drag, orders) for t in (tick, self.waits * tick - late)
         )
         #: Rows that are held and sent of each link, and number of links.
         self.shape = 1 + _REST + iterations, L
@@ -130,8 +130,8 @@ class LinearFlight:
         cut = zip(self._shapes.items(), np.split(x, ends[:-1]), strict=True)
         return SimpleNamespace(**{name: y.reshape(*shape, x.shape[1]) for (name, shape), y in cut})
 
-    def _bring_forward(self, heard: Floats, t: float) -> Floats:
-        """Bring forward what was heard (W, L, B) in place by t [s], as `neighbours.bring_forward` does."""
+    def _extrapolate(self, heard: Floats, t: float) -> Floats:
+        """Bring forward what was heard (W, L, B) in place by t [s], as `neighbours.extrapolate` does."""
         place, velocity, acceleration, v, a, put = heard[:_REST]
         place += t * (velocity + 0.5 * t * acceleration)
         velocity += t * acceleration
@@ -223,21 +223,21 @@ class LinearFlight:
                 z.seen[1:] = z.seen[:-1].copy()
                 z.seen[0] = np.einsum("qpn,pnb->qnb", self._early[:2], motion)
             z.orders[:] = np.einsum("qpn,pnb->qnb", self._motion, motion)
-            self._bring_forward(z.held[1:], tick)
-            z.held += arrivals(k + 1, partial(self._news, sent, k + 1, delay, z.held))
+            self._extrapolate(z.held[1:], tick)
+            z.held += arrivals(k + 1, partial(self._updates, sent, k + 1, delay, z.held))
             squares[k] = ((self.edges @ z.orders[0]) ** 2).sum(axis=0)
         return squares, x
 
-    def _news(self, sent: Floats, k: int, delay: int, held: Floats, late: int) -> Floats:
+    def _updates(self, sent: Floats, k: int, delay: int, held: Floats, late: int) -> Floats:
         """What changes in what is held (W, L, B) if each link's message arrives at tick k, some ticks late."""
         age = delay + late
         news = sent[(k - age) % len(sent)].copy()
         news[0] *= -min(TOGETHER, UNDER_WAY / max(age / self.radio.every, 1.0))
-        news[1:] = self._bring_forward(news[1:], age * self.radio.tick) - held[1:]
+        news[1:] = self._extrapolate(news[1:], age * self.radio.tick) - held[1:]
         return news
 
 
-def _along(unit: Floats, who: Ints, columns: int) -> Any:
+def _component_map(unit: Floats, who: Ints, columns: int) -> Any:
     """The map (L, 3 N) of vectors of vehicles to the components of one of them (L,) along unit vectors (L, 3)."""
     from scipy import sparse
 
@@ -245,7 +245,7 @@ def _along(unit: Floats, who: Ints, columns: int) -> Any:
     return sparse.csr_array((unit.ravel(), places), (len(who), columns))
 
 
-def _motion_over(t: float, lags: Sequence[Lag], drag: Floats, orders: int) -> Floats:
+def _transition_matrix(t: float, lags: Sequence[Lag], drag: Floats, orders: int) -> Floats:
     """What places and their derivatives become in t [s]: (Q, Q + 1, 3 N), the command, which is held, last."""
     from scipy.linalg import expm
 

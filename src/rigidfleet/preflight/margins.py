@@ -76,7 +76,7 @@ def tracking_law(mission: Mission, lags: Sequence[Lag]) -> ClosedLoops | None:
     """The tracking of single vehicles; None if no phase tracks slots."""
     if not any(phase.control == "tracking" for phase in mission.phases):
         return None
-    return ClosedLoops("tracking", tracking_loops(lags), feedback(mission, None, None), GROWTH)
+    return ClosedLoops("tracking", tracking_loops(lags), phase_gains(mission, None, None), GROWTH)
 
 
 def formation_laws(
@@ -91,11 +91,11 @@ def formation_laws(
         name = planned.shapes[1]
         if name is None or not len(edges := mission.formation_edges(name)):
             continue
-        law = feedback(mission, phase, None if _changes_shape(planned) else name)
+        law = phase_gains(mission, phase, None if _changes_shape(planned) else name)
         # On a way that ends, slow growth does no harm: weak shapes pass.
         growth = 1.0 / np.ptp(planned.time) if _changes_shape(planned) else GROWTH
-        for r in _shapes(planned, phase):
-            key = (_place_in_words(planned), law, *_seen_from_above(r))
+        for r in _sampled_shapes(planned, phase):
+            key = (_place_in_words(planned), law, *_shape_key(r))
             if key in seen:
                 continue
             seen.add(key)
@@ -109,7 +109,7 @@ def formation_laws(
     return laws, skipped
 
 
-def feedback(mission: Mission, phase: Phase | None, held: str | None) -> LoopGains:
+def phase_gains(mission: Mission, phase: Phase | None, held: str | None) -> LoopGains:
     """The laws of a phase; ``held`` is the formation in which it begins, None if the shape changes."""
     c = mission.constraint
     k1, k2 = mission.tracking_gains
@@ -133,7 +133,7 @@ def _place_in_words(planned: PlannedPhase) -> str:
     return f"on the way to '{after}'" if before is None else f"'{before}' to '{after}'"
 
 
-def _shapes(planned: PlannedPhase, phase: Phase) -> Floats:
+def _sampled_shapes(planned: PlannedPhase, phase: Phase) -> Floats:
     """Positions (SHAPES, N, 3) [m], evenly over the change of shape, or over the phase."""
     shaping = phase.shaping
     t, span = planned.time, planned.time[-1] - planned.time[0]
@@ -143,7 +143,7 @@ def _shapes(planned: PlannedPhase, phase: Phase) -> Floats:
     return planned.position[np.minimum(at, len(t) - 1)]
 
 
-def _seen_from_above(r: Floats) -> tuple[bytes, bytes]:
+def _shape_key(r: Floats) -> tuple[bytes, bytes]:
     """What the loop depends on: all but place and heading, to a millimetre or so."""
     x = r - r.mean(axis=0)
     across = x[:, :2] @ x[:, :2].T
@@ -163,7 +163,7 @@ def _smaller_margins(
     constrained = [loop for loop in loops if loop.is_constrained]
     most = math.inf if known is None else known.largest_pole
     pole = largest_pole(constrained, law, most, growth) if constrained else most
-    return FormationMargins(now if known is None else known.margins.common(now), pole)
+    return FormationMargins(now if known is None else known.margins.smaller_margins(now), pole)
 
 
 def margin_remarks(preflight: Preflight) -> Iterator[Remark]:

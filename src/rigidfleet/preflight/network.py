@@ -27,7 +27,7 @@ from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import network_of
 from rigidfleet.preflight.findings import FormationNetwork, Preflight, Remark
 from rigidfleet.preflight.linear_flight import Arrivals, LinearFlight, Radio
-from rigidfleet.preflight.margins import feedback
+from rigidfleet.preflight.margins import phase_gains
 from rigidfleet.typing import Floats
 
 #: Number of links beyond which a formation is not checked: that would take minutes.
@@ -64,7 +64,7 @@ def check_network(
     checks: dict[str, FormationNetwork] = {}
     for name, flight, unheard in linear_flights(mission, way, lags):
         check = _formation_network(mission, flight, unheard)
-        checks[name] = check.lesser(checks.get(name, check))
+        checks[name] = check.weaker_of(checks.get(name, check))
     return checks
 
 
@@ -74,14 +74,14 @@ def linear_flights(
     """Each formation under each law with which it is flown, and how many of its edges nobody hears along."""
     if mission.network is None or mission.vehicle_models is None:
         return
-    net, every = network_of(mission), _law_every(mission)
+    net, every = network_of(mission), _ticks_per_law(mission)
     radio = Radio(
         max(1, round(net.every / every)), math.ceil(net.delay / every), net.lag, every / mission.autopilot.rate
     )  # fmt: skip
     drag = np.array([model.linear_drag for model in mission.vehicle_models])
     drag /= mission.fleet.mass[:, None]
     pairs = zip(mission.phases, way, strict=False)
-    laws = {(planned.shapes[1], feedback(mission, p, planned.shapes[1])) for p, planned in pairs}
+    laws = {(planned.shapes[1], phase_gains(mission, p, planned.shapes[1])) for p, planned in pairs}
     for name, law in sorted(laws, key=str):
         slots = None if name is None else mission.formation_slots(name)
         if name is None or slots is None:
@@ -96,9 +96,9 @@ def linear_flights(
 def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> FormationNetwork:
     own, net, radio = mission.network, network_of(mission), flight.radio
     assert own is not None
-    every = _law_every(mission)
+    every = _ticks_per_law(mission)
     latest, delay = math.ceil((net.delay + net.jitter) / every), last_stable_delay(flight)
-    loss = loss_borne(flight) if radio.delay <= delay else None
+    loss = greatest_stable_loss(flight) if radio.delay <= delay else None
     growing = None
     if latest > min(radio.delay, delay) or own.burst is not None or own.loss > (loss or 0.0):
         growing = float((sampled_growth(flight, net, every) > _GROWS).mean())
@@ -106,12 +106,12 @@ def _formation_network(mission: Mission, flight: LinearFlight, unheard: int) -> 
     return FormationNetwork(broadcasts, radio.tick, delay, latest, loss, own.loss, growing, unheard)
 
 
-def _law_every(mission: Mission) -> int:
+def _ticks_per_law(mission: Mission) -> int:
     """Attitude ticks from one evaluation of the law to the next."""
     return max(1, round(mission.autopilot.rate / mission.autopilot.formation_rate))
 
 
-def growth_at(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]) -> float:
+def growth_at_delay(flight: LinearFlight, delay: int, accuracy: float = _FINE[0]) -> float:
     """Greatest growth [1/s] of a motion if all messages arrive after ``delay`` ticks; about 0 at least.
 
     Free motions of the whole formation, and integrals of stresses that no vehicle feels, neither grow nor decay.
@@ -164,13 +164,13 @@ def last_stable_delay(flight: LinearFlight) -> int:
 def _last_delay(flight: LinearFlight, first: int, most: int, accuracy: float, growth: float) -> int:
     """Last delay in ticks up to ``most`` at which motions grow by less, looked for from ``first`` on."""
     low, high = 0, first
-    while growth_at(flight, high, accuracy) < growth:
+    while growth_at_delay(flight, high, accuracy) < growth:
         if high == most:
             return most
         low, high = high, min(2 * high, most)
     while high - low > 1:
         middle = (low + high) // 2
-        stable = growth_at(flight, middle, accuracy) < growth
+        stable = growth_at_delay(flight, middle, accuracy) < growth
         low, high = (middle, high) if stable else (low, middle)
     return low
 
@@ -222,7 +222,7 @@ def growth_of(squares: Floats, time: float) -> Floats:
     return 0.5 * np.log(after.mean(axis=0) / before.mean(axis=0)) / (0.5 * time)
 
 
-def loss_borne(flight: LinearFlight) -> float:
+def greatest_stable_loss(flight: LinearFlight) -> float:
     """Share of messages lost up to which the formation is stable in mean square at its own delay."""
     few, many, links = _STATES
     states = min(max(links // len(flight.links), few), many)
@@ -282,7 +282,7 @@ def network_remarks(preflight: Preflight) -> Iterator[Remark]:
         if f.unheard:
             text = f"'{name}': {f.unheard} edges are longer than the range of the network: nobody hears along them"
             yield Remark("note", "network", text)
-        if f.borne:
+        if f.bears_network:
             continue
         share, what = f.growing or 0.0, f"{100 * f.own_loss:.0f} % of its messages are lost"
         why, remedy = what, "lower network.loss, raise network.rate, or slow the constraint law"

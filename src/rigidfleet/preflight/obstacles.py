@@ -11,7 +11,7 @@ from rigidfleet._common.quantities import PLACES, QUANTITIES
 from rigidfleet.math.piecewise import Piecewise
 from rigidfleet.mission import Box, Ground, Mission, Obstacle
 from rigidfleet.mission.boundaries import BoundaryWatch, Worst, boundary_in_words
-from rigidfleet.planning.clearance import CLOSE, closest, pace
+from rigidfleet.planning.clearance import CLOSE, closest, speed_bounds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import SLACK, Preflight, Remark, names_in_words
 from rigidfleet.solids.records import extent
@@ -40,7 +40,7 @@ def obstacle_remarks(mission: Mission, preflight: Preflight) -> Iterator[Remark]
     far = np.stack(bounds, axis=1) - radius.max()
     held, met, skipped = 0, 0, []
     unproved: dict[int, float] = {}
-    paces = [pace(planned) for planned in way]
+    paces = [speed_bounds(planned) for planned in way]
     near = np.argsort(far.min(axis=0), kind="stable")
     shown: dict[int, tuple[float, float, int, str]] = {}
     remarks: dict[int, list[Remark]] = {}

@@ -17,13 +17,13 @@ import numpy as np
 from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
-from rigidfleet.math.margins import shares
+from rigidfleet.math.margins import input_shares
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
-from rigidfleet.planning.vehicles import air_force, jets
+from rigidfleet.planning.vehicles import air_force, jet_speeds
 from rigidfleet.preflight.avoidance import is_left_to_avoidance
 from rigidfleet.preflight.findings import DENSE, Preflight, Remark
-from rigidfleet.preflight.margins import feedback
+from rigidfleet.preflight.margins import phase_gains
 from rigidfleet.preflight.obstacles import obstacle_remarks
 from rigidfleet.preflight.trajectory import downwash_remarks, geofence_remarks, separation_remarks
 from rigidfleet.preflight.vehicles import STACKED
@@ -48,7 +48,7 @@ def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
     ]
     if not any(pushed.any() for pushed in pushes):
         return pushes
-    law = feedback(mission, None, None)
+    law = phase_gains(mission, None, None)
     laws = np.zeros((2, 4, 4))  # of the integral, the offset, its rate and a held force
     laws[:, 0, 1] = laws[:, 1, 2] = laws[:, 2, 3] = 1.0
     laws[0, 2, :3] = -law.ki, -law.k1, -law.k2
@@ -89,7 +89,7 @@ def _unknown_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
     up = np.array([0.0, 0.0, 1.0])
     air = np.zeros(3) if d is None else np.array(d.wind)
     if d is not None and d.downwash and mission.n_agents <= STACKED:
-        air = air - jets(mission, planned.position).sum(axis=2)[..., None] * up
+        air = air - jet_speeds(mission, planned.position).sum(axis=2)[..., None] * up
     force = air_force(mission, air - v)
     if mission.tracking.drag_feedforward:
         known = air_force(mission, -v)
@@ -109,10 +109,10 @@ def _offsets_with_edges(
     edges = mission.formation_edges(name)
     if max(len(edges), 3 * len(masses)) > DENSE:  # as a whole, at least
         return np.broadcast_to((masses @ free / masses.sum())[:, None], free.shape)
-    law, root = feedback(mission, planned.leg.phase, name), np.repeat(np.sqrt(masses), 3)
+    law, root = phase_gains(mission, planned.leg.phase, name), np.repeat(np.sqrt(masses), 3)
     law = replace(law, damping=_SMALL * law.damping)
     for part in np.array_split(np.arange(len(free)), _SHAPES):
-        S = shares(planned.position[part[len(part) // 2]], edges, masses, law)
+        S = input_shares(planned.position[part[len(part) // 2]], edges, masses, law)
         mixed = answers[part, 0] + (answers[part, 1] - answers[part, 0]) * root @ S / root
         free[part] = mixed.reshape(-1, *free.shape[1:])
     return free
@@ -165,7 +165,7 @@ def _broken_limits(
             broken["collision"] = f"{least[2]} come {nearer:.2f} m nearer than the plan proves"
     arrival = min(int(np.searchsorted(planned.time, leg.arrival)), len(r) - 1)
     held = [("tracking error", "", float(far.max()), limits.tracking_error)]
-    # As `PhasePlan.target` and `PhasePlan.stay` promise.
+    # As `PhasePlan.target` and `PhasePlan.stay_target` promise.
     stays, later = "position" not in phase.meets, arrival < len(r) - 1
     places = [("waypoint", arrival)] * (not stays)
     places += [("its place at the end", -1)] * (stays or (later and not phase.free))

@@ -333,7 +333,7 @@ def _limits_of_reference(
     mission: Mission, planned: PlannedPhase, hopeless: set[str]
 ) -> Iterator[Remark]:
     """Remark on the limit that the reference of a smooth phase breaks most, with the least time that keeps all."""
-    over = timing.broken(mission, planned.leg)
+    over = timing.broken_limits(mission, planned.leg)
     if not over or (topic := over[0].limit.of.name_in_words) in hopeless:
         return
     key, least = timing.least_time(mission, planned.leg)
@@ -342,7 +342,7 @@ def _limits_of_reference(
         hopeless.add(topic)
     else:
         remedy = f"the least {key} of this phase is {math.ceil(100 * least) / 100:.2f} s"
-    yield Remark("fails", topic, f"{timing.said(over[0], planned.leg.phase)}; {remedy}")
+    yield Remark("fails", topic, f"{timing.reached_in_words(over[0], planned.leg.phase)}; {remedy}")
 
 
 def _limits_at_samples(mission: Mission, planned: PlannedPhase) -> Iterator[Remark]:

@@ -17,9 +17,9 @@ from rigidfleet.planning.derivatives import slot_derivatives
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import (
     air_force,
-    asked_yaw,
+    commanded_yaw,
     first_yaw,
-    jets,
+    jet_speeds,
     slots_and_yaw,
     turn_along,
 )
@@ -48,7 +48,7 @@ def check_vehicles(mission: Mission, way: Sequence[PlannedPhase]) -> VehicleChec
     tracked = [planned for planned in way if planned.leg.phase.control == "tracking"]
     if models is None or not tracked or all(model.point for model in models):
         return None
-    setting, angle, needs = asked_yaw(mission), first_yaw(mission), []
+    setting, angle, needs = commanded_yaw(mission), first_yaw(mission), []
     for planned in tracked:
         leg, n = planned.leg, mission.n_agents
         count = min(max(_SAMPLES, int((leg.end - leg.start) / _STEP) + 1), _MOST)
@@ -161,7 +161,7 @@ def _jet_remarks(mission: Mission, way: Sequence[PlannedPhase]) -> Iterator[Rema
     assert models is not None
     worst = (0.0, 0.0, 0.0, 0, 0, 0.0, 0.0, "")
     for planned in way if mission.n_agents <= STACKED else ():
-        flow = jets(mission, planned.position)
+        flow = jet_speeds(mission, planned.position)
         down = np.zeros((*flow.shape, 3))
         down[..., 2] = flow
         push = air_force(mission, down.swapaxes(1, 2)).swapaxes(1, 2)[..., 2]

@@ -19,7 +19,7 @@ from rigidfleet.typing import Floats
 _AREAS = "fence", "soft_fence", "people"
 
 
-def rows(
+def brief_rows(
     result: Result, verdict: Verdict, falls: Floats, rehearsed: Sequence[str] = (), abort: Sequence[str] = ()
 ) -> list[tuple[str, Sequence[str]]]:  # fmt: skip
     """Headings, each with its sentences.
@@ -34,7 +34,7 @@ def rows(
         f"{x.message[0].upper()}{x.message[1:]}." for x in verdict.checks if x.check in _AREAS
     ]
     return [
-        ("Planned", plan(result)),
+        ("Planned", plan_sentences(result)),
         ("Proved", _proofs(result, verdict)),
         ("Rehearsed", rehearsed or ["No drill belongs to this report."]),
         ("Aborted", abort or ["No way home belongs to this report."]),
@@ -44,7 +44,7 @@ def rows(
     ]
 
 
-def plan(result: Result) -> list[str]:
+def plan_sentences(result: Result) -> list[str]:
     """What flies, for how long, and how far and fast."""
     mission, mass = result.mission, sorted({*result.mission.agents.mass})
     lasting = value(float(result.time[-1] - result.time[0]), "s")

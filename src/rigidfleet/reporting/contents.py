@@ -13,7 +13,7 @@ import numpy as np
 from rigidfleet import plotting
 from rigidfleet._common.facts import Cell, FactTable, Level, Row, value
 from rigidfleet._common.quantities import QUANTITIES, display_unit, quantity
-from rigidfleet._common.text import all_hold
+from rigidfleet._common.text import all_hold_in_words
 from rigidfleet._version import __version__
 from rigidfleet.assessment import Safety, Verdict, assess, safety
 from rigidfleet.plotting import encode_figure
@@ -64,13 +64,13 @@ def contents(
     pages = [_flight(*each) for each in zip(flights, judged, names, colours, strict=True)]
     # Trajectories that others made have no gains.
     controlled = any(each["gains"] is not None and each["gains"].rows for each in pages)
-    response = overlay.response(missions, names) if controlled else None
+    response = overlay.draw_responses(missions, names) if controlled else None
     # The summary has its own page.
     drawn = [name for name in plotting.figure_names(flights[0]) if name != "summary"]
     first: dict[str, Any] = {"brief": [], "sketch": None}
     if not several:
         falls = falls_of(flights[0])
-        first["brief"] = brief.rows(flights[0], judged[0], falls, **more)
+        first["brief"] = brief.brief_rows(flights[0], judged[0], falls, **more)
         first["sketch"] = _data_url(encode_figure(sketch(flights[0], falls), ["svg"])["svg"])
     return {
         "title": " · ".join(names),
@@ -86,7 +86,7 @@ def contents(
         "controlled": controlled,
         "response": None if response is None else _data_url(response),
         "version": __version__,
-        "covers": _covers(flights),
+        "covers": _scope_in_words(flights),
     }
 
 
@@ -116,13 +116,13 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
         "word": verdict.word,
         "head": f"{len(failed)} of {len(judged)} checks {verdict.word}"
         if failed
-        else all_hold(len(judged)),
+        else all_hold_in_words(len(judged)),
         "words": [f.message for f in (*verdict.failures, *verdict.open_checks)]
         or [verdict.summary.split("\n")[0].partition("; ")[2] or verdict.covers],
         "notes": [verdict.uncalled, *verdict.notes] if verdict.uncalled else verdict.notes,
-        "plan": brief.plan(result),
+        "plan": brief.plan_sentences(result),
         "phases": mission.phase_table,
-        "checks": [part for part in verdict.facts().shown if isinstance(part, FactTable)],
+        "checks": [part for part in verdict.facts().shown_parts if isinstance(part, FactTable)],
         "vehicles": _vehicles_table(result),
         "vehicles_left_out": max(0, result.n_agents - _VEHICLES),
         "summary": _figure(result, "summary"),
@@ -132,7 +132,7 @@ def _flight(result: Result, verdict: Verdict, label: str, colour: str) -> dict[s
     }
 
 
-def _covers(flights: Sequence[Result]) -> str:
+def _scope_in_words(flights: Sequence[Result]) -> str:
     """What the flights are, and what the report does not cover."""
     if all(flight.interpolation is not None for flight in flights):
         return "Others made this flight: its curve is judged, not whether vehicles can fly it."
@@ -241,7 +241,7 @@ def _safety_cells(row: Safety) -> tuple[str | Cell, ...]:
         left = f"{value(abs(row.margin), row.unit)} {'left' if row.margin >= 0 else 'beyond'}"
     when = f"{worst.when:.2f} s" + ", at samples" * worst.at_samples
     margin, at = Cell(left, share=row.used), Cell(when, worst.phase)
-    size = Cell(value(worst.value, row.unit), row.fact.doubt)
+    size = Cell(value(worst.value, row.unit), row.fact.interval_text)
     return row.fact.bound, size, margin, at, worst.who
 
 
@@ -350,6 +350,6 @@ def _data_url(svg: bytes) -> str:
 
 def _overlays(flights: Sequence[Result], labels: Sequence[str]) -> list[dict[str, str]]:
     return [
-        _picture("paths", overlay.paths(flights, labels), "Paths of the formations' centres of mass."),
-        _picture("over time", overlay.over_time(flights, labels), "Worst value of all vehicles at each time."),
+        _picture("paths", overlay.draw_paths(flights, labels), "Paths of the formations' centres of mass."),
+        _picture("over time", overlay.draw_over_time(flights, labels), "Worst value of all vehicles at each time."),
     ]  # fmt: skip

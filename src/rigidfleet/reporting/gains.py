@@ -32,7 +32,7 @@ def gain_lines(mission: Mission) -> list[GainLine]:
     return [*constraint, *_tracking_lines(mission), *_regulator_lines(mission)]
 
 
-def response(mission: Mission, t: list[float]) -> list[float] | None:
+def error_response(mission: Mission, t: list[float]) -> list[float] | None:
     """Error c(t)/c(0) of a distance with c'(0) = 0; None without stabilisation."""
     c = mission.constraint
     if c.stabilisation == "none" or not len(mission.edges):

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 _WIDTHS = (2.6, 0.9)  # of lines, first flight to last: each remains visible under the next
 
 
-def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
+def draw_paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Path of the centre of mass from above, and its height over time, as an SVG."""
-    with st.settings():
+    with st.apply_style():
         fig = st.blank_figure(st.WIDTH, 3.6, "constrained")
         above, height = fig.subplots(1, 2)
         for flight, look in zip(flights, _looks(flights), strict=True):
@@ -38,12 +38,12 @@ def paths(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         return _svg(fig)
 
 
-def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
+def draw_over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
     """Distances, thrust, speed and errors over time, as an SVG."""
     panels = ["separation", "thrust", "speed", "tracking_error", "constraint"]
     if any(flight.mission.obstacles for flight in flights):
         panels.insert(1, "clearance")
-    with st.settings():
+    with st.apply_style():
         rows = (len(panels) + 1) // 2
         fig = st.blank_figure(st.WIDTH, 0.6 + 1.9 * rows, "constrained")
         axes = fig.subplots(rows, 2, sharex=True, squeeze=False).ravel()
@@ -72,18 +72,18 @@ def over_time(flights: Sequence[Result], labels: Sequence[str]) -> bytes:
         return _svg(fig)
 
 
-def response(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
+def draw_responses(missions: Sequence[Mission], labels: Sequence[str]) -> bytes | None:
     """Response of a distance error with c'(0) = 0 under each mission's gains, as an SVG."""
     times = [s for m in missions if len(m.edges) and (s := m.constraint.settling_time) is not None]
     if not times:
         return None
     t = np.linspace(0.0, 1.6 * max(times), 400)
-    with st.settings():
+    with st.apply_style():
         fig = st.blank_figure(st.WIDTH, 2.2, "constrained")
         ax = fig.subplots()
         ax.axhspan(-0.02, 0.02, color=st.BAND, linewidth=0)
         for mission, look in zip(missions, _looks(missions), strict=True):
-            error = gains.response(mission, t.tolist())
+            error = gains.error_response(mission, t.tolist())
             if error is not None:
                 ax.plot(t, error, **look)
         ax.axhline(0.0, color=st.GREY, linewidth=0.6)

@@ -71,9 +71,9 @@ def rgb(colours: tuple[str, ...]) -> Floats:
     return np.array([[*bytes.fromhex(colour[1:])] for colour in colours]) / 255.0
 
 
-def view(result: Result) -> tuple[float, float]:
+def view_angles(result: Result) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer, from the flight, who reads the flattest of the lit formations."""
-    best, seen = np.inf, seen_from(np.zeros((1, 3)))
+    best, seen = np.inf, plane_view(np.zeros((1, 3)))
     for phase in range(len(result.phases)):
         formation, k = result.phases[phase].formation, result.samples(phase).stop - 1
         colours = None if formation is None else result.mission.formation_colours(formation)
@@ -82,22 +82,22 @@ def view(result: Result) -> tuple[float, float]:
         points = result.position[k][rgb(colours).any(axis=1)]
         if not (len(points) and np.isfinite(points).all()):
             continue
-        _, wide, thick = _principal(points)[0]
+        _, wide, thick = _principal_axes(points)[0]
         if (thin := thick / max(wide, 1e-9)) < best:
             q = result.attitude[k]
             turn = dcm_from_quaternion(q).T if np.isfinite(q).all() else np.eye(3)
-            best, seen = thin, seen_from(points, turn @ _FRONT)
+            best, seen = thin, plane_view(points, turn @ _FRONT)
     return seen
 
 
-def seen_from(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tuple[float, float]:
+def plane_view(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tuple[float, float]:
     """Azimuth and elevation [rad] of a viewer who faces the plane of points (n, 3) [m], on the side of ``front`` (3,).
 
     Of the planes through a line it is the one that faces the front most, without any plane the front itself. A plane
     that lies flat is seen from above, y upwards.
     """
     ahead = np.asarray(front, dtype=float)
-    extents, axes = _principal(points)
+    extents, axes = _principal_axes(points)
     normal = axes[2]
     if extents[1] <= 1e-3 * extents[0]:
         normal = ahead - ahead @ axes[0] * axes[0]
@@ -109,7 +109,7 @@ def seen_from(points: Floats, front: Floats | tuple[float, ...] = _FRONT) -> tup
     return float(np.arctan2(y, x)), _LOW
 
 
-def _principal(points: Floats) -> tuple[Floats, Floats]:
+def _principal_axes(points: Floats) -> tuple[Floats, Floats]:
     """Extents (3,) of points (n, 3) along their principal directions, the greatest first, and these (3, 3) as rows."""
     about = np.concatenate([points - points.mean(axis=0), np.zeros((3, 3))])
     return np.linalg.svd(about, full_matrices=False)[1:]

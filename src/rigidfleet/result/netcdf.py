@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet._common.files import why_not
-from rigidfleet._common.plain import plain_text
+from rigidfleet._common.files import os_error_in_words
+from rigidfleet._common.plain import to_json_text
 from rigidfleet.errors import ResultError, refuse_format
 from rigidfleet.result.phases import PhaseRecord
 
@@ -110,7 +110,7 @@ def file_content(
         file.attrs[_MARK] = SCHEMA_VERSION
         for name, kind in ATTRIBUTES.items():
             # Attributes can be text or numbers, but not dict, bool or None: those are stored as JSON.
-            plain = kind if kind in (int, str) else plain_text
+            plain = kind if kind in (int, str) else to_json_text
             file.attrs[_attribute_name(name)] = plain(attributes[name])
         for name, names in labels.items():
             names_along = file.create_variable(name, (name,), text)
@@ -154,14 +154,14 @@ def read_file(path: Path, variables: Mapping[str, Variable]) -> dict[str, Any]:
                 f"{path}: is a netCDF-4 or HDF5 file, but not a result of rigidfleet. "
                 "Give the path of a result of `rigidfleet run`."
             )
-        made = reader.attribute(file, _MARK, int)
+        made = reader.read_attribute(file, _MARK, int)
         refuse_format(path, "result", made, SCHEMA_VERSION, older="Fly the mission again")
         attributes = {
-            name: reader.attribute(file, _attribute_name(name), kind)
+            name: reader.read_attribute(file, _attribute_name(name), kind)
             for name, kind in ATTRIBUTES.items()
         }
         sizes = {dim: len(names) for dim, names in LABELS.items()}
-        arrays = reader.arrays(file, due, sizes, len(data))
+        arrays = reader.read_arrays(file, due, sizes, len(data))
     return arrays | attributes | {"complete": bool(attributes["complete"])}
 
 
@@ -186,7 +186,7 @@ def _bytes(path: Path) -> bytes:
     except IsADirectoryError as error:
         raise ResultError(f"{path}: is a folder. Give the path of a result file in it.") from error
     except OSError as error:
-        raise ResultError(f"{path}: {why_not(error, 'read', path)}") from error
+        raise ResultError(f"{path}: {os_error_in_words(error, 'read', path)}") from error
     if not data.startswith(b"\x89HDF\r\n\x1a\n"):
         what = "is empty" if not data else "is not a netCDF-4 file"
         raise ResultError(f"{path}: {what}. Give the path of a result of `rigidfleet run`.")

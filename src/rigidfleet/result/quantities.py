@@ -42,7 +42,7 @@ class Samples:
         return np.where(np.isfinite(rank), -rank if self.quantity.at_least else rank, np.nan)
 
 
-def length(x: Floats, more: Floats | None = None) -> Floats:
+def norms(x: Floats, more: Floats | None = None) -> Floats:
     """Lengths (...) of vectors (..., 3), or of their sums with ``more`` (..., 3)."""
     squares = (x if more is None else x + more) ** 2
     return np.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
@@ -89,7 +89,7 @@ def _motion(result: Result, q: Quantity) -> tuple[Floats, ...]:
     x = getattr(result, ("velocity", "acceleration", "slot_jerk")[q.order - 1])
     if x is None:
         return (np.full(result.left.shape, np.nan),)
-    return (without_lost(result, SIZES[q.way](x) if q.way else length(x)),)
+    return (without_lost(result, SIZES[q.way](x) if q.way else norms(x)),)
 
 
 def _headroom(result: Result) -> tuple[Floats, Owner]:
@@ -138,7 +138,7 @@ def _tilt(result: Result) -> tuple[Floats, ...]:
         up = att.dcm_from_quaternion(result.vehicle_attitude)[..., 2, 2]
     elif (wanted := result.slot_acceleration) is not None:
         force = wanted + np.array([0.0, 0.0, result.mission.gravity])
-        up = force[..., 2] / np.maximum(length(force), 1e-300)
+        up = force[..., 2] / np.maximum(norms(force), 1e-300)
     else:
         up = np.full(result.left.shape, np.nan)
     return (without_lost(result, np.degrees(np.arccos(np.clip(up, -1.0, 1.0)))),)
@@ -146,7 +146,7 @@ def _tilt(result: Result) -> tuple[Floats, ...]:
 
 def _thrust(result: Result) -> tuple[Floats, ...]:
     """Thrust (K, N) [N] of each agent, from forces, or as recorded where that is more."""
-    thrust, agents = length(result.input_force, result.constraint_force), result.mission.agents
+    thrust, agents = norms(result.input_force, result.constraint_force), result.mission.agents
     if agents.saturate:
         thrust = np.minimum(thrust, agents.thrust_limit)
     if result.rotor_force is not None:  # what was given, not what was asked
@@ -169,9 +169,9 @@ SAMPLED: dict[str, Callable[[Result], tuple[Any, ...]]] = {
     **dict.fromkeys(("lowest", "highest"), lambda r: (without_lost(r, r.position[..., 2]),)),
     "thrust": _thrust,
     "tilt": _tilt,
-    "tracking_error": lambda r: (without_lost(r, length(r.position - r.slot_position)),),
+    "tracking_error": lambda r: (without_lost(r, norms(r.position - r.slot_position)),),
     "constraint": lambda r: _of_edges(r, np.abs(r.constraint)),
     "tension": lambda r: _of_edges(r, -r.multiplier),
-    "constraint_force": lambda r: (without_lost(r, length(r.constraint_force)),),
+    "constraint_force": lambda r: (without_lost(r, norms(r.constraint_force)),),
     "singular_value": lambda r: (r.singular_value, lambda _k: (0,)),
 }

@@ -172,8 +172,8 @@ def analyse(
         rank=frame.rank,
         reachable=full_rank(n, d),
         needed=full_rank(n, space),
-        redundant=frame.redundant(),
-        spare=frame.spare(),
+        redundant=frame.redundant_edges(),
+        spare=frame.spare_edges(),
         flexes=flexes,
         index=_rigidity_index(frame, masses),
         rigidity_class=rigidity_class,
@@ -289,7 +289,7 @@ def classify(
 
 def _generic_rank(frame: Framework) -> int:
     """Greatest rank of J over all positions of the agents; random positions have it almost surely."""
-    if frame.stresses == 0:
+    if frame.stress_dimension == 0:
         return frame.rank
     random = np.random.default_rng(1).normal(size=frame.p.shape)
     return Framework(random, frame.edges).rank

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.arguments import numbers
+from rigidfleet._common.arguments import as_numbers
 from rigidfleet.errors import wrong_type
 from rigidfleet.formation.distance_geometry import dimension, distances
 from rigidfleet.formation.graphs import complete_graph
@@ -70,7 +70,7 @@ def design(
     ValueError
         Two slots coincide; or no edges within range hold the shape (the message gives a sufficient range).
     """
-    p, _ = as_framework(numbers("slots [m]", slots), [])
+    p, _ = as_framework(as_numbers("slots [m]", slots), [])
     flat, _ = flatten(p, max(1, dimension(p)))
     n, d = flat.shape
     edges = complete_graph(n)
@@ -94,13 +94,13 @@ def design(
         return near
     rows = rows[length <= reach]
     meshes = [np.arange(len(near)), *_edges_of_meshes(flat, near)]
-    starts = [_grow(rows, _thin(rows, some, wanted), wanted) for some in meshes]
+    starts = [_add_rows(rows, _remove_rows(rows, some, wanted), wanted) for some in meshes]
     chosen = max(starts, key=lambda some: _least_eigenvalue(rows[some]))
     rng = np.random.default_rng(seed)
     best, best_w = chosen, _least_eigenvalue(rows[chosen])
     work, idle = 0.0, 0
     while True:
-        chosen, used = _exchange(rows, chosen)
+        chosen, used = _improve_by_exchange(rows, chosen)
         w = _least_eigenvalue(rows[chosen])
         idle += 1
         if w > best_w * (1 + 1e-9):
@@ -202,7 +202,7 @@ def _edges_of_meshes(flat: Floats, near: Ints) -> list[Ints]:
     return meshes
 
 
-def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
+def _remove_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     """The chosen rows reduced to (wanted,): the least useful are removed, a tenth of the surplus at a time.
 
     Without row a, tr M^-1 grows by |M^-1 a|^2 / (1 - a^T M^-1 a).
@@ -225,7 +225,7 @@ def _thin(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     return chosen
 
 
-def _grow(rows: Floats, chosen: Ints, wanted: int) -> Ints:
+def _add_rows(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     """The chosen rows and the most useful of the others, (wanted,); arbitrary others if the chosen rows lack rank."""
     while len(chosen) < wanted:
         A = rows[chosen]
@@ -239,7 +239,7 @@ def _grow(rows: Floats, chosen: Ints, wanted: int) -> Ints:
     return chosen
 
 
-def _exchange(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
+def _improve_by_exchange(rows: Floats, chosen: Ints) -> tuple[Ints, float]:
     """A design that no exchange of one edge improves, and the work spent."""
     m, r = rows.shape
     work = 0.0

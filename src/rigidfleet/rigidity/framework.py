@@ -63,7 +63,7 @@ class Framework:
         return len(self.s)
 
     @property
-    def stresses(self) -> int:
+    def stress_dimension(self) -> int:
         """Dimension of the space of self-stresses, which is the number of surplus edges."""
         return len(self.edges) - self.rank
 
@@ -86,13 +86,13 @@ class Framework:
         u = np.linalg.svd(self.null.T @ self.rigid)[0]
         return self.null @ u[:, -k:]
 
-    def redundant(self) -> Ints:
+    def redundant_edges(self) -> Ints:
         """Edges of which any single one could be removed without loss of rank: those that some self-stress loads."""
         return np.flatnonzero(1 - (self.span**2).sum(axis=1) > ZERO)
 
-    def spare(self) -> Ints:
+    def spare_edges(self) -> Ints:
         """Edges that could all be removed at once without loss of rank, long ones first."""
-        if self.stresses == 0:
+        if self.stress_dimension == 0:
             return np.zeros(0, dtype=np.int64)
         # Pivoting takes the largest remainder, so weights make short edges come first. The pivots still span the
         # range, since each is independent of those before.

@@ -96,9 +96,9 @@ def blocking_stress(energy: StressEnergy) -> tuple[Floats | None, Floats, bool]:
     proven : whether it is certain that no stress blocks all
     """
     frame = energy.frame
-    if frame.stresses == 0:
+    if frame.stress_dimension == 0:
         return None, np.eye(energy.k), True
-    if frame.stresses > 1:
+    if frame.stress_dimension > 1:
         return _search_blocking_stress(energy)
     z = np.zeros(len(frame.edges))
     z[(frame.span**2).sum(axis=1).argmin()] = 1

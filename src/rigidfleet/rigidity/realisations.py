@@ -159,7 +159,7 @@ def realisations(
         if at.shape != (n, 3) or not np.isfinite(at).all():
             raise ValueError(f"start must be ({n}, 3) finite positions [m], not {at.shape}")
         begin = align(at, drawn) @ axes[:dimension].T
-        end = lead_lengths(begin, e, length, _REACHED * size)
+        end = follow_lengths(begin, e, length, _REACHED * size)
     last = None if end is None else groups.add(end, 0)
     first = groups.families(e)
     counts = np.bincount(first, groups.counts).astype(int).tolist()
@@ -234,7 +234,7 @@ def _distances_of_pairs(p: Floats) -> Floats:
     return np.linalg.norm(p[i] - p[j], axis=1)
 
 
-def lead_lengths(
+def follow_lengths(
     start: Floats, e: Ints, length: Floats, tol: float, slots: Floats | None = None
 ) -> Floats | None:
     """Positions (N, d) to which lengths (m,) lead that go from those at the start to the desired ones in small steps.

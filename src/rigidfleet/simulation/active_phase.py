@@ -32,7 +32,7 @@ from rigidfleet.simulation.recording import (
     Unevaluated,
     VehicleSamples,
 )
-from rigidfleet.simulation.solver_setup import equip
+from rigidfleet.simulation.solver_setup import workspace_and_solver
 from rigidfleet.typing import Bools, Floats
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class Stepper:
         """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
         raise NotImplementedError
 
-    def decide(self, *, by_law: bool) -> float:
+    def lead_reference(self, *, by_law: bool) -> float:
         """Decide how to fly on, ``by_law`` or under a controller; returns until when that holds [s]."""
         return math.inf
 
@@ -143,11 +143,11 @@ class ActivePhase:
         self.begun = False  # whether samples exist since the start or the last loss
         self.state: IntegratorState
         self.stepper = stepper(self)
-        self._start(plan.state(), plan.start)
+        self._start(plan.initial_state(), plan.start)
 
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
-        self.workspace, self.solver = equip(self.plan, self.workspaces)
+        self.workspace, self.solver = workspace_and_solver(self.plan, self.workspaces)
         self.stepper.begin(y, t)
 
     @property
@@ -185,7 +185,7 @@ class ActivePhase:
         """
         whole = t_end >= self.plan.t_end
         while self.t < (self.plan.t_end if whole else t_end):
-            decided = self.stepper.decide(by_law=controller is None)
+            decided = self.stepper.lead_reference(by_law=controller is None)
             end = min(decided, self.plan.t_end if whole else t_end)
             if controller is None or self.plan.phase.control != "tracking":
                 self._integrate(self.plan.problem, end)
@@ -198,12 +198,12 @@ class ActivePhase:
         while self.t < t_end:
             # Control instants are the start of the phase and multiples since, not the ends of its segments.
             if self.held is None or self.t >= start + self.asked / rate:
-                self.held = self._under(controller)
+                self.held = self._problem_under_controller(controller)
                 # Instants that differ by a rounding error, far less than a millionth of a period, are one.
                 self.asked = max(self.asked, math.floor((self.t - start) * rate + 1e-6)) + 1
             self._integrate(self.held, min(start + self.asked / rate, t_end))
 
-    def _under(self, controller: Controller) -> Problem:
+    def _problem_under_controller(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""
         self.stepper.drop_command()
         answer = call_user("the controller", self.t, controller, self.observe())
@@ -230,9 +230,9 @@ class ActivePhase:
     def steer(self, problem: Problem) -> None:
         """Continue with another problem of the same size, such as one with a different reference, by hand."""
         self.stepper.steer(problem)
-        self.renew(problem)
+        self.continue_with(problem)
 
-    def renew(self, problem: Problem) -> None:
+    def continue_with(self, problem: Problem) -> None:
         """Continue with another problem of the same size."""
         self.plan.problem = problem
         self.counted[records.EVALUATIONS] += self.state.count[records.EVALUATIONS]
@@ -266,17 +266,17 @@ class ActivePhase:
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
         self.stepper.end()
-        self.check()
+        self.raise_errors()
         if not (self.state.count[records.EVALUATIONS] or self.t > self.plan.start):
             return self.plan.before
         self.evaluate()
         return self.plan.state_at_end(self.t, self.state.y, self.workspace)
 
-    def check(self) -> None:
+    def raise_errors(self) -> None:
         """Raise errors of the multipliers' solver, or of the monitor's solver."""
         if self.solver is not None:
             self.solver.check()
-            self.solver.aside.check()
+            self.solver.solver_for_thread.check()
 
     def release(self) -> None:
         """Give back what the phase holds, after the end: nothing more is asked of it."""
@@ -292,27 +292,27 @@ class ActivePhase:
         """
         while self.t < t_end:
             if self.next_loss <= self.t:
-                problem = self._lose(problem, ~self.lost & (self.plan.lost_at <= self.t))
+                problem = self._remove_lost(problem, ~self.lost & (self.plan.lost_at <= self.t))
             else:
                 self.stepper.fly(problem, min(t_end, self.next_loss))
 
-    def _lose(self, problem: Problem, now: Bools) -> Problem:
+    def _remove_lost(self, problem: Problem, now: Bools) -> Problem:
         """Continue without the vehicles that are lost ``now`` (N,) and without the links lost by now.
 
         Returns the remaining problem.
         """
         self.watch(last=True)
-        self.check()
+        self.raise_errors()
         plan, y, own = self.plan, self.state.y, problem is self.plan.problem
         self.parted = plan.links_lost[1] <= self.t
         if now.any():
             self.lost = self.lost | now
             plan.before.lost = self.lost
-            self.extremes.lose(self.lost)
+            self.extremes.remove_lost(self.lost)
         self.next_loss = self._loss_ahead()
         n = len(self.lost)
-        self.count()
-        kept = plan.release(self.lost, self.parted)
+        self.count_work()
+        kept = plan.remove_lost_edges(self.lost, self.parted)
         integral = y[6 * n : 6 * n + len(kept)][kept]
         rest = y[6 * n + len(kept) :]
         y = np.concatenate([y[: 6 * n], integral, rest])
@@ -332,13 +332,13 @@ class ActivePhase:
         agents, links = self.plan.lost_at[~self.lost], self.plan.links_lost[1][~self.parted]
         return min([*agents.tolist(), *links.tolist()], default=math.inf)
 
-    def count(self) -> None:
+    def count_work(self) -> None:
         """Add up the evaluations, steps and solves of the phase, or of its part up to a loss."""
         self.counted += self.state.count[: records.REJECTED + 1]
         if self.solver is not None:
             self.solves.append((self.plan.method, self.solver.counts))
 
-    def times(self, t_end: float) -> Floats:
+    def sample_times(self, t_end: float) -> Floats:
         """Times (K,) [s] to record from now to ``t_end`` [s]."""
         return self.sampler(self.plan, self.t, t_end, first=not self.begun, stop=self.stop)
 
@@ -367,7 +367,7 @@ class ActivePhase:
             errors.append(np.linalg.norm(plan.slots @ turned, axis=1).max())
         return float(max(errors))
 
-    def keep(
+    def store(
         self,
         times: Floats,
         source: Record | Unevaluated,

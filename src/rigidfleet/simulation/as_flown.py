@@ -16,7 +16,7 @@ from rigidfleet.planning.transitions import expand_phases
 from rigidfleet.result import PhaseRecord
 
 
-def as_flown(
+def mission_as_flown(
     mission: Mission, begun: Sequence[Phase], flown: Sequence[PhaseRecord], step: float
 ) -> tuple[Mission, list[PhaseRecord]]:
     """The mission with the phases ``flown`` by hand, and their records under its names.
@@ -47,7 +47,7 @@ def as_flown(
         return mission.rewritten(as_given, "<dict>"), records
 
 
-def with_phase(
+def phase_of_table(
     mission: Mission, begun: Sequence[Phase], flown: Sequence[PhaseRecord], table: Mapping[str, Any]
 ) -> Phase:
     """The phase given as a table of a mission file, checked after the phases flown so far.
@@ -70,11 +70,11 @@ def with_phase(
         spread = expand_phases(made, timed_leg)
         if len(spread.phases) == len(made.phases):  # with the ways that were found
             made = spread
-    _check_flown(made.phases[-1])
+    _refuse_replaced(made.phases[-1])
     return made.phases[-1]
 
 
-def _check_flown(phase: Phase) -> None:
+def _refuse_replaced(phase: Phase) -> None:
     """See that a phase has a flight of its own."""
     if phase.replaced:
         problem = "finds its way before the flight, and cannot begin by hand"
@@ -103,7 +103,7 @@ def check_formation(mission: Mission, phase: Phase) -> None:
         raise wrong_type(
             "a phase (a table as in a mission file, or one of a mission's phases)", phase
         )
-    _check_flown(phase)
+    _refuse_replaced(phase)
     shaping = phase.shaping
     if shaping is None:
         return

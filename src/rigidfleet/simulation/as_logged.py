@@ -15,7 +15,7 @@ import numpy as np
 
 from rigidfleet.assessment import Verdict, assess
 from rigidfleet.assessment.alignment import Alignment, align
-from rigidfleet.assessment.doubt import DrawnWays, facts_of, verdict_with_doubt
+from rigidfleet.assessment.doubt import DrawnWays, doubt_facts, verdict_with_doubt
 from rigidfleet.errors import TrajectoryError
 from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
@@ -88,7 +88,7 @@ def judge_log(
         doubts = doubts._replace(clock="own")
     flown, drawn, estimate, alignment = _likely_flight(read, plan, doubts, judged)
     deviations = None if drawn is None else DrawnWays(flown, drawn)
-    facts = facts_of(flown, deviations, estimate, alignment, doubts.clock)
+    facts = doubt_facts(flown, deviations, estimate, alignment, doubts.clock)
     verdict = verdict_with_doubt(assess(flown), deviations, facts, shared=doubts.clock != "own")
     flown.statistics["doubt"] = facts
     return flown, verdict
@@ -134,7 +134,7 @@ def _likely_flight(
     if plan is None or planned is None:
         blank = Piecewise(whole.time, np.full((*whole.pieces.shape[:2], 1, 1), np.nan))
         judged |= {"names": read.names, "spans": spans, "since": read.since}
-        flown = of_curve(whole.beside(blank), WORDS, **judged)
+        flown = of_curve(whole.stack(blank), WORDS, **judged)
     else:
         flown = flight_of_plan(plan, planned, whole, spans)
     del whole, planned  # large
@@ -253,10 +253,10 @@ def flight_of_plan(plan: Result, planned: Piecewise, way: Piecewise, spans: list
         extremes: dict[str, Extremum] = {}
         if until - since > 1e-9:
             fastest = watch_curve(watch, way.between(since, until), grid, spans)
-            extremes = watch.phase() | fastest
+            extremes = watch.end_phase() | fastest
         records.append(replace(record, extremes=extremes, settled=None, controller=None))
-    watch.only(np.ones(plan.n_agents, dtype=np.bool_))
-    watch.flight(records)
+    watch.keep_only(np.ones(plan.n_agents, dtype=np.bool_))
+    watch.complete_phases(records)
     every = {name: getattr(plan, name) for name in _PLANNED}
     known: dict[str, Any] = {name: x[inside] for name, x in every.items() if x is not None}
     (r, v, a), slots = way.states(time, 3), planned.states(time, 3)[..., :3]

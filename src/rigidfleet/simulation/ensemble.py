@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigidfleet._common.arguments import numbers
+from rigidfleet._common.arguments import as_numbers
 from rigidfleet.kernel.compiler.simd import WIDTH
 from rigidfleet.kernel.engine import batch
 from rigidfleet.mission import Mission, Phase, as_mission
 from rigidfleet.planning.legs import leg_of
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState
-from rigidfleet.planning.solvers import choose
+from rigidfleet.planning.solvers import choose_method
 from rigidfleet.planning.timing import complete_times
 from rigidfleet.planning.tolerances import absolute_tolerances, most_steps, tolerance_of_velocity
 from rigidfleet.typing import Bools, Floats, Ints
@@ -88,7 +88,7 @@ def establish(
     v = np.zeros_like(r) if velocity is None else _starts("velocity", velocity, mission.n_agents)
     if v.shape != r.shape:
         raise ValueError(f"velocity {v.shape} and position {r.shape} must have the same shape")
-    if (why := unfit(mission)) is not None:
+    if (why := why_unfit(mission)) is not None:
         raise ValueError(f"{why}; vary such missions with `rigidfleet.sweep`")
     flights = _Flights(mission, r, v)
     ends = []
@@ -107,17 +107,17 @@ def establish(
     )
 
 
-def unfit(mission: Mission) -> str | None:
+def why_unfit(mission: Mission) -> str | None:
     """Why a mission cannot be flown by `establish`; None if it can."""
     for index, phase in enumerate(mission.phases):
-        if phase.control != "open" or phase.settle or not _alike(mission, phase):
+        if phase.control != "open" or phase.settle or not _serves_all_starts(mission, phase):
             return (
                 f"phase {index + 1} '{phase.name}' cannot be flown in an ensemble, which flies only open-loop phases"
                 " that blend squares or step and end at a given time"
             )
         if (shaping := phase.shaping) is not None:
             edges = mission.formation_edges(shaping.formation)
-            if choose(mission.n_agents, edges, mission.constraint.solver) != "dense":
+            if choose_method(mission.n_agents, edges, mission.constraint.solver) != "dense":
                 return (
                     f"an ensemble solves densely, and '{shaping.formation}' has too many edges for that"
                     f" ({len(edges)})"
@@ -159,10 +159,10 @@ class _Flights:
         law = plan.problem.law._replace(mu=self.mission.damping(None))
         problem = plan.problem._replace(law=law)
         edges = [(int(i), int(j)) for i, j in plan.edges]
-        before = now.reference.of(plan.edges, _lengths(self.r, plan.edges))
+        before = now.reference.values_of(plan.edges, _lengths(self.r, plan.edges))
         sums = [self.integral.get(edge, np.zeros(count)) for edge in edges]
         y = np.column_stack([self.r.reshape(count, -1), self.v.reshape(count, -1), *sums])
-        places, options = _places(self.finished), self.mission.integrator
+        places, options = _flight_by_place(self.finished), self.mission.integrator
         velocity = tolerance_of_velocity(options, now.r, problem.vehicles.m, law.beta, large=False)
         shared = batch.fits(problem) if vectors is None else vectors
         ends = batch.fly_all(
@@ -189,7 +189,7 @@ class _Flights:
         self.plan = plan
 
 
-def _alike(mission: Mission, phase: Phase) -> bool:
+def _serves_all_starts(mission: Mission, phase: Phase) -> bool:
     """Whether a phase blends squares or steps from any start, so that one plan serves all flights."""
     if (shaping := phase.shaping) is None:
         return True
@@ -198,7 +198,7 @@ def _alike(mission: Mission, phase: Phase) -> bool:
 
 
 def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
-    starts = numbers(name, values).copy()
+    starts = as_numbers(name, values).copy()
     if starts.ndim != 3 or starts.shape[1:] != (agents, 3) or not len(starts):
         raise ValueError(f"{name} must be (B, {agents}, 3) for {agents} agents, not {starts.shape}")
     if not np.isfinite(starts).all():
@@ -208,7 +208,7 @@ def _starts(name: str, values: ArrayLike, agents: int) -> Floats:
     return starts
 
 
-def _places(finished: Bools) -> Ints:
+def _flight_by_place(finished: Bools) -> Ints:
     """Flight in each place; a flight that is out leaves its place to a neighbour, so that all others keep theirs."""
     places = np.arange(len(finished))
     for k in np.flatnonzero(~finished):

@@ -102,7 +102,7 @@ class CurveWatch:
         self.pairs = self.columns = self.struck = np.zeros((0, 2), dtype=np.int64)
         self.spare, self.moved = 0.0, np.zeros(2)
         self.touched: dict[str, Extremum] = {}  # first contacts of the flight
-        self._list_all()
+        self._list_all_pairs()
 
     def _take_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         corners = [thing.corners for thing in obstacles]
@@ -138,15 +138,15 @@ class CurveWatch:
         count[records.TRAILED] = len(clock)
         self.take_path(problem, work, state._replace(trail=trail, count=count))
 
-    def only(self, left: Bools) -> None:
+    def keep_only(self, left: Bools) -> None:
         """Continue with the vehicles ``left`` (N,) alone, as if the others were not there."""
         self.left[:] = left
-        self._list_all()
+        self._list_all_pairs()
         if "monitor" in vars(self):
             self._watch_listed(0.0)
         self.moved[:] = np.inf  # of a large fleet, no pairs are listed yet
 
-    def contact(self) -> Extremum | None:
+    def deepest_contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far; None if there was none."""
         contacts = [x for x in (self._extremum(records.FLYING), self._landing()) if x is not None]
         deepest = min(contacts, key=lambda x: x.value, default=None)
@@ -161,10 +161,10 @@ class CurveWatch:
         if self.boundaries.every:
             rows = _rows(state, np.arange(first, steps))
             clock, points = state.trail.clock[rows], state.trail.points[rows]
-            self.boundaries.take(*in_world(clock, points, problem), self.left)
+            self.boundaries.take_steps(*steps_in_world(clock, points, problem), self.left)
         if self.n > _FEW:
             for step in range(first, steps):
-                self._step(problem, work, state, step)
+                self._watch_step(problem, work, state, step)
             return
         self.monitor.distances(problem, state, first, steps)
         self._find_contacts(problem, work, state, np.arange(first, steps))
@@ -216,7 +216,7 @@ class CurveWatch:
         if self.solids is not None:
             self.monitor.clearances(problem, state, first, end, self.solids)
 
-    def so_far(self) -> dict[str, Extremum]:
+    def extremes_so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
         worst, when, who = self.worst.tolist(), self.when.tolist(), self.who.tolist()
         none = self.none.tolist()
@@ -229,15 +229,15 @@ class CurveWatch:
             extremes["tension"] = tension._replace(value=-tension.value)
         return extremes | {name: Extremum(*x) for name, x in self.boundaries.search().items()}
 
-    def phase(self) -> dict[str, Extremum]:
+    def end_phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
-        extremes = self.so_far()
+        extremes = self.extremes_so_far()
         self.worst[_OF_PHASE] = self.none[_OF_PHASE]
         self.boundaries.worst.clear()
         self.moved[:] = np.inf  # the list was made for a worst value that no longer counts
         return extremes
 
-    def flight(self, phases: Sequence[PhaseRecord]) -> None:
+    def complete_phases(self, phases: Sequence[PhaseRecord]) -> None:
         """Give the phases of a finished flight its first contacts, and its clearances in flight and on an obstacle."""
         extremes: dict[str, Extremum | None] = dict(self.touched)
         if self.solids is not None or len(self.boxes):
@@ -266,7 +266,7 @@ class CurveWatch:
 
     # -- large fleets ---------------------------------------------------------------------------------
 
-    def _list_all(self) -> None:
+    def _list_all_pairs(self) -> None:
         """List all pairs of a small fleet; none of a large one yet."""
         self.moved[:] = np.inf
         if self.n <= _FEW:
@@ -275,7 +275,7 @@ class CurveWatch:
                 pairs if self.left.all() else pairs[self.left[pairs].all(axis=1)]
             )
 
-    def _step(
+    def _watch_step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
     ) -> None:
         """Monitor the distances of one step, in pieces so short that only the listed pairs matter."""
@@ -292,18 +292,18 @@ class CurveWatch:
             if not self.stacks:
                 moved[1] = 0.0
             if (self.moved + moved > self.spare).any():
-                self._list(problem, points[0], 0.0)
+                self._list_near_pairs(problem, points[0], 0.0)
             if moved.max() > self.spare:
                 if h > _SHORTEST * length:
                     clock, halves = _halves(t, h, points)
                     pieces += [(*clock[k], halves[k]) for k in (1, 0)]
                     continue
-                self._list(problem, points[0], float(moved.max()))
+                self._list_near_pairs(problem, points[0], float(moved.max()))
             self.moved += moved
             self.monitor.distances(problem, piece, 0, 1)
             self._find_contacts(problem, work, piece, np.zeros(1, dtype=np.int64))
 
-    def _list(self, problem: Problem, y: Floats, moves: float) -> None:
+    def _list_near_pairs(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).
 
         The list is valid at least until distances may have changed by ``moves`` [m].
@@ -394,7 +394,7 @@ class Extremes(CurveWatch):
             self._begin_monitor(size[0], self.trail.gauge.shape[1])
         return records.integrator(y, t, rtol=rtol, atol=atol, trail=self.trail)
 
-    def lose(self, lost: Bools) -> None:
+    def remove_lost(self, lost: Bools) -> None:
         """Continue without the vehicles ``lost`` (N,), which must not hit the others."""
         for i in np.flatnonzero(lost & self.left & (self.low[:, 0] < np.inf)):
             # It was near an obstacle when it was lost, and is no longer landing.
@@ -407,24 +407,24 @@ class Extremes(CurveWatch):
         gone, left = np.flatnonzero(lost), np.flatnonzero(~lost)
         struck = np.stack(np.meshgrid(gone, left, indexing="ij"), axis=-1).reshape(-1, 2)
         self.struck = np.ascontiguousarray(struck)
-        self._list_all()
+        self._list_all_pairs()
         self.size = None  # other vehicles are monitored from now on
 
-    def take(
+    def take_steps(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, *, last: bool
     ) -> None:
         """Evaluate the steps in the trail; ``last``: no further steps of the segment follow."""
         self.take_path(problem, work, state, int(self.monitor.monitor.count[records.STAYED]))
         self.monitor.forces(problem, work, state, last=last)
 
-    def room(self, state: records.IntegratorState) -> int:
+    def free_steps(self, state: records.IntegratorState) -> int:
         """Number of steps for which the trail has room beside those that another thread evaluates."""
         # Beside as many others, and one that has stayed.
         half = (len(state.trail.clock) - 1) // 2
         return half + 1 - int(state.count[records.TRAILED])
 
     def hand_over(self, problem: Problem, work: Workspace, state: records.IntegratorState) -> None:
-        """Let another thread evaluate the steps in the trail, `take`; no more than `room` may follow.
+        """Let another thread evaluate the steps in the trail, `take_steps`; no more than `free_steps` may follow.
 
         Until `wait`, only that thread may use this monitor, ``work``, and what the problem's law changes.
         """
@@ -439,8 +439,8 @@ class Extremes(CurveWatch):
         self._taking = self._thread.submit(self._take_aside, problem, work, taken)
 
     def _take_aside(self, *given: Any) -> None:
-        self.take(*given, last=False)
-        packing.forget()  # the phase may be over before this thread packs others
+        self.take_steps(*given, last=False)
+        packing.forget_last_packed()  # the phase may be over before this thread packs others
 
     def wait(self) -> None:
         """Wait until the steps that were handed over are evaluated."""
@@ -488,7 +488,7 @@ class Extremes(CurveWatch):
             i = int(values.argmax())
             self.of_vehicles[name] = Extremum(float(values[i]), float(times[i]), i, -1)
 
-    def _of_avoidance(self) -> dict[str, Extremum]:
+    def _avoidance_extremes(self) -> dict[str, Extremum]:
         """What avoidance in flight has recorded of the phase so far, by name."""
         arrays, extremes = self.avoidance, {}
         if arrays is None:
@@ -518,15 +518,15 @@ class Extremes(CurveWatch):
             i = int(np.where(values == value, times, np.inf).argmin())
             self.worst[kind], self.when[kind], self.who[kind] = value, times[i], (who[i], -1)
 
-    def so_far(self) -> dict[str, Extremum]:
+    def extremes_so_far(self) -> dict[str, Extremum]:
         """Extremes of the phase under way, by name."""
-        extremes = super().so_far()
-        extremes.update(self.of_vehicles, **self._of_avoidance(), **self.of_layers)
+        extremes = super().extremes_so_far()
+        extremes.update(self.of_vehicles, **self._avoidance_extremes(), **self.of_layers)
         return extremes
 
-    def phase(self) -> dict[str, Extremum]:
+    def end_phase(self) -> dict[str, Extremum]:
         """Extremes of the phase that ends, by name; start those of the next one."""
-        extremes = super().phase()
+        extremes = super().end_phase()
         self.of_vehicles, self.avoidance, self.of_layers = {}, None, {}
         return extremes
 
@@ -535,10 +535,10 @@ def _halves(t: float, h: float, points: Floats) -> tuple[Floats, Floats]:
     """Starts and lengths (2, 2) [s], and control points (2, 5, n), of both halves of a step with points (5, n)."""
     knots = (records.KNOTS + [[0.0], [1.0]]) / 2.0
     clock = np.array([[t, 0.5 * h], [t + 0.5 * h, 0.5 * h]])
-    return clock, records.FROM_KNOTS @ (records.bernstein(knots) @ points)
+    return clock, records.FROM_KNOTS @ (records.bernstein_basis(knots) @ points)
 
 
-def in_world(clock: Floats, points: Floats, problem: Problem) -> tuple[Floats, Floats]:
+def steps_in_world(clock: Floats, points: Floats, problem: Problem) -> tuple[Floats, Floats]:
     """Steps (S, 2) [s] and control points (S, N, 6, 5) of positions and velocities of a trail, in world axes.
 
     In the body formulation, steps are cut so short that their axes turn by less than `_TURN`, and curves of fourth
@@ -553,7 +553,7 @@ def in_world(clock: Floats, points: Floats, problem: Problem) -> tuple[Floats, F
         ).min(axis=1)
         parts = int(max(1.0, np.ceil(8.0 * turns.max(initial=0.0) / _TURN)))
         shares = (np.arange(parts)[:, None] + records.KNOTS) / parts
-        x = (records.bernstein(shares.ravel()) @ points).reshape(-1, 5, points.shape[2])
+        x = (records.bernstein_basis(shares.ravel()) @ points).reshape(-1, 5, points.shape[2])
         clock = np.repeat(clock, parts, axis=0)
         clock[:, 1] /= parts
         clock[:, 0] += clock[:, 1] * np.tile(np.arange(parts), len(points))

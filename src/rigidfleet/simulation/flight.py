@@ -15,20 +15,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rigidfleet.errors import FlightError, MissionError, StoppedError, wrong_type
-from rigidfleet.kernel.avoidance import among
+from rigidfleet.kernel.avoidance import with_obstacles
 from rigidfleet.kernel.problem import TRACKING, External, Motion, workspace
 from rigidfleet.math import attitude as att
 from rigidfleet.math import lqr
 from rigidfleet.mission import Mission, Obstacle, Phase, as_mission
 from rigidfleet.planning.disturbances import disturbance
-from rigidfleet.planning.legs import Leg, at_start
+from rigidfleet.planning.legs import Leg, state_at_start
 from rigidfleet.planning.losses import Answer, answer_to, legs_from
 from rigidfleet.planning.plan import PhasePlan, plan_phase
 from rigidfleet.planning.reference import PhaseState, Pose, copy_with
 from rigidfleet.planning.timing import complete_times, timed_leg
 from rigidfleet.result import Extremum, PhaseRecord, Result
 from rigidfleet.simulation.active_phase import ActivePhase, Sampler
-from rigidfleet.simulation.as_flown import as_flown, check_formation, with_phase
+from rigidfleet.simulation.as_flown import check_formation, mission_as_flown, phase_of_table
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Controller,
@@ -40,9 +40,9 @@ from rigidfleet.simulation.callbacks import (
 from rigidfleet.simulation.extremes import Extremes
 from rigidfleet.simulation.own_laws import Law
 from rigidfleet.simulation.point_phase import PointPhase
-from rigidfleet.simulation.recording import Piece, assemble
+from rigidfleet.simulation.recording import Piece, assemble_result
 from rigidfleet.simulation.sampled_phase import FleetState, SampledPhase
-from rigidfleet.simulation.sampling import Sampling, times_asked
+from rigidfleet.simulation.sampling import Sampling, requested_times
 from rigidfleet.solids.records import join
 from rigidfleet.typing import Floats
 
@@ -259,10 +259,10 @@ class Flight:
         self._built_in = controller is None and agent is None  # whether the mission's own laws fly
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self._push = External(self.external.address, float(max_step)) if self.external else External()  # fmt: skip
-        asked_for = None if times is None else times_asked(times, mission.latest_end)
-        self.sampler = sampler or Sampling(mission.output_step, asked_for).between
+        asked_for = None if times is None else requested_times(times, mission.latest_end)
+        self.sampler = sampler or Sampling(mission.output_step, asked_for).times_between
         self.flips = flips
-        self._reached = at_start(mission)
+        self._reached = state_at_start(mission)
         self._vehicles = (
             FleetState(mission, self._push.max_step, agent) if mission.vehicle_models else None
         )
@@ -359,7 +359,7 @@ class Flight:
                 )
             if not self._reacted and self.t >= self.mission.abandons_at:
                 self._leave_phase(changed=True)
-                self._react()
+                self._react_to_loss()
             if self._following >= len(self._route):
                 if why := self._answer.problem:
                     self.ending = f"no way home is proved from where the flight was aborted: {why}"
@@ -369,16 +369,16 @@ class Flight:
         elif isinstance(phase, Mapping):  # no phase yet
             # Checked first: a phase under way goes on where it has errors.
             flown = len(self.phases) - (self._active is not None and not self._active.flew)
-            phase = with_phase(self.mission, self._asked[:flown], self.phases[:flown], phase)
+            phase = phase_of_table(self.mission, self._asked[:flown], self.phases[:flown], phase)
         else:
             check_formation(self.mission, phase)
         self._leave_phase(changed=True)
-        if self.mission.on_loss == "continue" or not self._given(phase):
-            self._now.blend = None
+        if self.mission.on_loss == "continue" or not self._is_current_of_route(phase):
+            self._state_now.blend = None
         if self._asked:
             self._report(phase, planning=True)
         try:
-            leg = timed_leg(self.mission, phase, self._now, len(self._asked))
+            leg = timed_leg(self.mission, phase, self._state_now, len(self._asked))
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
@@ -549,7 +549,7 @@ class Flight:
     def lose(self, loss: float) -> None:
         """Let links lose a share of the messages from now on, if there are any."""
         if self._vehicles is not None:
-            self._vehicles.lose(loss)
+            self._vehicles.lose_messages(loss)
 
     def record(
         self,
@@ -563,13 +563,13 @@ class Flight:
         active = self._active
         if active is not None:  # the flight can go on
             active.watch(last=True)
-            self.phases[-1].extremes = self._extremes.so_far()
+            self.phases[-1].extremes = self._extremes.extremes_so_far()
         mission, phases = self.mission, self.phases
         if flown is not None:
             last = max(piece.phase for piece in pieces) + 1
             step = step or mission.output_step
-            mission, phases = as_flown(mission, flown[:last], phases[:last], step)
-        self._extremes.flight(phases)
+            mission, phases = mission_as_flown(mission, flown[:last], phases[:last], step)
+        self._extremes.complete_phases(phases)
         evaluations, steps, rejected = self._count.tolist()
         statistics = {
             "evaluations": evaluations, "steps": steps, "rejected": rejected,
@@ -584,7 +584,7 @@ class Flight:
         if self._answer.promise is not None:
             statistics["promised"] = [self._answer.legs[0].start, self._answer.promise]
         ending = self.ending if ending is None else ending
-        result = assemble(
+        result = assemble_result(
             mission, phases, pieces, ending=ending, statistics=statistics, network=self.network
         )
         result.mission = mission  # keeps the slots assigned and edges that it has computed
@@ -602,18 +602,18 @@ class Flight:
         vehicles = self._vehicles
         if vehicles is not None and vehicles.avoidance is not None:
             solids = join([thing.solid for thing in obstacles])
-            vehicles.avoidance = among(vehicles.avoidance, solids)
+            vehicles.avoidance = with_obstacles(vehicles.avoidance, solids)
 
     def contact(self) -> Extremum | None:
         """The deepest contact of a vehicle in flight with an obstacle so far, with vehicle and obstacle, or None."""
         if self._active is not None:
             self._active.watch(last=True)
-        return self._extremes.contact()
+        return self._extremes.deepest_contact()
 
     # -- inside -----------------------------------------------------------------------------------
 
     @property
-    def _now(self) -> PhaseState:
+    def _state_now(self) -> PhaseState:
         """The state from which the next phase starts, evaluated when it is asked for: none follows the last."""
         if self._ended is not None:
             self._reached = self._ended.end()
@@ -641,21 +641,21 @@ class Flight:
 
         Phases begun by hand go on: who began them decides.
         """
-        routed = self._given(self._asked[-1])
+        routed = self._is_current_of_route(self._asked[-1])
         return self.mission.abandons_at if routed and not self._reacted else math.inf
 
-    def _given(self, phase: Phase) -> bool:
+    def _is_current_of_route(self, phase: Phase) -> bool:
         """Whether the route gives a phase that has begun last, or is about to."""
         return self._following > 0 and phase is self._route[self._following - 1]
 
-    def _react(self) -> None:
+    def _react_to_loss(self) -> None:
         """Replace the rest of the route by what the mission asks for after a loss."""
         self._reacted = True
-        lost = self.mission.lost_at <= self._now.t
+        lost = self.mission.lost_at <= self._state_now.t
         if lost.any():
-            self._extremes.lose(lost)
-            self._now.lost = lost
-        self._answer = answer_to(self.mission, self._now, self._whole_plan)
+            self._extremes.remove_lost(lost)
+            self._state_now.lost = lost
+        self._answer = answer_to(self.mission, self._state_now, self._whole_plan)
         legs = self._answer.legs
         if legs:
             self._reached = legs[0].before
@@ -682,27 +682,27 @@ class Flight:
             return
         self._active = None
         if not active.flew:  # as if it had never begun: if it is the mission's, it is still to come
-            self._following -= self._given(self._asked[-1])
+            self._following -= self._is_current_of_route(self._asked[-1])
             del self.phases[-1], self._asked[-1], self._plans[-1:]
             return
         if not (active.has_settled or active.over or abandoned):
             self._cut.add(len(self.phases) - 1)
         active.watch(last=True)
         record = self.phases[-1]
-        record.extremes = self._extremes.phase()
+        record.extremes = self._extremes.end_phase()
         record.abandoned = abandoned
         record.controller = None if self._built_in else self.controller is None or active.asked > 0
         if active.stepper.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.has_settled
-        active.count()
+        active.count_work()
         self._count += active.counted
         for method, counts in active.solves:
             self._solves.setdefault(method, type(counts)()).add(counts)
         self._ended = active
         self._t = record.t_end = active.t
         if active.solver is not None:  # its errors are told at once
-            active.check()
+            active.raise_errors()
         if abandoned:
             points = () if record.target is None else record.target.get("through", ())
             came = [point for point in points if point["time"] <= record.t_end]
@@ -710,12 +710,12 @@ class Flight:
         if changed and record.target is not None and record.target["time"] > record.t_end:
             record.target = None
         if not abandoned and (active.has_settled or active.over or active.t >= active.plan.arrival):
-            record.stay = active.plan.stay(active.t)
+            record.stay = active.plan.stay_target(active.t)
 
     def _check_frame(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""
         both = {plan.phase.control, *(phase.control for phase in self._asked[-1:])}
-        now = self._now
+        now = self._state_now
         if self.flips or both != {"body"} or now.frame is None or plan.frame is None:
             return
         angle = att.angle_between(

@@ -28,7 +28,7 @@ from rigidfleet.planning.body_layer import (
 )
 from rigidfleet.planning.derivatives import body_series, slot_derivatives, slot_series
 from rigidfleet.planning.plan import PhasePlan
-from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, later, time_derivatives
+from rigidfleet.planning.virtual_clock import STEEPEST, VirtualClock, delay_by, time_derivatives
 from rigidfleet.result import Extremum
 from rigidfleet.solids.distance import outward_normal, own_axes, signed_distance
 from rigidfleet.typing import Floats, Ints
@@ -119,24 +119,26 @@ class Leader:
         """Decide at t [s] until ``end`` [s]; returns the problem to fly, or None if it is the one flown already."""
         h = end - t
         acts = self._acts(t + h)
-        self.clock.lead(*(self._choose(t, a) if acts and self.settings.clock else (1.0, np.inf)))
-        accelerations = self._steer(t, a) if acts and self.settings.body else self.deviation.decay()
-        if self.clock.runs and self.deviation.none and not accelerations.any():
+        self.clock.aim(*(self._target(t, a) if acts and self.settings.clock else (1.0, np.inf)))
+        accelerations = (
+            self._detour_rates(t, a) if acts and self.settings.body else self.deviation.decay()
+        )
+        if self.clock.runs_in_real_time and self.deviation.is_none and not accelerations.any():
             self.now = None
             if not self.leads:
                 return None
             self.leads = False
-            return later(self.problem, self.clock.delay)
+            return delay_by(self.problem, self.clock.delay)
         self.leads = True
         self.now = LeaderState(t, copy.copy(self.clock), self.deviation)
-        problem = self._piece(t, h, accelerations)
+        problem = self._moved_problem(t, h, accelerations)
         lost = self.clock.advance(h)
         if lost > 0.0:
             self.waited = t if self.waited is None else self.waited
-            self._put_off(end, lost)
-        self.deviation = self.deviation.at(h, accelerations, h)
-        self.deviation.end(still=self.calm)
-        if not self.deviation.none:
+            self._delay_events(end, lost)
+        self.deviation = self.deviation.state_after(h, accelerations, h)
+        self.deviation.end_if_small(still=self.calm)
+        if not self.deviation.is_none:
             self.steering += h
             self.steered = t if self.steered is None else self.steered
         return problem
@@ -145,7 +147,7 @@ class Leader:
         """Rate of the clock at times (K,) [s] of the period flown last."""
         if self.now is None:
             return np.ones(len(time))
-        return self.now.clock.ahead(time - self.now.begun)[1]
+        return self.now.clock.progress_in(time - self.now.begun)[1]
 
     def displacement(self, time: Floats) -> Floats:
         """Displacement (K, 3) [m] of the body from its path at times (K,) [s] of the period flown last."""
@@ -171,7 +173,7 @@ class Leader:
         reference = self.problem.reference
         return reference.kind != SQUARED or t - self.clock.delay >= reference.t0 + reference.T_b
 
-    def _choose(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
+    def _target(self, t: float, a: AvoidanceArrays) -> tuple[float, float]:
         """The rate to aim at, and the bandwidth of the clock.
 
         The greatest one at which the slots keep away from all that moves, as far as it is known, over the horizon; if
@@ -191,7 +193,7 @@ class Leader:
         again = self.clock.target < 1.0
         if room[0] < (_AGAIN if again else _FREE):
             for rate in _RATES[1:]:
-                at = np.clip(self.clock.ahead(ahead, rate)[0] / step, 0.0, _LOOKS - 1e-9)
+                at = np.clip(self.clock.progress_in(ahead, rate)[0] / step, 0.0, _LOOKS - 1e-9)
                 low = at.astype(int)
                 share = (at - low)[:, None, None]
                 room.append(self._room((1.0 - share) * r[low] + share * r[low + 1], ahead, a, seen))
@@ -218,7 +220,7 @@ class Leader:
                 least, self.who = worst, int(np.unravel_index(room.argmin(), room.shape)[1])
         return least
 
-    def _put_off(self, end: float, lost: float) -> None:
+    def _delay_events(self, end: float, lost: float) -> None:
         """Move the events of the plan that have not come yet by what the clock has fallen behind by ``end`` [s]."""
         assert self.now is not None
         begun, clock = self.now.begun, self.now.clock
@@ -228,7 +230,7 @@ class Leader:
             if progress <= 0.0:
                 return time
             if progress <= end - begun - lost:
-                return begun + clock.when(progress, end - begun)
+                return begun + clock.time_of_progress(progress, end - begun)
             return time + lost
 
         plan = self.plan
@@ -237,7 +239,7 @@ class Leader:
         if begun < (blend := plan.reference).t0 + blend.T_b:
             plan.reference = blend._replace(t0=blend.t0 + lost)
 
-    def _piece(self, t: float, h: float, accelerations: Floats) -> Problem:
+    def _moved_problem(self, t: float, h: float, accelerations: Floats) -> Problem:
         """The problem from t for h [s]: the path at the clock's time, moved by the deviation, as polynomials.
 
         They have the values and two derivatives of both at either end, and at the end of the path, where its
@@ -247,12 +249,12 @@ class Leader:
         reference, motion = problem.reference, problem.motion
         dt = [-_OVERLAP, h + _OVERLAP]
         left = motion.knots[-1] - (t - self.clock.delay)
-        if 0.0 < left < self.clock.ahead(h)[0]:
-            dt.insert(1, self.clock.when(left, h))
+        if 0.0 < left < self.clock.progress_in(h)[0]:
+            dt.insert(1, self.clock.time_of_progress(left, h))
         times, dt = t + np.array(dt), np.repeat(dt, 2)[1:-1]  # both ends of each polynomial
         dt[1:-1:2] -= _BESIDE
         dt[2:-1:2] += _BESIDE
-        progress, s, slope, _ = self.clock.ahead(dt)
+        progress, s, slope, _ = self.clock.progress_in(dt)
         tau, rates = t - self.clock.delay + progress, np.stack([s, slope])
         cm, axes = body_series(motion, tau, 3)
         axes = np.broadcast_to(axes, (3, 3, 3, len(tau)))  # also of a body that does not turn
@@ -263,7 +265,7 @@ class Leader:
         )
         x = time_derivatives(series.derivatives(cm), rates)
         B = series.from_derivatives(time_derivatives(series.derivatives(axes), rates))
-        ends = [self.deviation.at(each, accelerations, h) for each in dt]
+        ends = [self.deviation.state_after(each, accelerations, h) for each in dt]
         moves, turns, grows = (
             np.stack(each, axis=-1) for each in zip(*(e.series() for e in ends), strict=True)
         )
@@ -274,7 +276,7 @@ class Leader:
         phi = series.derivatives(series.rotation_vector(B[0, 0].T @ B))
         channels = np.concatenate([x.transpose(0, 2, 1), phi], axis=2)  # (3, ends, 6)
         polynomials = Motion(times, _polynomials(times, channels), np.ascontiguousarray(B[0, 0].T))
-        late, scaled = later(problem, self.clock.delay).reference, self._any_scale(ends)
+        late, scaled = delay_by(problem, self.clock.delay).reference, self._any_scale(ends)
         if not (p[1:].any() or scaled):
             return problem._replace(motion=polynomials, reference=late)
         ways = _polynomials(times, p.transpose(0, 3, 2, 1))
@@ -289,17 +291,17 @@ class Leader:
 
     # -- the body -----------------------------------------------------------------------------------------
 
-    def _steer(self, t: float, a: AvoidanceArrays) -> Floats:
+    def _detour_rates(self, t: float, a: AvoidanceArrays) -> Floats:
         """Second derivatives (7,) of the deviation to take: those of its decay, changed as barriers need."""
         accelerations, self.calm = self.deviation.decay(), True
         sight = a.sight
         moving = np.flatnonzero((sight.moves == 1) & (sight.known == KNOWN))
-        if not len(moving) and self.deviation.none:
+        if not len(moving) and self.deviation.is_none:
             return accelerations
         r, v, rise, arms = self._slots(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
-        cones = [self._cones(o, r, v, rise, arms, limit, a) for o in moving]
+        cones = [self._cone_rows(o, r, v, rise, arms, limit, a) for o in moving]
         rows, needed, who = (
             (np.concatenate(parts) for parts in zip(*cones, strict=True))
             if cones
@@ -308,14 +310,14 @@ class Leader:
         if len(rows):
             accelerations = self.deviation.decay(NEAR)
         short = needed - rows @ accelerations
-        if not (len(short) and short.max() > 0.0) and self.deviation.none:
+        if not (len(short) and short.max() > 0.0) and self.deviation.is_none:
             return accelerations
         self.calm = not (len(short) and short.max() > 0.0)
         if not self.calm:
             self.who = int(who[short.argmax()])
         # Off the planned path, what stands still counts, too
         for o in np.flatnonzero(sight.moves == 0):
-            more, least, _ = self._barriers(o, r, v, rise, arms, limit, a)
+            more, least, _ = self._barrier_rows(o, r, v, rise, arms, limit, a)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
         if self._any_scale([self.deviation]) or self._scalable:
             more, least = scale_rows(self.deviation)
@@ -365,7 +367,7 @@ class Leader:
         a = c[2] + d[0] @ Q[2].T + 2.0 * d[1] @ Q[1].T + turned[2]
         return r, v, a, turned[0]
 
-    def _cones(
+    def _cone_rows(
         self,
         o: int,
         r: Floats,
@@ -397,7 +399,7 @@ class Leader:
         rows = rigid_rows(normal[some] / length[some, None], arms[some], self.deviation.scale[0])
         return rows, needed[some], some
 
-    def _barriers(
+    def _barrier_rows(
         self,
         o: int,
         r: Floats,
@@ -407,7 +409,7 @@ class Leader:
         limit: float,
         a: AvoidanceArrays,
     ) -> tuple[Floats, Floats, Ints]:
-        """Barriers of slots against obstacle o, which stands still, that may act; see `_cones`."""
+        """Barriers of slots against obstacle o, which stands still, that may act; see `_cone_rows`."""
         solids = a.solids
         at = own_axes(*r.T, o, solids)
         away = signed_distance(*at, o, solids)

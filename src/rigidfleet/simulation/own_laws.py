@@ -98,7 +98,7 @@ class OwnLaws:
         self.last: tuple[int, Problem, list[View | None]] | None = None
         self.numbers = 0  # in the longest message
 
-    def ask(
+    def call_laws(
         self, phase: str, problem: Problem, w: Workspace, flight: SampledFlight, state: SampledState
     ) -> None:
         """Call the law of each vehicle at the tick at which the flight asks, and take what they answer.

@@ -17,7 +17,7 @@ from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Unevaluated
-from rigidfleet.simulation.solver_setup import first_step, solved_by
+from rigidfleet.simulation.solver_setup import first_step, problem_with_solver
 from rigidfleet.typing import Floats
 
 #: Greatest number of steps, and greatest wall time [s], after which the integrator returns to Python. For any
@@ -66,7 +66,7 @@ class PointPhase(Stepper):
     def fly(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
         phase = self.phase
-        stretch = self.prepare(problem, phase.times(t_end))
+        stretch = self.prepare(problem, phase.sample_times(t_end))
         state, fresh = phase.state, stretch.fresh
         status = records.PAUSED
         go_on = native.Integration(
@@ -75,7 +75,7 @@ class PointPhase(Stepper):
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
-                most = phase.extremes.room(state) if self.aside else self.steps
+                most = phase.extremes.free_steps(state) if self.aside else self.steps
                 status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
@@ -83,10 +83,10 @@ class PointPhase(Stepper):
                 fresh = False
                 if phase.external is not None:
                     phase.external.check()
-                phase.check()
+                phase.raise_errors()
                 full = state.count[records.TRAILED] == len(state.trail.clock)
                 if self.aside:
-                    full = phase.extremes.room(state) < 1
+                    full = phase.extremes.free_steps(state) < 1
                 if status == records.PAUSED or full:
                     self.watch(last=False)
                 phase.pause(phase.t)
@@ -109,9 +109,9 @@ class PointPhase(Stepper):
         phase.extremes.wait()
         if not phase.state.count[records.TRAILED] or self.flown is None:
             return
-        work = phase.workspace if phase.solver is None else phase.solver.aside.workspace
+        work = phase.workspace if phase.solver is None else phase.solver.solver_for_thread.workspace
         if last or not self.aside:
-            phase.extremes.take(self.flown, work, phase.state, last=last)
+            phase.extremes.take_steps(self.flown, work, phase.state, last=last)
         else:
             phase.extremes.hand_over(self.flown, work, phase.state)
 
@@ -124,7 +124,7 @@ class PointPhase(Stepper):
             self.watch(last=True)
             self.flown = problem
             if phase.solver is not None:  # a solver keeps state: the monitor has its own
-                self.flown = solved_by(phase.solver.aside, problem)
+                self.flown = problem_with_solver(phase.solver.solver_for_thread, problem)
         phase.begun = True
         samples = np.empty((len(times), len(phase.state.y)))
         phase.state.count[records.SAMPLES] = 0
@@ -156,7 +156,7 @@ class PointPhase(Stepper):
     def release(self) -> None:
         """Let go of what a large formation has packed."""
         if self.phase.solver is not None:
-            packing.forget()
+            packing.forget_last_packed()
 
     def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
         """Store the samples; forces and references at them are evaluated when they are asked for."""
@@ -170,4 +170,4 @@ class PointPhase(Stepper):
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        phase.keep(times, source, samples[:, 6 * n : 6 * n + m], frame)
+        phase.store(times, source, samples[:, 6 * n : 6 * n + m], frame)

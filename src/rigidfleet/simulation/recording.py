@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from rigidfleet._common.arrays import same
+from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.problem import workspace
-from rigidfleet.kernel.records import Record, recorder
+from rigidfleet.kernel.records import Record, new_record
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity
 from rigidfleet.math.constraint_jacobian import smallest_singular_value
@@ -24,7 +24,7 @@ from rigidfleet.planning.derivatives import (
     yaw_derivatives,
 )
 from rigidfleet.result import CLOSE, LATER, RECORDED, SEEN, Extremum, PhaseRecord, Result
-from rigidfleet.simulation.solver_setup import large_solver, solved_by, workspace_of
+from rigidfleet.simulation.solver_setup import large_solver, problem_with_solver, workspace_of
 from rigidfleet.typing import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ class Unevaluated(NamedTuple):
 
     def evaluate(self, times: Floats, work: Workspace) -> Record:
         """Forces and references at the samples, times (K,) [s]."""
-        out = recorder(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
+        out = new_record(len(times), len(self.problem.vehicles.m), len(self.problem.graph.edges))
         self.evaluate_into(native.pack_anew(out), 0, times, work)
         return out
 
@@ -147,7 +147,7 @@ class Piece:
         if not isinstance(self.source, Unevaluated):
             return self.source
         n = len(self.source.problem.vehicles.m)
-        out = recorder(len(self.time), n, len(self.edges))
+        out = new_record(len(self.time), n, len(self.edges))
         self.record_into(native.pack_anew(out), 0)
         return out
 
@@ -165,9 +165,9 @@ class Piece:
                     rows[first : first + len(values)] = values
         elif source.setup is not None:
             solver = large_solver(source.planned, source.setup)
-            planned = solved_by(solver, source.planned)
+            planned = problem_with_solver(solver, source.planned)
             own = source.problem is source.planned
-            problem = planned if own else solved_by(solver, source.problem)
+            problem = planned if own else problem_with_solver(solver, source.problem)
             renewed = source._replace(packed=native.pack_anew(problem), planned=planned)
             renewed.evaluate_into(out, first, self.time, solver.workspace)
             solver.check()
@@ -175,7 +175,7 @@ class Piece:
             source.evaluate_into(out, first, self.time, workspace_of(source.planned, make=make))
 
 
-def assemble(
+def assemble_result(
     mission: Mission,
     phases: Sequence[PhaseRecord],
     pieces: Sequence[Piece],
@@ -194,7 +194,7 @@ def assemble(
     flown = _of_vehicles(pieces)
     tau = flown.tau if flown is not None and flown.tau.size else None
     avoided = [piece.layers for piece in pieces if piece.layers is not None]
-    layers = _together(avoided) if avoided else None
+    layers = _concatenate_samples(avoided) if avoided else None
     d = mission.disturbances
     noisy = d is not None and d.noise is not None
     airy = flown is not None or (d is not None and bool(mission.drag.any()))
@@ -215,7 +215,7 @@ def assemble(
     later += [
         (LATER, partial(_references, mission, [(p.time, p.followed) for p in pieces], tau)),
         (("singular_value",), partial(_singular_values, r, counts, [p.edges for p in pieces])),
-        (("mission_text",), partial(text_of, mission)),
+        (("mission_text",), partial(recorded_text, mission)),
     ]
     return Result(
         time=time,
@@ -297,7 +297,7 @@ def _forces_and_references(
     }
 
 
-def text_of(mission: Mission) -> dict[str, str]:
+def recorded_text(mission: Mission) -> dict[str, str]:
     """The text of a mission, as a result has it."""
     return {"mission_text": mission.text}
 
@@ -323,7 +323,7 @@ def distances(
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
-    _put(worst, time, close)
+    _insert(worst, time, close)
     arrays = close.separation, close.pair, close.clearance, close.agent, close.obstacle
     return dict(zip(CLOSE, arrays, strict=True))
 
@@ -399,17 +399,17 @@ def _of_vehicles(pieces: Sequence[Piece]) -> VehicleSamples | None:
     samples = [piece.vehicles for piece in pieces if piece.vehicles is not None]
     if not samples:
         return None
-    joined = _together(samples)
+    joined = _concatenate_samples(samples)
     attitude = att.unwrap_quaternion(joined.attitude.swapaxes(0, 1)).swapaxes(0, 1)
     return joined._replace(attitude=np.ascontiguousarray(attitude))
 
 
-def _together(pieces: Sequence[Samples]) -> Samples:
+def _concatenate_samples(pieces: Sequence[Samples]) -> Samples:
     """Samples of pieces, one after the other."""
     return type(pieces[0])(*(np.concatenate(parts) for parts in zip(*pieces, strict=True)))
 
 
-def _put(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness) -> None:
+def _insert(worst: Sequence[dict[str, Extremum]], time: Floats, close: proximity.Closeness) -> None:
     """Enter extremes between samples at the sample after each."""
     for name, values in (("separation", close.separation), ("clearance", close.clearance)):
         every = [extremes[name] for extremes in worst if name in extremes]
@@ -446,7 +446,7 @@ def _measure(mission: Mission, pieces: Sequence[Piece], time: Floats, record: Re
 def _record(pieces: Sequence[Piece], n: int, edges: Ints, *, disturbed: bool) -> Record:
     """Forces and references at all samples, of the pieces one after the other; NaN while an edge is not active."""
     count, end = sum(len(p.time) for p in pieces), 0
-    out = recorder(count, n, len(edges), disturbed=disturbed)
+    out = new_record(count, n, len(edges), disturbed=disturbed)
     whole, make = native.pack_anew(out), cache(workspace)
     for piece in pieces:
         begin, end = end, end + len(piece.time)
@@ -476,7 +476,7 @@ def _constraint_integral(pieces: Sequence[Piece], edges: Ints) -> Floats:
 
 def _columns(some: Ints, edges: Ints) -> Ints | slice:
     """Indices of some edges among all edges, (m, 2) both."""
-    if same(some, edges):
+    if arrays_equal(some, edges):
         return slice(None)
     key = edges.max(initial=0) + 1
     keys = edges[:, 0] * key + edges[:, 1]
@@ -493,19 +493,19 @@ def _singular_values(r: Floats, counts: Sequence[int], edges: Sequence[Ints]) ->
     ends = np.cumsum(counts).tolist()
     spans: list[tuple[list[int], Ints]] = []  # pieces with the same edges, one after the other
     for end, some in zip(ends, edges, strict=True):
-        if spans and same(spans[-1][1], some):
+        if spans and arrays_equal(spans[-1][1], some):
             spans[-1][0].append(end)
         else:
             spans.append(([end], some))
     values, begin = [], 0
     for parts, some in spans:
         within = [end - begin for end in parts[:-1]]
-        values += _singular(r[begin : parts[-1]], within, some)
+        values += _smallest_singular_values(r[begin : parts[-1]], within, some)
         begin = parts[-1]
     return {"singular_value": np.concatenate(values)}
 
 
-def _singular(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
+def _smallest_singular_values(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
     """Smallest non-zero singular value of J (K,) at positions r (K, N, 3) of phases that begin at 0 and ``within``."""
     size = min(len(edges), 3 * r.shape[1])
     if size > _SINGULAR or not len(edges):

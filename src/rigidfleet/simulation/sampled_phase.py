@@ -13,7 +13,7 @@ from rigidfleet.kernel import avoidance, fleet, records
 from rigidfleet.kernel.clock_records import OFF, PACE, RATE, WORST
 from rigidfleet.kernel.engine import native
 from rigidfleet.kernel.engine.sampled import fly_ticks
-from rigidfleet.kernel.mail import CLOCK, Links, Mail, assign_edges
+from rigidfleet.kernel.mail import CLOCK, Links, Mail, give_edges_to_links
 from rigidfleet.kernel.problem import ITERATED, TRACKING, Problem
 from rigidfleet.kernel.records import Record
 from rigidfleet.math import attitude as att
@@ -23,12 +23,12 @@ from rigidfleet.planning.derivatives import slots_by_own_clocks
 from rigidfleet.planning.vehicles import (
     TickTables,
     YawTurn,
-    fading,
     first_yaw,
+    loss_transitions,
     sampled_flight,
     turn_from,
 )
-from rigidfleet.planning.virtual_clock import later
+from rigidfleet.planning.virtual_clock import delay_by
 from rigidfleet.result import Extremum
 from rigidfleet.simulation.active_phase import ActivePhase, Stepper
 from rigidfleet.simulation.callbacks import (
@@ -75,7 +75,7 @@ class FleetState:
         start = mission.fleet
         self.yaw = first_yaw(mission)  # asked of each vehicle at the last switch, and its rate
         yaw = float(self.yaw[0, 0])
-        self.S = fleet.hovering(self.flight.vehicles, start.position, start.velocity, yaw)
+        self.S = fleet.hover_states(self.flight.vehicles, start.position, start.velocity, yaw)
         self.state: fleet.SampledState | None = None  # of the phase before
         self.layers = layers(mission)  # settings of the clock and the body layer, if they may act
         self.output_step = mission.output_step
@@ -89,9 +89,9 @@ class FleetState:
         links = self.flight.network
         return (links, self.state.mail) if links.every and self.state is not None else None
 
-    def lose(self, loss: float) -> None:
+    def lose_messages(self, loss: float) -> None:
         """Let links lose a share of the messages from now on."""
-        worsens, recovers = fading(loss, self.burst)
+        worsens, recovers = loss_transitions(loss, self.burst)
         network = self.flight.network._replace(worsens=worsens, recovers=recovers)
         self.flight = self.flight._replace(network=network)
 
@@ -112,7 +112,7 @@ class SampledPhase(Stepper):
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
-            vehicles.avoidance = avoidance.of_next_phase(vehicles.avoidance)
+            vehicles.avoidance = avoidance.for_next_phase(vehicles.avoidance)
         self.by_pieces = False  # whether the reference is given piece by piece
         self.steered = False  # whether it is given by hand
         self.decided_until = -math.inf  # end of what the leader has decided [s]
@@ -139,27 +139,27 @@ class SampledPhase(Stepper):
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], fleet_state.state
         law = plan.problem.law
-        begun = fleet.begin(
+        begun = fleet.initial_state(
             self.flight, fleet_state.S, phase.workspace, frame=frame,
             iterations=law.iterations if law.solver == ITERATED else 1,
         )  # fmt: skip
         if before is None:
             begun.integral[:] = integral
         else:
-            renewed = fleet.under_problem(before, phase.workspace, integral, frame=frame)
+            renewed = fleet.state_under_problem(before, phase.workspace, integral, frame=frame)
             if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
             begun = renewed
         # Edges that end within a phase are those of what is lost.
         lose = self.first_tick is not None
-        assign_edges(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
+        give_edges_to_links(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
         trail = phase.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
         )
         if fleet_state.avoidance is not None:
-            fleet_state.avoidance = avoidance.holding(fleet_state.avoidance, m)
+            fleet_state.avoidance = avoidance.with_edges(fleet_state.avoidance, m)
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
             self.gone = phase.lost.copy()  # (N,) vehicles that do not fly in this phase
@@ -168,7 +168,7 @@ class SampledPhase(Stepper):
 
     # -- flying -----------------------------------------------------------------------------------
 
-    def decide(self, *, by_law: bool) -> float:
+    def lead_reference(self, *, by_law: bool) -> float:
         """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
         leader, arrays = self.leader, self.vehicles.avoidance
         if self.flight.clocks.own:
@@ -180,17 +180,17 @@ class SampledPhase(Stepper):
         if t >= self.decided_until:
             self.decided_until = end
             if (problem := leader.lead(t, end, arrays)) is not None:
-                self._renew(problem)
+                self._continue_with(problem)
                 self.by_pieces = leader.leads
         return self.decided_until
 
     @property
-    def delay(self) -> float:
+    def event_delay(self) -> float:
         """Time by which the events of the phase come later than planned [s]."""
         return self.late[1] if self.leader is None else self.leader.clock.delay
 
     @property
-    def behind(self) -> float:
+    def lateness(self) -> float:
         """Time by which the plan's references are behind now, in the mean of the clocks of vehicles that fly [s]."""
         if not self.flight.clocks.own:
             return 0.0
@@ -202,10 +202,10 @@ class SampledPhase(Stepper):
     def _tick(self) -> float:
         return self.flight.steps * self.flight.h
 
-    def _put_off(self) -> None:
+    def _delay_events(self) -> None:
         """Move the events of the plan that have not come yet by what own clocks are late."""
         plan, t, (t_before, before) = self.phase.plan, self.phase.t, self.late
-        late = max(0, round(self.behind / self._tick)) * self._tick
+        late = max(0, round(self.lateness / self._tick)) * self._tick
         self.late = t, late
 
         def postponed_time(time: float) -> float:
@@ -225,14 +225,14 @@ class SampledPhase(Stepper):
         self.steered = True
         if self.leader is not None:
             self.leader.now = None
-        self._turn_on(problem)
+        self._turn_along_way(problem)
 
-    def _renew(self, problem: Problem) -> None:
+    def _continue_with(self, problem: Problem) -> None:
         """Continue with a problem that the leader has made of the plan's."""
-        self._turn_on(problem)
-        self.phase.renew(problem)
+        self._turn_along_way(problem)
+        self.phase.continue_with(problem)
 
-    def _turn_on(self, problem: Problem) -> None:
+    def _turn_along_way(self, problem: Problem) -> None:
         """Let vehicles that turn along their way do so from the yaw they have now, by another problem."""
         tables, t = self.vehicles.tables, self.phase.t
         if tables.yaw.kind == "along":
@@ -245,7 +245,7 @@ class SampledPhase(Stepper):
         S = self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
-            self._look()
+            self._measure_if_due()
             tables, tick = self.flight.tables, self.sampled.count[fleet.STEPS] // self.flight.steps
             # About the path of that tick, if there are any
             seen = self.sampled.seen + tables.path[max(tick - tables.first, 0) :][:1].sum(axis=0)
@@ -254,9 +254,9 @@ class SampledPhase(Stepper):
             rates=S[:, 10:13].copy(), rotor_speed=S[:, 13:].copy(),
         )  # fmt: skip
 
-    def _look(self) -> None:
+    def _measure_if_due(self) -> None:
         """Measure what the law will know if a tick is due."""
-        self._supply()
+        self._supply_tables()
         now = fleet.segment(
             len(self.sampled.S), len(self.phase.plan.edges), self.phase.t, max_steps=0
         )
@@ -264,7 +264,7 @@ class SampledPhase(Stepper):
 
     def views(self) -> list[View | None]:
         """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
-        self._look()
+        self._measure_if_due()
         phase, laws = self.phase, self.vehicles.laws
         assert laws is not None
         return laws.views(
@@ -304,7 +304,7 @@ class SampledPhase(Stepper):
             phase.extremes.of_layers = self.leader.extremes(phase.t)
         if self.slowed is not None:
             time, who = self.slowed
-            phase.extremes.of_layers = {"clock": Extremum(self.delay, time, who, -1)}
+            phase.extremes.of_layers = {"clock": Extremum(self.event_delay, time, who, -1)}
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
@@ -328,7 +328,7 @@ class SampledPhase(Stepper):
         phase, plan, sampled = self.phase, self.phase.plan, self.sampled
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
-        times = phase.times(t_end)
+        times = phase.sample_times(t_end)
         phase.begun, arrays = True, self.vehicles.avoidance
         network, laws = self.vehicles.flight.network, self.vehicles.laws
         if network is not self.flight.network:
@@ -340,18 +340,18 @@ class SampledPhase(Stepper):
         try:
             while status in (records.PAUSED, records.ASKS):
                 if status == records.PAUSED:
-                    self._supply()
+                    self._supply_tables()
                 elif laws is not None:
-                    laws.ask(plan.phase.name, problem, phase.workspace, self.flight, sampled)
+                    laws.call_laws(plan.phase.name, problem, phase.workspace, self.flight, sampled)
                 status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, arrays)
-                self._follow()
+                self._take_over_state()
                 if status == records.ASKS:
                     continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
                     phase.state.clock[records.TIME] = t_end
                 if phase.external is not None:
                     phase.external.check()
-                phase.check()
+                phase.raise_errors()
                 self.watch(last=False)
                 phase.pause(phase.t)
         finally:
@@ -363,7 +363,7 @@ class SampledPhase(Stepper):
             if done:
                 self._keep(problem, call, done)
         if self.flight.clocks.own:
-            self._put_off()
+            self._delay_events()
         if not np.isfinite(sampled.S).all():
             who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
@@ -379,7 +379,7 @@ class SampledPhase(Stepper):
             own = phase.external is not None
             raise StoppedError(diagnose(phase, own_force=own, collapsed=True))
 
-    def _supply(self) -> None:
+    def _supply_tables(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
         planned, source = self.phase.plan.problem, self.vehicles.tables
@@ -400,7 +400,7 @@ class SampledPhase(Stepper):
                 np.add(known, moved, out=known)
         self.flight, self.tabled = self.flight._replace(tables=made), planned
 
-    def _follow(self) -> None:
+    def _take_over_state(self) -> None:
         """Take over the true state, and what it cost."""
         plan, state, sampled = self.phase.plan, self.phase.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y
@@ -415,16 +415,16 @@ class SampledPhase(Stepper):
     def end(self) -> None:
         """End the phase; the vehicles keep their states, and so the workspace, to which these may refer."""
         plan, t = self.phase.plan, self.phase.t
-        self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.behind, self.turn)
+        self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.lateness, self.turn)
         if self.flight.clocks.own:
             # The next phase is planned from now on: its times are later by as much, for all clocks alike.
-            late = round(self.behind / self._tick) * self._tick
+            late = round(self.lateness / self._tick) * self._tick
             mail = self.sampled.mail
             for off in (self.sampled.tau[:, OFF], mail.heard[:, CLOCK], mail.post[..., CLOCK]):
                 np.add(off, late, out=off)  # also in messages
             self.vehicles.waited += late
-            self.vehicles.tables.put_off(late)
-            plan.problem = later(plan.problem, late)
+            self.vehicles.tables.delay_path(late)
+            plan.problem = delay_by(plan.problem, late)
             plan.reference = plan.reference._replace(t0=plan.reference.t0 + late)
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:
@@ -443,16 +443,16 @@ class SampledPhase(Stepper):
             parts.append(frame)
         tau, y = call.tau[:done], np.concatenate(parts, axis=1)
         if self.flight.clocks.own:
-            planned = self._by_own_clocks(times, y, tau)
+            planned = self._record_by_own_clocks(times, y, tau)
             plan_time = (times - self.vehicles.waited)[:, None, None] + tau[..., :1]
             tau = np.concatenate([tau, plan_time], axis=2)
         else:
             planned = native.record(plan.problem, self.phase.workspace, times, y)
             tau = tau[..., :0]
         out, kept = _as_flown(planned, call, done, self.flight, problem, tau)
-        self.phase.keep(times, out, call.integral[:done], frame, kept, self._layers(call, done))
+        self.phase.store(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
-    def _by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
+    def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
         """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
         problem, work = self.phase.plan.problem, self.phase.workspace
         off, rate = tau[:, ~self.flight.vehicles.lost, :2].mean(axis=1).T

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rigidfleet._common.arguments import numbers
+from rigidfleet._common.arguments import as_numbers
 from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.typing import Floats
 
@@ -22,7 +22,7 @@ class Sampling:
     def __init__(self, step: float, times: Floats | None = None) -> None:
         self.step, self.times = step, times
 
-    def between(
+    def times_between(
         self, plan: PhasePlan, t: float, t_end: float, *, first: bool, stop: float = math.inf
     ) -> Floats:
         """Times in (t, t_end] [s] of a phase; ``first`` after a switch; ``stop`` is where the caller stops."""
@@ -48,7 +48,7 @@ class Sampling:
         return np.concatenate([(start,), grid[grid.searchsorted(start, "right") :]])
 
 
-def times_asked(times: ArrayLike, end: float) -> Floats:
+def requested_times(times: ArrayLike, end: float) -> Floats:
     """Times [s] to record, sorted; those that rounding puts after the end are moved to the end.
 
     Raises
@@ -56,12 +56,12 @@ def times_asked(times: ArrayLike, end: float) -> Floats:
     ValueError
         A time lies outside the mission.
     """
-    t = _increasing(numbers("times to record [s]", times))
+    t = _sort_once(as_numbers("times to record [s]", times))
     if not (len(t) and t[0] >= 0.0 and t[-1] <= end * (1.0 + 1e-12)):
         raise ValueError(f"times to record must lie between 0 and the mission's end, {end:g} s")
-    return t if t[-1] <= end else _increasing(np.minimum(t, end))
+    return t if t[-1] <= end else _sort_once(np.minimum(t, end))
 
 
-def _increasing(t: Floats) -> Floats:
+def _sort_once(t: Floats) -> Floats:
     """Times (K,) sorted, each once; a copy, of which a flight records parts."""
     return t.copy() if t.ndim == 1 and (t[1:] > t[:-1]).all() else np.unique(t)

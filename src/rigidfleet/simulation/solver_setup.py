@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from rigidfleet.kernel.large.solver import LargeSolver, Setup
 
 
-def equip(plan: PhasePlan, make: Callable[..., Workspace]) -> tuple[Workspace, LargeSolver | None]:
+def workspace_and_solver(
+    plan: PhasePlan, make: Callable[..., Workspace]
+) -> tuple[Workspace, LargeSolver | None]:
     """Workspace of a plan, and the solver for its multipliers if the kernel itself does not solve for them.
 
     ``make`` makes a workspace, or returns one that the phase before has used.
@@ -35,12 +37,12 @@ def equip(plan: PhasePlan, make: Callable[..., Workspace]) -> tuple[Workspace, L
     order = None
     if plan.method == "elimination":
         steps = solvers.elimination_steps(len(points), edges)
-        order = None if steps is None else ordering.order(steps, plan.problem.graph.edges)
+        order = None if steps is None else ordering.prepare_order(steps, plan.problem.graph.edges)
     axes = plan.problem.has_frame or plan.problem.law.k_def > 0.0
     solver = large_solver(
         plan.problem, Setup(order, solvers.Dissection(points, edges), *plan.residual(), axes)
     )
-    plan.problem = solved_by(solver, plan.problem)
+    plan.problem = problem_with_solver(solver, plan.problem)
     return solver.workspace, solver
 
 
@@ -52,7 +54,7 @@ def large_solver(problem: Problem, setup: Setup) -> LargeSolver:
     return LargeSolver(problem.vehicles, problem.graph.edges, problem.law, work, setup)
 
 
-def solved_by(solver: LargeSolver, problem: Problem) -> Problem:
+def problem_with_solver(solver: LargeSolver, problem: Problem) -> Problem:
     """A problem whose multipliers this solver finds, as long as somebody keeps it."""
     graph = problem.graph._replace(solver=solver.address, multipliers=solver.multipliers)
     return problem._replace(graph=graph)

@@ -54,7 +54,7 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
             return [flight.finish() for flight in flights]
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
         steppers = [x.stepper for x in active if isinstance(x.stepper, PointPhase)]
-        if all(going) and len(steppers) == len(active) and _alike(active):
+        if all(going) and len(steppers) == len(active) and _can_share_steps(active):
             if vector is None:
                 from rigidfleet.kernel.engine import batch
 
@@ -69,17 +69,17 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
                 pass
 
 
-def _alike(active: Sequence[ActivePhase]) -> bool:
+def _can_share_steps(active: Sequence[ActivePhase]) -> bool:
     """Whether phases differ in nothing but numbers, so that they can share steps."""
-    first = _kind(active[0])
-    if not all(_plain(phase) and _kind(phase) == first for phase in active):
+    first = _sharing_key(active[0])
+    if not all(_is_plain(phase) and _sharing_key(phase) == first for phase in active):
         return False
     from rigidfleet.kernel.engine import batch
 
     return batch.fit_together([phase.plan.problem for phase in active])
 
 
-def _plain(phase: ActivePhase) -> bool:
+def _is_plain(phase: ActivePhase) -> bool:
     """Whether a phase has a given duration, without losses, calls of users' functions, fences and people."""
     plan = phase.plan
     return (
@@ -91,7 +91,7 @@ def _plain(phase: ActivePhase) -> bool:
     )
 
 
-def _kind(phase: ActivePhase) -> tuple[object, ...]:
+def _sharing_key(phase: ActivePhase) -> tuple[object, ...]:
     """What phases that share steps have in common: when they are flown and recorded, and sizes of arrays."""
     plan, extremes = phase.plan, phase.extremes
     points = tuple(at["time"] for at in plan.through)
@@ -105,7 +105,7 @@ def _fly(steppers: Sequence[PointPhase], vector: batch.Vector) -> bool:
 
     active = [stepper.phase for stepper in steppers]
     t_end = active[0].plan.t_end
-    times = active[0].times(t_end)
+    times = active[0].sample_times(t_end)
     stretches = [stepper.prepare(stepper.phase.plan.problem, times) for stepper in steppers]
     try:
         vector.begin(

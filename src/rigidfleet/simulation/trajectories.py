@@ -23,7 +23,7 @@ from rigidfleet.foreign.curves import Trajectories
 from rigidfleet.foreign.samples import ASSUMED
 from rigidfleet.kernel import records
 from rigidfleet.math import series
-from rigidfleet.math.bernstein import SIZES, greatest
+from rigidfleet.math.bernstein import SIZES, greatest_convex_value
 from rigidfleet.math.piecewise import (
     SAME,
     Piecewise,
@@ -31,14 +31,14 @@ from rigidfleet.math.piecewise import (
     join,
     pad,
     piece_at,
-    refine,
+    refine_knots,
 )
 from rigidfleet.mission import Mission, as_mission
 from rigidfleet.result import Extremum, PhaseRecord, Result, presence
 from rigidfleet.result.result import CLOSE, VARIABLES
-from rigidfleet.setpoints import intervals
+from rigidfleet.setpoints import sample_intervals
 from rigidfleet.simulation.extremes import CurveWatch
-from rigidfleet.simulation.recording import distances, text_of
+from rigidfleet.simulation.recording import distances, recorded_text
 from rigidfleet.typing import Floats, Ints
 
 #: Greatest distance [m] of a curve of fourth degree from the piece that it stands for, and most parts of a piece.
@@ -145,7 +145,7 @@ def trajectories(
             f"times must increase: sample {k + 2} is at {t[k + 1]:g} s, the one before at {t[k]:g} s."
         )
     # A sample that is one representable number after another marks a jump, as at a switch of phases in a result.
-    first, knots = intervals(t)
+    first, knots = sample_intervals(t)
     if not len(first):
         raise ResultError(f"all samples are at {t[0]:g} s; a trajectory lasts.")
     yaws = np.full(shape[:2], np.nan) if yaw is None else _array("yaw", yaw, *shape[:2])
@@ -156,7 +156,7 @@ def trajectories(
         _refuse_jumps(way)
         way, how = Piecewise.cubic_spline(knots, way.at(knots)), ASSUMED["cubic"]
     return of_curve(
-        way.beside(turned), how,
+        way.stack(turned), how,
         mission=mission, separation=separation, limits=limits, radius=radius, ground=ground, name=name,
     )  # fmt: skip
 
@@ -182,7 +182,7 @@ def _array(name: str, values: ArrayLike, *sizes: int | None) -> Floats:
     return x
 
 
-def judged_as(
+def judging_mission(
     start: Floats,
     duration: float,
     *,
@@ -263,7 +263,7 @@ def of_curve(
     names : of the vehicles, where they come from
     spans : from when to when [s] each vehicle is there; empty: all always are
     since : time of another clock from which times count [s]; no clock of obstacles that move, unless it is 0
-    judged : see `judged_as`
+    judged : see `judging_mission`
 
     Raises
     ------
@@ -282,7 +282,7 @@ def of_curve(
     parts = np.ceil(np.diff(time) / step).astype(np.int64)
     _refuse_too_many(n, int(parts.sum()) + 1)
     start = curve.at(time[:1])[0, :, :3]
-    mission = judged_as(start, span, **judged)
+    mission = judging_mission(start, span, **judged)
     if (zero or since) and any(thing.solid.moves for thing in mission.obstacles):
         raise ResultError(
             f"the trajectories begin at {since + zero:.12g} s, and obstacles move from 0 s on. Let both count from one "
@@ -294,9 +294,9 @@ def of_curve(
     grid = time[0] + near * np.arange(1, math.ceil(span / near))
     fastest = watch_curve(watch, curve, grid, spans)
     record = PhaseRecord(PHASE, "hold", "open", None, float(time[0]), float(time[-1]))
-    watch.only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
-    record.extremes.update(watch.phase())
-    watch.flight([record])
+    watch.keep_only(np.ones(n, dtype=np.bool_))  # whose data end near an obstacle has not left it
+    record.extremes.update(watch.end_phase())
+    watch.complete_phases([record])
     record.extremes.update(fastest)
     at, state, yaws = _samples(curve, parts)
     if powers < 3:  # lines turn at once at samples
@@ -319,7 +319,7 @@ def of_curves(read: Trajectories, **judged: Any) -> Result:
 
     Parameters
     ----------
-    judged : see `judged_as`
+    judged : see `judging_mission`
 
     Raises
     ------
@@ -426,7 +426,7 @@ def watch_curve(
         block = curve.part(k, k + together)
         way = Piecewise(block.time, pad(block.pieces[:, :, :3], 2))
         _watch(watch, way, grid, spans)
-        _accelerations(fastest, way, directed=watch.directed)
+        _take_accelerations(fastest, way, directed=watch.directed)
     return fastest
 
 
@@ -437,7 +437,7 @@ def _watch(
 
     Vehicles are watched in their ``spans`` alone, if there are any.
     """
-    knots = refine(way.time, grid, 1e-6)
+    knots = refine_knots(way.time, grid, 1e-6)
     k = piece_at(way.time, 0.5 * (knots[:-1] + knots[1:]))
     share = np.diff(knots) / np.diff(way.time)[k]
     knots = _split(knots, np.ceil(_parts(way)[k] * share - 1e-9).astype(np.int64))
@@ -447,11 +447,11 @@ def _watch(
     starts = np.union1d(np.arange(0, len(here), together), change)
     for first, last in pairwise([*starts.tolist(), len(here)]):
         if spans:
-            watch.only(here[first])
+            watch.keep_only(here[first])
         if not here[first].any():
             continue
-        part = way.on(knots[first : last + 1])
-        at = [x.within(records.KNOTS) for x in (part, part.rate())]
+        part = way.refine(knots[first : last + 1])
+        at = [x.at_shares(records.KNOTS) for x in (part, part.rate())]
         points = np.concatenate([x.reshape(*x.shape[:2], -1) for x in at], axis=2)
         clock = np.column_stack([part.time[:-1], np.diff(part.time)])
         watch.take_curves(clock, records.FROM_KNOTS @ points)
@@ -469,16 +469,16 @@ def _parts(way: Piecewise) -> Ints:
     return np.ceil((size @ np.array(weight) / _CLOSE) ** 0.2).clip(1, _PARTS).astype(np.int64)
 
 
-def _accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
+def _take_accelerations(best: dict[str, Extremum], curve: Piecewise, *, directed: bool) -> None:
     """Take the greatest accelerations of some pieces into account, by direction too; straight lines have none."""
     n = curve.pieces.shape[1]
     if curve.pieces.shape[-1] < 3:
         return
-    points = curve.rate().rate().bernstein()
+    points = curve.rate().rate().control_points()
     points = points.reshape(-1, *points.shape[2:])
     for way in SIZES if directed else ("",):
         name = f"{way}_acceleration".lstrip("_")
-        peak, known = greatest(points, SIZES[way]), best.get(name)
+        peak, known = greatest_convex_value(points, SIZES[way]), best.get(name)
         if known is None or peak.value > known.value:
             k, i = divmod(peak.curve, n)
             t, end = curve.time[k : k + 2]
@@ -516,7 +516,7 @@ def result_of(
         statistics=statistics, **ending,
         later=[
             (CLOSE, partial(distances, mission, worst, r, time, left)),
-            (("mission_text",), partial(text_of, mission)),
+            (("mission_text",), partial(recorded_text, mission)),
         ],
     )  # fmt: skip
     # Its text is written where the result is, and need not be read.

@@ -2,7 +2,7 @@
 
 Every function takes coordinates x, y, z that are numbers, or arrays of one shape. NumPy runs it on arrays. The kernel
 compiles the same source for numbers (`rigidfleet.kernel.compiler.elementwise`), so there is one distance in plan,
-flight and verdict. What differs between numbers and arrays is in `choose`, `some` and `floor`.
+flight and verdict. What differs between numbers and arrays is in `where`, `any_true` and `floor`.
 
 Points are in the solid's own axes, unless a docstring says otherwise.
 """
@@ -20,12 +20,12 @@ from rigidfleet.solids.records import CYLINDER, HEIGHTS, ROUNDED
 Numbers = Any
 
 
-def choose(test: Numbers, this: Numbers, other: Numbers) -> Numbers:
+def where(test: Numbers, this: Numbers, other: Numbers) -> Numbers:
     """One number where the test holds, the other elsewhere."""
     return np.where(test, this, other)
 
 
-def some(test: Numbers) -> Any:
+def any_true(test: Numbers) -> Any:
     """Whether the test holds for any point."""
     return np.any(test)
 
@@ -38,7 +38,7 @@ def floor(x: Numbers) -> Any:
 # -- boxes, balls, half spaces -------------------------------------------------------------------------
 
 
-def from_box(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Numbers:
+def box_distance(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Numbers:
     """Signed distance [m] from a box (6,), which may be infinite in both x and y."""
     inside = np.maximum(box[2] - z, z - box[5])  # positive outside
     beyond = np.maximum(inside, 0.0)
@@ -64,9 +64,9 @@ def box_normal(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Any:
     inside = most <= 0.0
     along_x, along_y = inside & (p >= most), inside & (q >= most) & (p < most)
     along_z = inside & (q < most) & (p < most)
-    a = choose(along_x, choose(box[0] - x > x - box[3], -1.0, 1.0), a)
-    b = choose(along_y, choose(box[1] - y > y - box[4], -1.0, 1.0), b)
-    c = choose(along_z, choose(box[2] - z > z - box[5], -1.0, 1.0), c)
+    a = where(along_x, where(box[0] - x > x - box[3], -1.0, 1.0), a)
+    b = where(along_y, where(box[1] - y > y - box[4], -1.0, 1.0), b)
+    c = where(along_z, where(box[2] - z > z - box[5], -1.0, 1.0), c)
     size = np.sqrt(a * a + b * b + c * c)
     return a / size, b / size, c / size
 
@@ -74,7 +74,7 @@ def box_normal(x: Numbers, y: Numbers, z: Numbers, box: Any) -> Any:
 # -- cylinders -----------------------------------------------------------------------------------------
 
 
-def from_cylinder(x: Numbers, y: Numbers, z: Numbers, size: Any) -> Numbers:
+def cylinder_distance(x: Numbers, y: Numbers, z: Numbers, size: Any) -> Numbers:
     """Signed distance [m] from a cylinder along z about the origin, of radius size[0] and half length size[1]."""
     a, b = np.sqrt(x * x + y * y) - size[0], np.abs(z) - size[1]
     inside = np.minimum(np.maximum(a, b), 0.0)
@@ -87,20 +87,20 @@ def cylinder_normal(x: Numbers, y: Numbers, z: Numbers, size: Any) -> Any:
     far = np.sqrt(x * x + y * y)
     a, b = far - size[0], np.abs(z) - size[1]
     inside = np.maximum(a, b) <= 0.0
-    radial = choose(inside, choose(a >= b, 1.0, 0.0), np.maximum(a, 0.0))
-    axial = choose(inside, choose(a >= b, 0.0, 1.0), np.maximum(b, 0.0))
-    axial = choose(z < 0.0, -axial, axial)
+    radial = where(inside, where(a >= b, 1.0, 0.0), np.maximum(a, 0.0))
+    axial = where(inside, where(a >= b, 0.0, 1.0), np.maximum(b, 0.0))
+    axial = where(z < 0.0, -axial, axial)
     length = np.sqrt(radial * radial + axial * axial)
     on_axis = far <= 0.0
-    across = choose(on_axis, 1.0, far)
-    u, v = choose(on_axis, 1.0, x) / across, y / across
+    across = where(on_axis, 1.0, far)
+    u, v = where(on_axis, 1.0, x) / across, y / across
     return radial * u / length, radial * v / length, axial / length
 
 
 # -- triangles -----------------------------------------------------------------------------------------
 
 
-def off_segment(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any) -> Any:
+def segment_to_point(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any) -> Any:
     """Vector from the nearest point of the segment between a and b (3,) to the point."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     x, y, z = x - a[0], y - a[1], z - a[2]
@@ -111,73 +111,73 @@ def off_segment(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any) -> Any:
     return x, y, z
 
 
-def side(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any, normal: Any) -> Numbers:
+def edge_side(x: Numbers, y: Numbers, z: Numbers, a: Any, b: Any, normal: Any) -> Numbers:
     """Positive on the inner side of a triangle's edge from a to b (3,)."""
     u, v, w = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     x, y, z = x - a[0], y - a[1], z - a[2]
     return (v * z - w * y) * normal[0] + (w * x - u * z) * normal[1] + (u * y - v * x) * normal[2]
 
 
-def off_triangle(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
+def triangle_to_point(x: Numbers, y: Numbers, z: Numbers, t: Any) -> Any:
     """Vector from the nearest point of a triangle (3, 3) to the point, and its squared length."""
     a, b, c = t[0], t[1], t[2]
     e, f, g = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     p, q, r = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     n = (f * r - g * q, g * p - e * r, e * q - f * p)
     area = n[0] * n[0] + n[1] * n[1] + n[2] * n[2]
-    i, j, k = off_segment(x, y, z, a, b)
+    i, j, k = segment_to_point(x, y, z, a, b)
     best = i * i + j * j + k * k
     for m in range(1, 3):
-        u, v, w = off_segment(x, y, z, t[m], t[(m + 1) % 3])
+        u, v, w = segment_to_point(x, y, z, t[m], t[(m + 1) % 3])
         d = u * u + v * v + w * w
         nearer = d < best
         i, j, k, best = (
-            choose(nearer, u, i),
-            choose(nearer, v, j),
-            choose(nearer, w, k),
-            choose(nearer, d, best),
+            where(nearer, u, i),
+            where(nearer, v, j),
+            where(nearer, w, k),
+            where(nearer, d, best),
         )
     if area > 0.0:
-        over = side(x, y, z, a, b, n) >= 0.0
-        over = over & (side(x, y, z, b, c, n) >= 0.0) & (side(x, y, z, c, a, n) >= 0.0)
+        over = edge_side(x, y, z, a, b, n) >= 0.0
+        over = over & (edge_side(x, y, z, b, c, n) >= 0.0) & (edge_side(x, y, z, c, a, n) >= 0.0)
         height = ((x - a[0]) * n[0] + (y - a[1]) * n[1] + (z - a[2]) * n[2]) / area
         i, j, k = (
-            choose(over, height * n[0], i),
-            choose(over, height * n[1], j),
-            choose(over, height * n[2], k),
+            where(over, height * n[0], i),
+            where(over, height * n[1], j),
+            where(over, height * n[2], k),
         )
-        best = choose(over, height * height * area, best)
+        best = where(over, height * height * area, best)
     return i, j, k, best
 
 
 # -- surfaces of triangles -----------------------------------------------------------------------------
 
 
-def off_surface(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def surface_to_point(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Vector from the nearest point of the surface of solid b, of triangles, to the point, and its squared length."""
     first, last = s.first[b], s.last[b]
     t = s.triangles[first[1]]
     i, j, k = x - t[0, 0], y - t[0, 1], z - t[0, 2]
     if s.kind[b] == HEIGHTS:  # straight below
-        u, v, h = below(x, y, b, s)
+        u, v, h = height_map_point(x, y, b, s)
         i, j, k = x - u, y - v, z - h
     best = i * i + j * j + k * k
     node = first[0]
     while node < last[0]:
-        far = np.maximum(from_box(x, y, z, s.nodes[node]), 0.0)
-        if not some(far * far < best):
+        far = np.maximum(box_distance(x, y, z, s.nodes[node]), 0.0)
+        if not any_true(far * far < best):
             node = s.after[node]
             continue
         for m in range(s.leaf[node, 0], s.leaf[node, 1]):
-            u, v, w, d = off_triangle(x, y, z, s.triangles[m])
+            u, v, w, d = triangle_to_point(x, y, z, s.triangles[m])
             nearer = d < best
-            i, j, k = choose(nearer, u, i), choose(nearer, v, j), choose(nearer, w, k)
-            best = choose(nearer, d, best)
+            i, j, k = where(nearer, u, i), where(nearer, v, j), where(nearer, w, k)
+            best = where(nearer, d, best)
         node += 1
     return i, j, k, best
 
 
-def below(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
+def height_map_point(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
     """The point (x, y, height) of a height map straight below or above the point, or its nearest rim."""
     size, first = s.size[b], s.first[b, 2]
     n, m = s.grid[b, 0], s.grid[b, 1]
@@ -189,10 +189,10 @@ def below(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
     low, high = s.heights[at], s.heights[at + m + 1]
     lower = low + p * (s.heights[at + m] - low) + q * (high - s.heights[at + m])
     upper = low + q * (s.heights[at + 1] - low) + p * (high - s.heights[at + 1])
-    return u, v, choose(p >= q, lower, upper)
+    return u, v, where(p >= q, lower, upper)
 
 
-def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
+def is_inside(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
     """Whether the point is inside a solid of triangles: a convex hull or a height map."""
     size = s.size[b]
     inside = (
@@ -203,10 +203,10 @@ def within(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         & (z >= size[2])
         & (z <= size[5])
     )
-    if not some(inside):
+    if not any_true(inside):
         return inside
     if s.kind[b] == HEIGHTS:
-        _, _, height = below(x, y, b, s)
+        _, _, height = height_map_point(x, y, b, s)
         return inside & (z <= height)
     for m in range(s.first[b, 1], s.last[b, 1]):
         t = s.triangles[m]
@@ -228,15 +228,15 @@ def signed_distance(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Numbe
     """Signed distance [m] from solid b of a record s; negative inside."""
     kind = s.kind[b]
     if kind == ROUNDED:
-        near = from_box(x, y, z, s.size[b])
+        near = box_distance(x, y, z, s.size[b])
         if s.rounding[b] > 0.0:
             near = near - s.rounding[b]
         return near
     if kind == CYLINDER:
-        return from_cylinder(x, y, z, s.size[b])
-    _, _, _, squared = off_surface(x, y, z, b, s)
+        return cylinder_distance(x, y, z, s.size[b])
+    _, _, _, squared = surface_to_point(x, y, z, b, s)
     away = np.sqrt(squared)
-    return choose(within(x, y, z, b, s), -away, away)
+    return where(is_inside(x, y, z, b, s), -away, away)
 
 
 def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
@@ -246,15 +246,15 @@ def outward_normal(x: Numbers, y: Numbers, z: Numbers, b: int, s: Any) -> Any:
         return box_normal(x, y, z, s.size[b])
     if kind == CYLINDER:
         return cylinder_normal(x, y, z, s.size[b])
-    i, j, k, squared = off_surface(x, y, z, b, s)
+    i, j, k, squared = surface_to_point(x, y, z, b, s)
     away = np.sqrt(squared)
-    away = choose(within(x, y, z, b, s), -away, away)
+    away = where(is_inside(x, y, z, b, s), -away, away)
     known = squared > 0.0
     i, j, k, away = (
-        choose(known, i, 0.0),
-        choose(known, j, 0.0),
-        choose(known, k, 0.0),
-        choose(known, away, 1.0),
+        where(known, i, 0.0),
+        where(known, j, 0.0),
+        where(known, k, 0.0),
+        where(known, away, 1.0),
     )
     return i / away, j / away, k / away
 
@@ -273,7 +273,7 @@ def displacement(t: Numbers, b: int, s: Any) -> Any:
     return x, y, z
 
 
-def is_there(t: Numbers, b: int, s: Any) -> Any:
+def is_present(t: Numbers, b: int, s: Any) -> Any:
     """Whether solid b is there at time t [s]: some appear, and vanish."""
     return (t >= s.there[b, 0]) & (t <= s.there[b, 1])
 
@@ -315,17 +315,17 @@ _DEEP = 1.0
 _TINY, _FAR = 1e-200, 1e30
 
 
-def column(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
+def height_range(x: Numbers, y: Numbers, b: int, s: Any) -> Any:
     """Lowest and highest z [m] of solid b, a box or a height map at rest, over points (x, y) of the world.
 
     Where there is nothing of it, the first is above the second.
     """
     o, T, size = s.origin[b], s.turn[b], s.size[b]
-    x, y = choose(np.isfinite(x), x, _FAR) - o[0], choose(np.isfinite(y), y, _FAR) - o[1]
+    x, y = where(np.isfinite(x), x, _FAR) - o[0], where(np.isfinite(y), y, _FAR) - o[1]
     if s.turned[b] == 0 or s.kind[b] == HEIGHTS:
         over = (x >= size[0]) & (x <= size[3]) & (y >= size[1]) & (y <= size[4])
-        top = below(x, y, b, s)[2] if s.kind[b] == HEIGHTS else size[5]
-        return choose(over, size[2], math.inf), choose(over, top, -math.inf)
+        top = height_map_point(x, y, b, s)[2] if s.kind[b] == HEIGHTS else size[5]
+        return where(over, size[2], math.inf), where(over, top, -math.inf)
     low, top = x * 0.0 - math.inf, x * 0.0 + math.inf
     for k in range(3):
         a, d = T[k, 0] * x + T[k, 1] * y - T[k, 2] * o[2], T[k, 2] + _TINY
@@ -338,14 +338,15 @@ def height_below(x: Numbers, y: Numbers, z: Numbers, s: Any) -> Numbers:
     """Height [m] of the highest of all solids, boxes and height maps at rest, below points; minus infinity: none."""
     height = x * 0.0 - math.inf
     for b in range(s.kind.shape[0]):
-        low, top = column(x, y, b, s)
+        low, top = height_range(x, y, b, s)
         on = (low <= top) & (z >= low) & ((z >= top - _DEEP) | (s.kind[b] == HEIGHTS))
-        height = choose(on, np.maximum(height, top), height)
+        height = where(on, np.maximum(height, top), height)
     return height
 
 
 #: The functions that the kernel compiles, each after those that it calls.
 ELEMENTWISE = (
-    from_box, box_normal, from_cylinder, cylinder_normal, off_segment, side, off_triangle, below, off_surface, within,
-    signed_distance, outward_normal, displacement, is_there, own_axes, is_below, column, height_below,
+    box_distance, box_normal, cylinder_distance, cylinder_normal,
+    segment_to_point, edge_side, triangle_to_point, height_map_point, surface_to_point, is_inside,
+    signed_distance, outward_normal, displacement, is_present, own_axes, is_below, height_range, height_below,
 )  # fmt: skip

@@ -43,7 +43,7 @@ def outline(solid: Solids) -> Outline:
     return Outline(own.triangles @ T + o, own.lines @ T + o)
 
 
-def places(solid: Solids, times: Floats) -> Floats:
+def displacements_at(solid: Solids, times: Floats) -> Floats:
     """Displacements (K, 3) [m] of a solid, alone in its record, at times (K,) [s]."""
     return np.stack(displacement(times, 0, solid), axis=-1)
 

@@ -39,34 +39,34 @@ class Region(NamedTuple):
         edges = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings]
         return cls(np.concatenate(edges), floor, ceiling)
 
-    def across(self, x: Floats) -> Floats:
+    def distance(self, x: Floats) -> Floats:
         """Signed distance (M,) [m] of points (M, 2) from the area as seen from above: negative inside."""
         some = max(1, _TOGETHER // len(self.edges))
         parts = np.split(x, range(some, len(x), some))
-        return np.concatenate([self._distance(self._off(part), part) for part in parts])
+        return np.concatenate([self._distance(self._edge_to_points(part), part) for part in parts])
 
-    def most(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
+    def depth(self, points: Floats, *, outside: bool) -> tuple[Floats, Floats]:
         """By how much curves are inside (or ``outside``) at their middles (M,) [m], and an upper bound (M,) all along.
 
         A curve lies in the hull of its control points (M, 3, P). Where it stays on the one side, the nearest edge is at
         least as far as the tangents at the middle say, since the distance from an edge is convex; and on the other side
         no farther than its farthest control point.
         """
-        c, low, high = middle(points), self.floor, self.ceiling
+        c, low, high = curve_middles(points), self.floor, self.ceiling
         across, bound = np.empty(len(c)), np.empty(len(c))
         some = max(1, _TOGETHER // (len(self.edges) * points.shape[2]))
         for k in range(0, len(c), some):
             rows = slice(k, k + some)
-            across[rows], bound[rows] = self._most(points[rows, :2], c[rows, :2], outside=outside)
+            across[rows], bound[rows] = self._depth(points[rows, :2], c[rows, :2], outside=outside)
         z, least, greatest = c[:, 2], points[:, 2].min(axis=1), points[:, 2].max(axis=1)
-        now = corner(across if outside else -across, np.maximum(low - z, z - high))
+        now = corner_distance(across if outside else -across, np.maximum(low - z, z - high))
         if outside:
-            return now, corner(bound, np.maximum(low - least, greatest - high))
-        return -now, -corner(-bound, np.maximum(low - greatest, least - high))
+            return now, corner_distance(bound, np.maximum(low - least, greatest - high))
+        return -now, -corner_distance(-bound, np.maximum(low - greatest, least - high))
 
-    def _most(self, points: Floats, c: Floats, *, outside: bool) -> tuple[Floats, Floats]:
-        """`most` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
-        off = self._off(c)
+    def _depth(self, points: Floats, c: Floats, *, outside: bool) -> tuple[Floats, Floats]:
+        """`depth` as seen from above, of control points (M, 2, P) with middles (M, 2)."""
+        off = self._edge_to_points(c)
         apart = np.linalg.norm(off, axis=2)
         now = self._distance(off, c) * (1.0 if outside else -1.0)
         spread = points - c[:, :, None]
@@ -77,12 +77,12 @@ class Region(NamedTuple):
         bound[kept] = np.minimum(bound[kept], -(apart[kept] + tangents.min(axis=2)).min(axis=1))
         rest = np.flatnonzero((now >= 0.0) | (reach >= -now))
         ends = np.moveaxis(points[rest], 2, 1)
-        far = np.linalg.norm(self._off(ends.reshape(-1, 2)), axis=2)
+        far = np.linalg.norm(self._edge_to_points(ends.reshape(-1, 2)), axis=2)
         far = far.reshape(len(rest), ends.shape[1], len(self.edges)).max(axis=1).min(axis=1)
         bound[rest] = np.minimum(bound[rest], far)
         return now, bound
 
-    def _off(self, x: Floats) -> Floats:
+    def _edge_to_points(self, x: Floats) -> Floats:
         """Vectors (M, E, 2) to points (M, 2) from the nearest point of each edge."""
         begin, along = self.edges[:, 0], self.edges[:, 1] - self.edges[:, 0]
         off = x[:, None] - begin
@@ -102,13 +102,13 @@ class Region(NamedTuple):
         return (((a[:, 1] > y) != (b[:, 1] > y)) & right).sum(axis=1) % 2 == 1
 
 
-def corner(across: Floats, above: Floats) -> Floats:
+def corner_distance(across: Floats, above: Floats) -> Floats:
     """Signed distance from what is within two distances at right angles."""
     outside = np.hypot(np.maximum(across, 0.0), np.maximum(above, 0.0))
     return outside + np.minimum(np.maximum(across, above), 0.0)
 
 
-def middle(points: Floats) -> Floats:
+def curve_middles(points: Floats) -> Floats:
     """Places (M, C) in the middle of curves with control points (M, C, P)."""
     weights = np.ones(1)
     for _ in range(points.shape[2] - 1):
@@ -116,7 +116,7 @@ def middle(points: Floats) -> Floats:
     return points @ weights
 
 
-def some_cross(edges: Floats) -> bool:
+def edges_cross(edges: Floats) -> bool:
     """Whether two of the edges (E, 2, 2) cross, or overlap, at more than an end that they share."""
     a, b = edges[:, 0], edges[:, 1]
 

@@ -162,7 +162,7 @@ def _cells(top: Floats) -> list[Floats]:
 # -- many solids in one record -------------------------------------------------------------------------
 
 
-def single(
+def one_solid(
     form: Form, times: ArrayLike = (), ways: ArrayLike = (), there: ArrayLike = ALWAYS
 ) -> Solids:
     """The record of one solid, which moves in straight lines: displacements (W, 3) [m] at times (W,) [s].
@@ -185,7 +185,7 @@ def single(
 def join(parts: Sequence[Solids]) -> Solids:
     """All solids of several records in one."""
     if not parts:
-        return single(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))
+        return one_solid(half_space(0.0))._replace(kind=np.zeros(0, dtype=np.int64))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     joint = Solids(*columns)
     counts = np.array(

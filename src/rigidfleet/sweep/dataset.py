@@ -36,7 +36,7 @@ def load(folder: str | Path) -> xarray.Dataset:
     variables: dict[str, Any] = {}
     for k, column in enumerate(sweep.columns):
         unit, text = unit_and_meaning(sweep, column)
-        values = [column.variation.value(code) for code in table.codes[:, k].tolist()]
+        values = [column.variation.decode(code) for code in table.codes[:, k].tolist()]
         variables[column.name] = ("run", values, {"units": unit, "long_name": text})
     for name, values, text in (
         ("passed", table.passed, "whether the flight passed its verdict"),

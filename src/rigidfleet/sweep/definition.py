@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, Strict
 
 from rigidfleet._common.arguments import as_path
-from rigidfleet._common.renamed import successor
+from rigidfleet._common.renamed import rename_hint
 from rigidfleet._version import __version__
 from rigidfleet.errors import MissionError, RigidfleetError, SweepError, wrong_type
 from rigidfleet.mission import Mission, load_mission, mission_names
@@ -35,8 +35,8 @@ from rigidfleet.sweep.variation import (
     Gridded,
     NotationError,
     Variation,
-    from_line,
     is_number,
+    parse_line,
 )
 
 #: Remedy if final states cannot be evaluated alone.
@@ -289,7 +289,7 @@ class Sweep:
 
     def _places(self, path: str) -> list[Keys]:
         """Keys of all places that match a path; a case of a drill is none of the mission."""
-        return [tuple(path.split("."))] if self.drill else keypaths.expand(self.whole, path)
+        return [tuple(path.split("."))] if self.drill else keypaths.expand_path(self.whole, path)
 
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:
@@ -322,8 +322,8 @@ class Sweep:
         varied = {column.keys for column in self.columns}
         document, values = (mission or self.mission).to_dict(), values or self.values(run)
         if self.drill:
-            stream = faults.stream_of(self.seed, run, 2)
-            faults.disturb(document, *values[:2], stream, self.mission.n_agents, self._end)
+            stream = faults.random_stream(self.seed, run, 2)
+            faults.apply_fault(document, *values[:2], stream, self.mission.n_agents, self._end)
         for column, value in zip(self.columns, values, strict=True) if not self.drill else ():
             apply_value(document, self.whole, column, value)
         if self.header.random_numbers == "own":
@@ -472,7 +472,7 @@ class _Check:
             problem = "has no effect: without [network], one law knows all states"
             self.add(("drill", "links"), problem, "remove it, or add [network] to the mission")
         n = 1 if self.mission is None else self.mission.n_agents
-        for name, most in faults.most_of(n).items():
+        for name, most in faults.greatest_sizes(n).items():
             if name in drill.model_fields_set and max(getattr(drill, name), default=0) > most:
                 self.add(("drill", name), f"is too much for {n} vehicles", f"give at most {most}")
         grids = drill.grids(n)
@@ -491,9 +491,9 @@ class _Check:
                 self._check_places(k, path, variation, starts=by_final_states)
             variations += [] if variation is None else [variation]
         if by_final_states and self.mission is not None:
-            from rigidfleet.simulation.ensemble import unfit
+            from rigidfleet.simulation.ensemble import why_unfit
 
-            if (why := unfit(self.mission)) is not None:
+            if (why := why_unfit(self.mission)) is not None:
                 self.add(("evaluate",), why, _WHOLE, "final")
         if self.mission is not None:
             self._check_values(self.mission)
@@ -515,15 +515,15 @@ class _Check:
         where, before = ("vary", k), len(self.collector.findings)
         if isinstance(entry, str):
             try:
-                entry = self.data["vary"][k] = from_line(entry)
+                entry = self.data["vary"][k] = parse_line(entry)
             except NotationError as error:
                 self.add(where, error.problem, error.remedy)
                 return None
-        model = self.collector.kind(entry, where, KINDS)
+        model = self.collector.model_of_kind(entry, where, KINDS)
         variation = None if model is None else self.collector.validate(model, entry, where)
         if variation is None or len(self.collector.findings) > before:
             return None
-        if problem := variation.wrong():
+        if problem := variation.find_error():
             key, *words = problem
             self.add((*where, key), *words, getattr(variation, key))
             return None
@@ -536,7 +536,7 @@ class _Check:
         """
         where = ("vary", k, "path")
         try:
-            places = keypaths.expand(self.whole, path)
+            places = keypaths.expand_path(self.whole, path)
         except NotationError as error:
             self.add(where, error.problem, error.remedy, path)
             return
@@ -545,7 +545,7 @@ class _Check:
         values = getattr(v, "values", ())
         numeric = all(map(is_number, values))
         for word in values:
-            if remedy := next(filter(None, (successor(keys[-1], word) for keys in places)), ""):
+            if remedy := next(filter(None, (rename_hint(keys[-1], word) for keys in places)), ""):
                 self.add(("vary", k, "values"), "is no value of the mission format", remedy, word)
         for keys in places:
             leaves = keypaths.flatten(look_up(self.whole, keys))

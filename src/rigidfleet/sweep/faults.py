@@ -66,7 +66,7 @@ class Drill(Part):
     def grids(self, n: int) -> list[Variation]:
         """The cases of a show of n vehicles as three grids that go together: a drill is a sweep over them."""
         possible = PARTIAL | SETUP if self.files else UNITS
-        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), most_of(n)
+        faults, most = self.model_fields_set & UNITS.keys() or possible.keys(), greatest_sizes(n)
         some = sorted({min(count, n) for count in self.vehicles})
         counts = dict.fromkeys(PARTIAL, some) | dict.fromkeys(SETUP, sorted({1, n}))
         places = range(1, len(self.stale) + 1)
@@ -99,24 +99,24 @@ class Drill(Part):
         return self.model_copy(update={key: x for key, x in named.items() if x})
 
 
-def most_of(n: int) -> dict[str, int]:
+def greatest_sizes(n: int) -> dict[str, int]:
     """Of how many vehicles or links at most a key may be in a show of n vehicles."""
     return {"vehicles": n, "another": n - 1, "lost": n - 1, "links": n * (n - 1) // 2}
 
 
-def stream_of(seed: int, *number: int) -> np.random.Generator:
+def random_stream(seed: int, *number: int) -> np.random.Generator:
     """Random numbers of a run or of an order of the vehicles."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=number))
 
 
-def some_of(seed: int, n: int, count: int, trial: int) -> Ints:
+def vehicles_of(seed: int, n: int, count: int, trial: int) -> Ints:
     """Which (S,) of n vehicles a fault concerns in a trial: in n / S trials, each of them once."""
     block, place = divmod(trial, n // count)
-    order = stream_of(seed, block, 3).permutation(n)
+    order = random_stream(seed, block, 3).permutation(n)
     return np.sort(order[place * count : (place + 1) * count])
 
 
-def disturb(
+def apply_fault(
     document: dict[str, Any], fault: str, size: float, stream: np.random.Generator, n: int, end: float
 ) -> None:  # fmt: skip
     """Put a fault, if it is flown, into the document of a mission of n vehicles that ends at a time [s]."""
@@ -170,7 +170,7 @@ class _Chords(NamedTuple):
     @classmethod
     def of(cls, way: Piecewise) -> _Chords:
         """Chords of ways (K, N, 4, P)."""
-        points = Piecewise(way.time, pad(way.pieces[:, :, :3], 2)).bernstein()
+        points = Piecewise(way.time, pad(way.pieces[:, :, :3], 2)).control_points()
         place = np.concatenate([points[..., 0], points[-1:, ..., -1]])
         share = np.linspace(0.0, 1.0, points.shape[-1])
         points -= place[:-1, ..., None] + np.diff(place, axis=0)[..., None] * share
@@ -200,7 +200,7 @@ class Show:
     """
 
     def __init__(self, mission: Mission, drill: Drill) -> None:
-        from rigidfleet.simulation.trajectories import judged_as
+        from rigidfleet.simulation.trajectories import judging_mission
 
         self.mission, self.drill, self.n = mission, drill, mission.n_agents
         self.curve, self.how, verdict = self._ways(mission, drill.files)
@@ -209,7 +209,7 @@ class Show:
             raise RigidfleetError(
                 f"drill: the flight fails without any fault: {why}. Mend this first."
             )
-        data = judged_as(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
+        data = judging_mission(self.curve.pieces[0, :, :3, 0], 1.0, mission=mission).to_dict()
         motions = {q.name for q in MOTIONS}  # which a fault leaves as they are
         data["limits"] = {k: x for k, x in data.get("limits", {}).items() if k not in motions}
         self._data, self.radius, limits = data, mission.fleet.radius, mission.limits
@@ -281,14 +281,14 @@ class Show:
 
         who = fault.who
         again = np.isin(np.arange(self.n), who)
-        way, knots = self.way_with(fault), self.curve.time
+        way, knots = self.way_by_fault(fault), self.curve.time
         if not np.array_equal(knots, way.time):
             knots = common_knots([self.curve, way])
-        way = way.on(knots, stays=True)
+        way = way.refine(knots, stays=True)
         if fault.kind not in SETUP or not again.all():
-            again |= self._near(who, _Chords.of(way), knots)
+            again |= self._may_be_nearest(who, _Chords.of(way), knots)
         every = np.flatnonzero(again)
-        curve = self._some(every).on(knots, stays=True)
+        curve = self._ways_of(every).refine(knots, stays=True)
         powers = max(x.pieces.shape[-1] for x in (curve, way))
         pieces = pad(curve.pieces, powers)
         pieces[:, np.isin(every, who)] = pad(way.pieces, powers)
@@ -300,10 +300,10 @@ class Show:
         mission = Mission.from_plain(data, "drill")
         return of_curve(Piecewise(knots, pieces), self.how, mission=mission), every
 
-    def way_with(self, fault: GeometricFault) -> Piecewise:
+    def way_by_fault(self, fault: GeometricFault) -> Piecewise:
         """The ways (K, S, 4, P) that vehicles (S,) fly by a fault, on knots of their own."""
         kind, size, who, stream = fault
-        pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._some(who), np.eye(2), 0.0
+        pads, flown, turn, by = self.curve.pieces[0, :, :2, 0], self._ways_of(who), np.eye(2), 0.0
         match kind:
             case "late":
                 return flown.later(size)
@@ -312,7 +312,7 @@ class Show:
                 return Piecewise(version.time, version.pieces[:, who])
             case "another":
                 source = (who + int(size)) % self.n
-                flown, by = self._some(source), pads[who] - pads[source]
+                flown, by = self._ways_of(source), pads[who] - pads[source]
             case "bias" | "shifted":
                 by = size * _heading(stream.uniform(0.0, _TURN, len(who) if kind == "bias" else 1))
             case "rotated":
@@ -328,7 +328,7 @@ class Show:
         pieces[:, :, :2, 0] += by
         return Piecewise(flown.time, pieces)
 
-    def _near(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
+    def _may_be_nearest(self, who: Ints, own: _Chords, knots: Floats) -> Bools:
         """Which vehicles (N,) may be the nearest to one of those (S,) that fly by other chords, or hit it.
 
         If distances count by height, these are all that may come nearer than a limit.
@@ -364,7 +364,7 @@ class Show:
             self._on_knots[key] = _Chords.through(place, sag)
         return self._on_knots[key]
 
-    def _some(self, who: Ints) -> Piecewise:
+    def _ways_of(self, who: Ints) -> Piecewise:
         """The ways of some vehicles."""
         return Piecewise(self.curve.time, self._rows[:, who].transpose(3, 1, 2, 0))
 

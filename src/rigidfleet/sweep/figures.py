@@ -25,12 +25,12 @@ from rigidfleet.sweep.run import flight_of_fault
 from rigidfleet.sweep.store import Table
 from rigidfleet.sweep.summary import (
     Borne,
-    borne,
     drivers,
     failures,
-    interval,
+    fault_rates,
     outcomes,
     varied_numbers,
+    wilson_interval,
 )
 from rigidfleet.sweep.variation import Geomspace, LogUniform
 from rigidfleet.typing import Floats, Ints
@@ -99,7 +99,7 @@ def plot(
         draw = {"drill": shares, "worst": worst_runs}
     files = []
     for name, drawn in draw.items():
-        with st.settings(), st.figure_options(titles=titles):
+        with st.apply_style(), st.figure_options(titles=titles):
             figure = drawn(table)
         made = {} if figure is None else encode_figure(figure, formats, close=not titles)
         files += write_files(Path(folder, name), made)
@@ -115,7 +115,7 @@ def outcome(table: Table) -> Figure | None:
     left, right = fig.subplots(1, 2, width_ratios=(3, 2))
     n = np.unique(np.geomspace(1, len(table.run), 200).astype(int))
     passed = np.cumsum(table.passed)[n - 1]
-    low, high = interval(passed, n)
+    low, high = wilson_interval(passed, n)
     left.fill_between(n, 100 * low, 100 * high, color=st.BAND, label="95 % interval")
     left.plot(n, 100 * passed / n, color=st.PALETTE[0])
     left.set(xlabel="runs", ylabel="passed [%]", ylim=(-3, 103))
@@ -143,7 +143,7 @@ def outcome(table: Table) -> Figure | None:
 
 def shares(table: Table) -> Figure | None:
     """Share of the runs of a drill that fail, over the magnitudes of each fault."""
-    cases = borne(table)
+    cases = fault_rates(table)
     if not cases:
         return None
     names = list(dict.fromkeys(case.fault for case in cases))
@@ -169,7 +169,7 @@ def shares(table: Table) -> Figure | None:
 
 def worst_runs(table: Table) -> Figure | None:
     """Of each fault that fails, the worst run from above: whom it concerns when it fails, and their ways until then."""
-    failed = [case for case in borne(table) if case.worst]
+    failed = [case for case in fault_rates(table) if case.worst]
     worst = {
         name: min((x for x in failed if x.fault == name), key=lambda x: x.separation or 0.0)
         for name in dict.fromkeys(case.fault for case in failed)

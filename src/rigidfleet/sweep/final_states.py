@@ -20,7 +20,7 @@ from rigidfleet.formation.graphs import complete_graph
 from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.mission.bounds import LENGTH, SPEED
-from rigidfleet.mission.formations import coincident
+from rigidfleet.mission.formations import coincident_pairs
 from rigidfleet.mission.kinds import seconds
 from rigidfleet.simulation.ensemble import Ensemble, establish, max_edge_error
 from rigidfleet.sweep.metrics import METRICS
@@ -59,7 +59,7 @@ def fly_final_states(sweep: Sweep, runs: Sequence[int]) -> list[RunRecord]:
     wall = (perf_counter() - begun) / len(runs)
     rows = []
     for k, (run, drawn) in enumerate(zip(runs, values, strict=True)):
-        codes = tuple(c.variation.code(x) for c, x in zip(sweep.columns, drawn, strict=True))
+        codes = tuple(c.variation.encode(x) for c, x in zip(sweep.columns, drawn, strict=True))
         if k in refused:
             unknown = dict.fromkeys(METRICS, math.nan)
             rows.append(RunRecord(run, False, *refused[k], codes, unknown, wall))
@@ -91,7 +91,7 @@ def _refusals(
     """Reason and detail of runs with an invalid mission, by index. Only doubtful missions are checked in full."""
     bounded = np.all((np.abs(r) <= LENGTH.most) & (np.abs(v) <= SPEED.most), axis=(1, 2))
     r, v = (np.where(bounded[:, None, None], x, 0.0) for x in (r, v))
-    apart = [not any(coincident(points)) for points in r.tolist()]
+    apart = [not any(coincident_pairs(points)) for points in r.tolist()]
     refusals = {}
     for k in np.flatnonzero(~(bounded & apart)):
         try:

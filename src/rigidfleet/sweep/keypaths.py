@@ -39,7 +39,7 @@ def name_of(keys: Keys) -> str:
     return ".".join(str(k + 1) if isinstance(k, int) else toml_key(k) for k in keys)
 
 
-def expand(whole: Mapping[str, Any], path: str) -> list[Keys]:
+def expand_path(whole: Mapping[str, Any], path: str) -> list[Keys]:
     """Keys of all places that match a path in a document with all defaults.
 
     Raises

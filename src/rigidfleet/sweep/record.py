@@ -23,7 +23,7 @@ class RunRecord:
     passed : whether the run passed its verdict
     reason : failed checks, separated by commas; one of `UNJUDGED` if the run has no verdict; "" if it passed
     detail : message of the first failure
-    codes : value of every column of the sweep, encoded by `Variation.code`
+    codes : value of every column of the sweep, encoded by `Variation.encode`
     metrics : value of each of `METRICS`; NaN if it does not apply
     wall : wall time of the run [s]
     level : level of the machine code that flew it; between levels the last bits of a row differ
@@ -36,7 +36,7 @@ class RunRecord:
     codes: tuple[float, ...]
     metrics: dict[str, float]
     wall: float
-    level: str = field(default_factory=levels.level)
+    level: str = field(default_factory=levels.target_level)
 
 
 def refusal(error: MissionError) -> tuple[str, str]:

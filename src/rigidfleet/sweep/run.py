@@ -56,8 +56,8 @@ def _show_and_fault(sweep: Sweep, run: int) -> tuple[faults.Show, faults.Geometr
     """The show of a drill, and the geometric fault of a run."""
     assert sweep.drill is not None
     show, (kind, size, count) = faults.show_of(sweep.mission.text, sweep.drill), sweep.values(run)
-    who = faults.some_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
-    return show, faults.GeometricFault(kind, size, who, faults.stream_of(sweep.seed, run, 2))
+    who = faults.vehicles_of(sweep.seed, show.n, count, run // math.prod(sweep.grid_sizes.values()))
+    return show, faults.GeometricFault(kind, size, who, faults.random_stream(sweep.seed, run, 2))
 
 
 def flight_of_fault(sweep: Sweep, run: int) -> tuple[Result, Ints]:
@@ -117,7 +117,7 @@ def _value_or_error(job: Callable[[], Any]) -> Any:
 
 def _record(sweep: Sweep, run: int, values: Sequence[Any], flown: Any, begun: float) -> RunRecord:
     """Judge and measure a flight, unless it is the outcome; ``begun``: when, by `perf_counter` [s]."""
-    codes = tuple(c.variation.code(v) for c, v in zip(sweep.columns, values, strict=True))
+    codes = tuple(c.variation.encode(v) for c, v in zip(sweep.columns, values, strict=True))
     metrics = dict.fromkeys(METRICS, math.nan)
     done = isinstance(flown, Exception | tuple)
     outcome = flown if done else _value_or_error(lambda: _judge(flown))

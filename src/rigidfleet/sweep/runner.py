@@ -113,7 +113,7 @@ def fly(
         elif pool is not None:
             flight.hand_out(pool, lambda: count)
         else:
-            flight.alone(until_worth=count > 1)
+            flight.fly_alone(until_worth=count > 1)
             deaths = 0
             while flight.missing:
                 before = flight.flown
@@ -149,12 +149,12 @@ class _Sweeping:
         _log.info(f"{self.words()}; begun")
         self.report(1)
 
-    def alone(self, *, until_worth: bool) -> None:
+    def fly_alone(self, *, until_worth: bool) -> None:
         """Fly in this process: all runs, or until the remaining work justifies more processes."""
         while self.missing:
             if until_worth and self.pace * GROUP * len(self.missing) > WORTH:
                 return
-            self.keep(fly_runs(self.sweep, self.take(1)))
+            self.store_records(fly_runs(self.sweep, self.take_chunk(1)))
             self.report(1)
 
     def hand_out(self, executor: Executor, capacity: Callable[[], int]) -> None:
@@ -181,11 +181,11 @@ class _Sweeping:
             while self.missing or flying:
                 workers = outcome(capacity)
                 while self.missing and len(flying) < _AHEAD * max(1, workers):
-                    taken = self.take(max(1, workers))
+                    taken = self.take_chunk(max(1, workers))
                     flying[outcome(executor.submit, pools.fly_chunk, *sweep, taken)] = taken
                     taken = []
                 for future in wait(flying, _LOOK, FIRST_COMPLETED).done:
-                    self.keep(outcome(future.result))
+                    self.store_records(outcome(future.result))
                     del flying[future]
                 self.report(workers)
         finally:
@@ -195,7 +195,7 @@ class _Sweeping:
             lost = {run // GROUP for runs in (*flying.values(), taken) for run in runs}
             self.missing.extendleft(sorted(lost, reverse=True))
 
-    def take(self, workers: int) -> list[int]:
+    def take_chunk(self, workers: int) -> list[int]:
         """Runs of the next chunk: complete groups for the duration of a chunk."""
         fair = -(-len(self.missing) // (_AHEAD * workers))
         groups = 1 if self.pace == 0.0 else min(fair, int(_CHUNK / (self.pace * GROUP)))
@@ -203,7 +203,7 @@ class _Sweeping:
         last = self.sweep.runs
         return [run for g in first for run in range(g * GROUP, min((g + 1) * GROUP, last))]
 
-    def keep(self, rows: list[RunRecord]) -> None:
+    def store_records(self, rows: list[RunRecord]) -> None:
         """Store the records of a chunk."""
         self.store.add(rows)
         self.finished_runs[[row.run for row in rows]] = True

@@ -10,7 +10,7 @@ import numpy as np
 
 from rigidfleet.errors import ResultError, RigidfleetError
 from rigidfleet.sweep.run import GROUP
-from rigidfleet.sweep.store import FILE, Store, Table, contents, differences, outcome_of, read
+from rigidfleet.sweep.store import FILE, Store, Table, differences, outcome_of, read, store_contents
 from rigidfleet.typing import Bools, Ints
 
 #: Folder of the shards in the folder of their sweep.
@@ -58,7 +58,7 @@ def merge(folder: str | Path, *, replace: bool = False) -> Table:
     """
     folder = Path(folder)
     paths = shard_folders(folder) or [folder / _SHARDS]
-    stored = [contents(path) for path in paths]
+    stored = [store_contents(path) for path in paths]
     sweep, common, _ = stored[0]
     rows: dict[int, tuple[Path, tuple[Any, ...]]] = {}
     for path, (_, own, part) in zip(paths, stored, strict=True):

@@ -22,7 +22,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rigidfleet._common.files import unwritable
+from rigidfleet._common.files import unwritable_error
 from rigidfleet.errors import ResultError, refuse_format
 from rigidfleet.sweep.definition import Sweep
 from rigidfleet.sweep.metrics import METRICS
@@ -54,7 +54,7 @@ class Table:
     run : numbers (n,) of the finished runs, from 0
     passed : whether each run passed (n,)
     reason, detail : failed checks and message of the first one (n,); "" if the run passed
-    codes : value of each column (n, D), encoded by `Variation.code`
+    codes : value of each column (n, D), encoded by `Variation.encode`
     metrics : values (n,) of each metric; NaN if it does not apply
     wall : wall time of each run (n,) [s]
     levels : number of runs by the level of machine code that flew them, if it is known
@@ -117,7 +117,7 @@ class Store:
         )  # fmt: skip
 
     def insert(self, rows: Iterable[tuple[Any, ...]]) -> None:
-        """Store rows as `contents` returns them, all of them or none."""
+        """Store rows as `store_contents` returns them, all of them or none."""
         names, marks = ", ".join(f'"{name}"' for name in _COLUMNS), ", ".join("?" * len(_COLUMNS))
         with _as_result_errors(self.path), self.db:
             self.db.execute("BEGIN IMMEDIATE")
@@ -184,7 +184,7 @@ def read(folder: str | Path) -> Table:
     ResultError
         The folder does not contain a sweep.
     """
-    sweep, _, rows = contents(Path(folder))
+    sweep, _, rows = store_contents(Path(folder))
     run, passed, reason, detail, wall, level, codes, *metrics = list(zip(*rows, strict=True)) or [
         () for _ in _COLUMNS
     ]
@@ -201,7 +201,7 @@ def read(folder: str | Path) -> Table:
     )
 
 
-def contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:
+def store_contents(folder: Path) -> tuple[Sweep, dict[str, Any], list[tuple[Any, ...]]]:
     """Sweep of a folder, what all shards of one sweep have in common, and the rows, in the order of the columns.
 
     Raises
@@ -261,11 +261,11 @@ def _as_result_errors(path: Path) -> Generator[None]:
             " another folder."
         ) from error
     except OSError as error:
-        raise unwritable(path.parent, error) from error
+        raise unwritable_error(path.parent, error) from error
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> str:
-    """Names of what differs between two sweeps, as `Sweep.identity` and `contents` have it."""
+    """Names of what differs between two sweeps, as `Sweep.identity` and `store_contents` have it."""
     names = {
         "vary": "variations",
         "evaluate": "what is evaluated",

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
-from rigidfleet._common.plain import plain
+from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.quantities import display_unit
 from rigidfleet.sweep import store
 from rigidfleet.sweep.faults import UNITS
@@ -143,7 +143,7 @@ class Summary(Shown):
         }
         units = {name: METRICS[name].unit for name in self.percentiles}
         tested = {"pairs_tested": len(self.drivers), "false_discovery_rate": _CHANCE}
-        return plain(data | tested | {"units": units, "confidence": CONFIDENCE})
+        return to_json_data(data | tested | {"units": units, "confidence": CONFIDENCE})
 
     def json(self) -> str:
         """The summary as JSON text."""
@@ -240,7 +240,7 @@ def summarise(table: store.Table) -> Summary:
     by_value, worded = {}, _columns_in_words(table)
     for k, column in enumerate(table.sweep.columns):
         if column.name in worded:
-            words = np.array([str(column.variation.value(x)) for x in table.codes[:, k].tolist()])
+            words = np.array([str(column.variation.decode(x)) for x in table.codes[:, k].tolist()])
             by_value[column.name] = {
                 word: rate(table.passed[words == word]) for word in dict.fromkeys(words.tolist())
             }
@@ -260,18 +260,18 @@ def summarise(table: store.Table) -> Summary:
         by_value,
         numbers if sweep.random else "none",
         table.levels,
-        borne(table),
+        fault_rates(table),
     )
 
 
-def borne(table: store.Table) -> list[Borne]:
+def fault_rates(table: store.Table) -> list[Borne]:
     """How often each fault of a drill fails; empty for other sweeps."""
     cases = []
     for codes in np.unique(table.codes, axis=0) if table.sweep.drill else []:
         some = np.flatnonzero((table.codes == codes).all(axis=1))
         apart, passed = table.metrics["separation"][some], table.passed[some]
         fault, size, count = (
-            c.variation.value(x) for c, x in zip(table.sweep.columns, codes.tolist(), strict=True)
+            c.variation.decode(x) for c, x in zip(table.sweep.columns, codes.tolist(), strict=True)
         )
         worst, failed = None, some[~passed]
         if len(failed):
@@ -306,11 +306,11 @@ def rate(passed: Bools) -> Rate:
     n, k = len(passed), int(passed.sum())
     if n == 0:
         return Rate(0, 0, math.nan, 0.0, 1.0)
-    low, high = interval(np.array([k]), np.array([n]))
+    low, high = wilson_interval(np.array([k]), np.array([n]))
     return Rate(k, n, k / n, float(low[0]), float(high[0]))
 
 
-def interval(k: Ints, n: Ints) -> tuple[Floats, Floats]:
+def wilson_interval(k: Ints, n: Ints) -> tuple[Floats, Floats]:
     """Ends of the Wilson interval of each rate: k (m,) of n (m,)."""
     p, z = k / n, NormalDist().inv_cdf(0.5 + 0.5 * CONFIDENCE)
     middle = (2 * n * p + z**2) / (2 * (n + z**2))
@@ -355,12 +355,12 @@ def drivers(table: store.Table) -> list[Driver]:
             if every or _differs(x[there]):
                 x_ranked = ranked[name] if every else _ranks(x[there])
                 tested.append((name, outcome, *_rank_correlation(x_ranked, y_ranked)))
-    adjusted = _adjusted_chances(np.array([chance for *_, chance in tested]))
+    adjusted = _adjusted_p_values(np.array([chance for *_, chance in tested]))
     pairs = [Driver(*d, float(q)) for d, q in zip(tested, adjusted, strict=True)]
     return sorted(pairs, key=lambda d: -abs(d.correlation))
 
 
-def _adjusted_chances(chance: Floats) -> Floats:
+def _adjusted_p_values(chance: Floats) -> Floats:
     """P-values (n,) corrected for their number, by Benjamini and Hochberg."""
     n = len(chance)
     order = np.argsort(-chance)

@@ -58,15 +58,15 @@ class Variation(Part):
         """Value at the fraction u of a distribution, in (0, 1)."""
         raise NotImplementedError
 
-    def code(self, value: Any) -> float:
+    def encode(self, value: Any) -> float:
         """Encode a value as a number: the value itself, or its index in a list that is not numeric."""
         return float(value)
 
-    def value(self, code: float) -> Any:
+    def decode(self, code: float) -> Any:
         """Decode a value."""
         return code
 
-    def wrong(self) -> tuple[str, str, str] | None:
+    def find_error(self) -> tuple[str, str, str] | None:
         """Key, problem and remedy of an error that involves several keys; None if there is none."""
         return None
 
@@ -104,7 +104,7 @@ class _Between(Variation):
     low: Number = required_key("lower end")
     high: Number = required_key("upper end, > low")
 
-    def wrong(self) -> tuple[str, str, str] | None:
+    def find_error(self) -> tuple[str, str, str] | None:
         """Ends in the wrong order."""
         if self.low < self.high:
             return None
@@ -140,15 +140,15 @@ class _Listed(Variation):
         "values: numbers, words, true or false, lists"
     )
 
-    def code(self, value: Any) -> float:
+    def encode(self, value: Any) -> float:
         """Encode a value: itself if all values are numbers, else its index."""
         return float(value) if self._numeric else float(self.values.index(value))
 
-    def value(self, code: float) -> Any:
+    def decode(self, code: float) -> Any:
         """Decode a value."""
         return code if self._numeric else self.values[int(code)]
 
-    def wrong(self) -> tuple[str, str, str] | None:
+    def find_error(self) -> tuple[str, str, str] | None:
         """Error if a value is of another type, or if values that are not numbers are to be added or scaled."""
         if not all(map(_usable, self.values)):
             words = "finite numbers, words, true or false, or lists of these"
@@ -229,7 +229,7 @@ _LINE = re.compile(r"\s*(.+?)\s*(\+=|\*=|=)\s*([\w-]+)\s*\((.*)\)\s*", re.DOTALL
 _FORM = "write PATH = KIND(NUMBERS), as in agents.mass.* *= normal(1, 0.05)"
 
 
-def from_line(line: str) -> dict[str, Any]:
+def parse_line(line: str) -> dict[str, Any]:
     """Parse a line into the table that it stands for.
 
     Raises

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from multiprocessing import connection
 from typing import TYPE_CHECKING, Any
 
-from rigidfleet._common.processes import safe_path
+from rigidfleet._common.processes import keep_folder_off_path
 from rigidfleet.errors import RigidfleetError
 from rigidfleet.sweep.definition import sweep_of_json
 from rigidfleet.sweep.record import RunRecord
@@ -51,15 +51,15 @@ def processes(count: int) -> Generator[Executor]:
     They are forks of this process where that is safe, as they then begin with all that it has loaded. Elsewhere, each
     starts on its own.
     """
-    from rigidfleet.kernel.engine.native import bequeath
+    from rigidfleet.kernel.engine.native import code_to_inherit
 
     before = set(multiprocessing.active_children())
     forked = _has_one_thread()
     context: Any = _fork_context() if forked else multiprocessing.get_context("spawn")
-    own = None if forked else bequeath()
+    own = None if forked else code_to_inherit()
     # Before a spawned process receives the module path of its parent, it would search the current folder first, even
     # for modules of the standard library; so would multiprocessing's resource tracker.
-    with safe_path():
+    with keep_folder_off_path():
         pool = ProcessPoolExecutor(count, context, _begin_worker, (own,))
         try:
             yield pool

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.toml import text_says, to_toml
+from rigidfleet._common.toml import text_has_data, to_toml
 from rigidfleet.math import lqr, pid
 from rigidfleet.math.margins import Loop, LoopGains, Margins, margins
 from rigidfleet.mission import Mission
@@ -123,7 +123,7 @@ class Screen:
         """The smallest margins of each law with some gains."""
         smallest: dict[str, Margins] = {}
         for name, m in self._margins_of_parts(gains):
-            smallest[name] = smallest[name].common(m) if name in smallest else m
+            smallest[name] = smallest[name].smaller_margins(m) if name in smallest else m
         return smallest
 
     def slack(self, gains: Gains) -> float:
@@ -207,7 +207,7 @@ def with_gains(text: str, gains: Gains) -> str:
     for table, key, value in _entries(document, gains):
         wanted.setdefault(table, {})[key] = value
         new = _replace_line(new, table, key, to_toml({key: value}).strip())
-    return new if text_says(new, wanted) else digest_lines(text) + to_toml(wanted)
+    return new if text_has_data(new, wanted) else digest_lines(text) + to_toml(wanted)
 
 
 def _entries(document: dict[str, Any], gains: Gains) -> Iterator[tuple[str, str, Any]]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rigidfleet._common.facts import FactTable, Line, Row, Sheet, Shown
-from rigidfleet._common.plain import plain
+from rigidfleet._common.plain import to_json_data
 from rigidfleet.math.margins import Margins
 from rigidfleet.sweep.record import reason_in_words
 from rigidfleet.tuning.gains import Gains
@@ -133,7 +133,7 @@ class Tuned(Shown):
                 "file": None if self.file is None else str(self.file),
             }
         }  # fmt: skip
-        return plain(data)
+        return to_json_data(data)
 
     def __str__(self) -> str:
         from rich.console import Console

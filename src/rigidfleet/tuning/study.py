@@ -124,7 +124,7 @@ def tune(
     claim = _Claim(
         folder, {"version": __version__, "mission": flown.text, **options}, own_mission.name
     )
-    claim.take(replace=replace)
+    claim.begin_study(replace=replace)
     count = cores() if workers is None else workers
     study = _Study(flown, folder, options, paths, budget, count, progress)
     with study.stack:
@@ -314,13 +314,13 @@ class _Study:
         if self.count > 1 and self.rounds and self.pool is None:
             self.pool = self.stack.enter_context(processes(self.count))
         workers = self.count if self.pool else 1
-        table = fly(sweep, folder, workers=workers, progress=self._tell, pool=self.pool)
+        table = fly(sweep, folder, workers=workers, progress=self._report_progress, pool=self.pool)
         self.before, self.now = self.before + self.now, self.now * 0
         if not self.rounds and np.median(table.wall) * self.total < WORTH:
             self.count = 1
         return _measurements(table, candidates, len(seeds))
 
-    def _tell(self, now: SweepProgress) -> None:
+    def _report_progress(self, now: SweepProgress) -> None:
         self.now = np.array([now.done, now.flown, now.failed])
         if self.progress is not None:
             done, flown, failed = (self.before + self.now).tolist()
@@ -346,9 +346,9 @@ class _Claim:
         self.folder, self.definition = folder, definition
         self.study, self.tuned = folder / STUDY, folder / f"{name}-tuned.toml"
 
-    def take(self, *, replace: bool) -> None:
+    def begin_study(self, *, replace: bool) -> None:
         """Check before anything flies that the files can be written, and begin the study."""
-        before = self._before()
+        before = self._read_folder()
         if replace:
             for name in (_ROUNDS, _VALIDATION):
                 shutil.rmtree(self.folder / name, ignore_errors=True)
@@ -373,7 +373,7 @@ class _Claim:
         tuned.file = self.tuned
         self._write({"definition": self.definition, **tuned.to_dict(), "text": tuned.text})
 
-    def _before(self) -> dict[str, Any]:
+    def _read_folder(self) -> dict[str, Any]:
         """What is in the folder."""
         try:
             return json.loads(self.study.read_bytes())

@@ -1,7 +1,7 @@
 """The cache of compiled code, which never runs code that another user may have written.
 
 Machine code and Numba's pickles can do whatever their author likes. They are stored and read only in a folder that this
-user alone can write. Code that came with the package (`objects.shared_object`) needs none.
+user alone can write. Code that came with the package (`objects.shared_object_path`) needs none.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def cache_directory() -> Path:
     # Nobody else can write the outer folder, and so nobody can put another one in place of the inner.
     for own in folder.parent, folder:
         own.mkdir(mode=0o700, exist_ok=True)
-        _refuse(own, os.lstat(own))
+        _refuse_unsafe(own, os.lstat(own))
     return folder
 
 
@@ -89,11 +89,11 @@ def open_safely(file: str | Path) -> Generator[IO[bytes]]:
         state = os.fstat(stream.fileno())
         if not stat.S_ISREG(state.st_mode):
             raise PermissionError(errno.EACCES, f"{file} is not a file")
-        _refuse(file, state)
+        _refuse_unsafe(file, state)
         yield stream
 
 
-def not_kept(error: OSError) -> None:
+def warn_not_cached(error: OSError) -> None:
     """Warn once that compiled code cannot be cached, whatever the function and reason."""
     if not warned.is_set():
         warned.set()
@@ -106,7 +106,7 @@ def not_kept(error: OSError) -> None:
         )
 
 
-def _refuse(path: str | Path, state: os.stat_result) -> None:
+def _refuse_unsafe(path: str | Path, state: os.stat_result) -> None:
     """Refuse a link, and what belongs to another user, or what others can write.
 
     Windows has access lists instead of owners and modes; they protect a user's own folders.

@@ -12,7 +12,7 @@ from rigidfleet.kernel.compiler.jit import OPTIONS
 from rigidfleet.solids import distance
 
 
-def _known(function: Callable[..., Any]) -> None:
+def _make_known(function: Callable[..., Any]) -> None:
     """Let compiled functions call a function of Python."""
     overload(function, jit_options=OPTIONS, strict=False)(lambda *_: function)
 
@@ -22,11 +22,11 @@ def _floor(x):
 
 
 # Numba takes the implementation that the second function returns for the arguments' types.
-overload(distance.choose, jit_options=OPTIONS)(
+overload(distance.where, jit_options=OPTIONS)(
     lambda test, this, other: lambda test, this, other: this if test else other
 )
-overload(distance.some, jit_options=OPTIONS)(lambda test: lambda test: test)
+overload(distance.any_true, jit_options=OPTIONS)(lambda test: lambda test: test)
 overload(distance.floor, jit_options=OPTIONS)(lambda x: _floor)
 
 for _function in distance.ELEMENTWISE:
-    _known(_function)
+    _make_known(_function)

@@ -22,9 +22,9 @@ from numba.core.caching import (
 )
 from numba.core.ccallback import CFunc
 
-from rigidfleet._common.files import replacing
-from rigidfleet.kernel.compiler.cache import cache_directory, not_kept, open_safely
-from rigidfleet.kernel.compiler.levels import KEY, level, runnable_level
+from rigidfleet._common.files import replace_atomically
+from rigidfleet.kernel.compiler.cache import cache_directory, open_safely, warn_not_cached
+from rigidfleet.kernel.compiler.levels import KEY, runnable_level, target_level
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -42,13 +42,13 @@ OPTIONS: dict[str, Any] = {
 _OPTIMISES = numba.config.OPT > 0
 _CACHED = OPTIONS | {"no_cfunc_wrapper": True}
 if os.environ.get(KEY):  # whatever Numba compiles in this process is then of this level, too
-    numba.config.CPU_NAME = runnable_level() if _OPTIMISES else level()
+    numba.config.CPU_NAME = runnable_level() if _OPTIMISES else target_level()
     numba.config.CPU_FEATURES = ""
 
 
 def jit(function: F) -> F:
     """Compile for the flight: cached on disk, without the GIL, without allocation."""
-    return _with_cache(function, _CACHED)
+    return _compile_with_cache(function, _CACHED)
 
 
 def jit_inline(function: F) -> F:
@@ -56,17 +56,17 @@ def jit_inline(function: F) -> F:
 
     Where it is not inlined, the linker takes the copy that was loaded first, and copies sum in different orders.
     """
-    return _with_cache(function, _CACHED | {"forceinline": _OPTIMISES})
+    return _compile_with_cache(function, _CACHED | {"forceinline": _OPTIMISES})
 
 
-def exact(function: F) -> F:
+def jit_exact(function: F) -> F:
     """Compile with sums as they are written, neither reordered nor fused: the same bits as NumPy's."""
-    return _with_cache(function, _CACHED | {"fastmath": False})
+    return _compile_with_cache(function, _CACHED | {"fastmath": False})
 
 
 def compiled_copy(function: Any, name: str, **instead: Any) -> Any:
     """Compile the source of a compiled function again, with other functions in place of some that it calls."""
-    return _with_cache(_copy(function.py_func, name, instead), _CACHED)
+    return _compile_with_cache(_copy_function(function.py_func, name, instead), _CACHED)
 
 
 def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) -> int:
@@ -75,9 +75,9 @@ def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) 
     The code and the copy stay alive as long as the process.
     """
     signature = types.void(*[types.CPointer(types.float64)] * arguments)
-    copy = _copy(function, name, instead)
+    copy = _copy_function(function, name, instead)
     made = CFunc(copy, (signature.args, signature.return_type), {}, {"nopython": True})
-    made._cache = _cache(copy)
+    made._cache = _cache_of(copy)
     made.compile()
     _STAYING.append(made)
     return made.address
@@ -86,7 +86,7 @@ def compiled_for_c(function: Any, name: str, *, arguments: int, **instead: Any) 
 _STAYING: list[Any] = []
 
 
-def _copy(function: FunctionType, name: str, instead: dict[str, Any]) -> FunctionType:
+def _copy_function(function: FunctionType, name: str, instead: dict[str, Any]) -> FunctionType:
     copy = FunctionType(function.__code__, function.__globals__ | instead, name)
     copy.__module__, copy.__qualname__ = function.__module__, name
     return copy
@@ -134,7 +134,7 @@ class _Files(IndexDataCacheFile):
             return super()._load_data(name)
 
     def _open_for_write(self, filepath: str) -> Any:
-        return replacing(filepath, private=True)
+        return replace_atomically(filepath, private=True)
 
 
 class _Cache(FunctionCache):
@@ -151,7 +151,7 @@ class _Cache(FunctionCache):
         try:
             super().save_overload(sig, data)
         except OSError as error:
-            not_kept(error)
+            warn_not_cached(error)
 
 
 class _NoCache(NullCache):
@@ -161,18 +161,18 @@ class _NoCache(NullCache):
         self._error = error
 
     def save_overload(self, *_: Any) -> None:
-        not_kept(self._error)
+        warn_not_cached(self._error)
 
 
-def _cache(function: Any) -> _Cache | _NoCache:
+def _cache_of(function: Any) -> _Cache | _NoCache:
     try:
         return _Cache(function)
     except OSError as error:
         return _NoCache(error)
 
 
-def _with_cache(function: F, options: dict[str, Any]) -> F:
+def _compile_with_cache(function: F, options: dict[str, Any]) -> F:
     dispatcher = numba.njit(**options)(function)
     if _OPTIMISES:
-        dispatcher._cache = _cache(function)
+        dispatcher._cache = _cache_of(function)
     return dispatcher

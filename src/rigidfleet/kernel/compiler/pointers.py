@@ -7,7 +7,7 @@ lanes takes eight), an array the words of its data address and shape, a nested t
 field loads its words. They never change while compiled code runs, and the compiler knows this.
 
 Extents of arrays that the tuple's type declares (`rigidfleet.kernel.problem.Extents`) are not loaded. An extent with a
-name passes through a function that returns what it is given; `with_sizes` replaces this function, and makes code for a
+name passes through a function that returns what it is given; `set_extents` replaces this function, and makes code for a
 size of the same translation, if `keep_extents` was called before it.
 """
 
@@ -54,7 +54,7 @@ class Pointer(types.Type):
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _ADDRESS)
-        self._size = 8 * _words(kind.to)
+        self._size = 8 * _count_words(kind.to)
 
     def from_argument(self, _builder: Any, value: Any) -> Any:
         """Declare that an argument is valid memory, so that reads can be moved forward."""
@@ -63,10 +63,10 @@ class _Model(models.PrimitiveModel):
         return value
 
 
-def _words(kind: types.Type) -> int:
+def _count_words(kind: types.Type) -> int:
     """Number of words of a value."""
     if isinstance(kind, types.BaseNamedTuple):
-        return sum(map(_words, kind.types))
+        return sum(map(_count_words, kind.types))
     if isinstance(kind, types.Array):
         return 1 + kind.ndim
     return WIDTH if kind == lanes else 1
@@ -75,7 +75,7 @@ def _words(kind: types.Type) -> int:
 def _field(kind: types.BaseNamedTuple, name: str) -> tuple[types.Type, int]:
     """Type and first word of a field."""
     k = kind.fields.index(name)
-    return kind.types[k], sum(map(_words, kind.types[:k]))
+    return kind.types[k], sum(map(_count_words, kind.types[:k]))
 
 
 @infer_getattr
@@ -88,10 +88,10 @@ class _Attribute(AttributeTemplate):
 
 
 @lower_getattr_generic(Pointer)
-def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
+def _read_field(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any:
     field, first = _field(kind.to, name)
     if isinstance(field, types.BaseNamedTuple):
-        return _at(builder, address, first)
+        return _word_address(builder, address, first)
     if isinstance(field, types.Array):
         array = context.make_array(field)(context, builder)
         array.data = _load(builder, address, first, array.data.type)
@@ -103,12 +103,12 @@ def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any
     return _load(builder, address, first, context.get_value_type(field))
 
 
-def _at(builder: Any, address: Any, word: int) -> Any:
+def _word_address(builder: Any, address: Any, word: int) -> Any:
     return builder.gep(address, [ir.Constant(_WORD, word)], inbounds=True)
 
 
 def _load(builder: Any, address: Any, word: int, kind: ir.Type = _WORD) -> Any:
-    place = builder.bitcast(_at(builder, address, word), kind.as_pointer())
+    place = builder.bitcast(_word_address(builder, address, word), kind.as_pointer())
     loaded = builder.load(place, align=8)
     loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
     return loaded
@@ -139,11 +139,11 @@ def _extent(builder: Any, address: Any, word: int, declared: int | str | None) -
 
 
 def keep_extents() -> None:
-    """Keep the functions of named extents, in what is translated from now on, until `with_sizes` replaces them."""
+    """Keep the functions of named extents, in what is translated from now on, until `set_extents` replaces them."""
     _inlining[0] = "noinline"
 
 
-def with_sizes(text: str, sizes: Mapping[str, int]) -> str:
+def set_extents(text: str, sizes: Mapping[str, int]) -> str:
     """A module's text in which named extents are these numbers; those not given are as they come.
 
     Raises RuntimeError if the text has no such extent.
@@ -189,13 +189,13 @@ def pointer(to: types.BaseNamedTuple) -> Any:
 
 
 @intrinsic
-def by_address(_context, x):
+def address_of(_context, x):
     """The address of a named tuple; one passed by value is copied to the caller's stack first."""
     if not isinstance(x, types.BaseNamedTuple):
         return x(x), lambda _context, _builder, _sig, args: args[0]
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        memory = cgutils.alloca_once(builder, _WORD, size=_words(x))
+        memory = cgutils.alloca_once(builder, _WORD, size=_count_words(x))
         _store(context, builder, x, args[0], memory, 0)
         # The address passes through an empty piece of assembly, so that nothing is read through it before all has
         # been stored.
@@ -211,7 +211,7 @@ def _store(context: Any, builder: Any, kind: Any, value: Any, memory: Any, word:
     if isinstance(kind, types.BaseNamedTuple):
         for k, part in enumerate(kind.types):
             _store(context, builder, part, builder.extract_value(value, k), memory, word)
-            word += _words(part)
+            word += _count_words(part)
         return
     parts = [value]
     if isinstance(kind, types.Array):
@@ -221,5 +221,5 @@ def _store(context: Any, builder: Any, kind: Any, value: Any, memory: Any, word:
     elif kind == types.boolean:
         parts = [builder.zext(value, _WORD)]
     for k, part in enumerate(parts):
-        place = builder.bitcast(_at(builder, memory, word + k), part.type.as_pointer())
+        place = builder.bitcast(_word_address(builder, memory, word + k), part.type.as_pointer())
         builder.store(part, place, align=8)

@@ -2,7 +2,7 @@
 
 A `lanes` value holds eight doubles; arithmetic, ``max`` and ``abs`` act on each of them. A `LaneArray`
 is an array of such values. The unchanged source of the integrator compiles for them: eight flights in
-the lanes share their steps. For a single flight, `in_vectors` views eight consecutive states as one value,
+the lanes share their steps. For a single flight, `as_lanes` views eight consecutive states as one value,
 so that the integrator's sums use the machine's vector registers.
 """
 
@@ -104,7 +104,7 @@ def _typeof(value: LaneArray, _context: Any) -> types.Type:
     return types.Array(lanes, value.ndim, "C", aligned=False)
 
 
-def in_all(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
+def fill_vector(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
     """Build a vector with a number in all lanes."""
     start = ir.Constant(VECTOR, ir.Undefined)
     one = builder.insert_element(start, number, ir.Constant(_INDEX, 0))
@@ -115,7 +115,7 @@ def in_all(builder: ir.IRBuilder, number: ir.Value) -> ir.Value:
 @lower_cast(types.Float, _Lanes)
 @lower_cast(types.Integer, _Lanes)
 def _cast(context: Any, builder: Any, kind: Any, _to: Any, value: Any) -> ir.Value:
-    return in_all(builder, context.cast(builder, value, kind, types.float64))
+    return fill_vector(builder, context.cast(builder, value, kind, types.float64))
 
 
 def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.Value]:
@@ -123,7 +123,7 @@ def _operands(context: Any, builder: Any, sig: Any, arguments: Any) -> list[ir.V
     return [
         value
         if isinstance(kind, _Lanes)
-        else in_all(builder, context.cast(builder, value, kind, types.float64))
+        else fill_vector(builder, context.cast(builder, value, kind, types.float64))
         for kind, value in zip(sig.args, arguments, strict=True)
     ]
 
@@ -156,32 +156,32 @@ def arithmetic(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, name: str) -> ir
 
 def absolute(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     """Build abs(x)."""
-    return builder.call(_llvm(builder, "fabs", 1), [x])
+    return builder.call(_llvm_intrinsic(builder, "fabs", 1), [x])
 
 
-def larger(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+def build_maximum(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
     """Build max(a, b)."""
     return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
-def smaller(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
+def build_minimum(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
     """Build min(a, b)."""
     return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
 def _multiply_add(builder: ir.IRBuilder, a: ir.Value, b: ir.Value, c: ir.Value) -> ir.Value:
-    return builder.call(_llvm(builder, "fma", 3), [a, b, c])
+    return builder.call(_llvm_intrinsic(builder, "fma", 3), [a, b, c])
 
 
-def _estimate(builder: ir.IRBuilder, name: str, x: ir.Value) -> ir.Value:
+def _machine_estimate(builder: ir.IRBuilder, name: str, x: ir.Value) -> ir.Value:
     mask = ir.IntType(WIDTH)
     kind = ir.FunctionType(VECTOR, [VECTOR, VECTOR, mask])
     symbol = f"llvm.x86.avx512.{name}14.pd.512"
     function = cgutils.get_or_insert_function(builder.module, kind, symbol)
-    return builder.call(function, [x, number(0.0), ir.Constant(mask, (1 << WIDTH) - 1)])
+    return builder.call(function, [x, lane_constant(0.0), ir.Constant(mask, (1 << WIDTH) - 1)])
 
 
-def number(value: float) -> ir.Constant:
+def lane_constant(value: float) -> ir.Constant:
     """Return a constant in all lanes."""
     return ir.Constant(VECTOR, [value] * WIDTH)
 
@@ -193,9 +193,9 @@ def inverse(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     by e + e^2 + e^3 with the error e = 1 - x y, takes a third of that.
     """
     if not _ESTIMATES:
-        return builder.fdiv(number(1.0), x, flags=_FAST)
-    y = _estimate(builder, "rcp", x)
-    e = _multiply_add(builder, builder.fneg(x), y, number(1.0))
+        return builder.fdiv(lane_constant(1.0), x, flags=_FAST)
+    y = _machine_estimate(builder, "rcp", x)
+    e = _multiply_add(builder, builder.fneg(x), y, lane_constant(1.0))
     power = _multiply_add(builder, e, e, e)
     return _multiply_add(builder, y, _multiply_add(builder, power, e, e), y)
 
@@ -206,7 +206,7 @@ def rough_inverse(_context, x):
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
         if _ESTIMATES:
-            return _estimate(builder, "rcp", args[0])
+            return _machine_estimate(builder, "rcp", args[0])
         return inverse(builder, args[0])
 
     return lanes(x), generate
@@ -218,22 +218,22 @@ def inverse_root(builder: ir.IRBuilder, x: ir.Value) -> ir.Value:
     From an estimate y, with e = 1 - x y^2: y (1 + e/2 + 3 e^2/8 + 5 e^3/16).
     """
     if not _ESTIMATES:
-        root = builder.call(_llvm(builder, "sqrt", 1), [x])
-        return builder.fdiv(number(1.0), root, flags=_FAST)
-    y = _estimate(builder, "rsqrt", x)
-    e = _multiply_add(builder, builder.fneg(builder.fmul(x, y)), y, number(1.0))
-    series = _multiply_add(builder, number(0.3125), e, number(0.375))
-    series = _multiply_add(builder, series, e, number(0.5))
+        root = builder.call(_llvm_intrinsic(builder, "sqrt", 1), [x])
+        return builder.fdiv(lane_constant(1.0), root, flags=_FAST)
+    y = _machine_estimate(builder, "rsqrt", x)
+    e = _multiply_add(builder, builder.fneg(builder.fmul(x, y)), y, lane_constant(1.0))
+    series = _multiply_add(builder, lane_constant(0.3125), e, lane_constant(0.375))
+    series = _multiply_add(builder, series, e, lane_constant(0.5))
     return _multiply_add(builder, builder.fmul(y, e), series, y)
 
 
-def root(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Value:
+def root_from_inverse(builder: ir.IRBuilder, x: ir.Value, inverse_of_it: ir.Value) -> ir.Value:
     """Build sqrt(x) from 1/sqrt(x)."""
-    zero = builder.fcmp_ordered("==", x, number(0.0))
+    zero = builder.fcmp_ordered("==", x, lane_constant(0.0))
     return builder.select(zero, x, builder.fmul(x, inverse_of_it))
 
 
-def _llvm(builder: ir.IRBuilder, name: str, arity: int) -> ir.Function:
+def _llvm_intrinsic(builder: ir.IRBuilder, name: str, arity: int) -> ir.Function:
     kind = ir.FunctionType(VECTOR, [VECTOR] * arity)
     return cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{WIDTH}f64")
 
@@ -246,12 +246,12 @@ BUILD: dict[str, Any] = {
     "neg": ir.IRBuilder.fneg,
     "inverse": inverse,
     "inverse_root": inverse_root,
-    "root": root,
+    "root": root_from_inverse,
     "abs": absolute,
-    "max": larger,
-    "min": smaller,
+    "max": build_maximum,
+    "min": build_minimum,
     "where_positive": lambda builder, x, a, b: builder.select(
-        builder.fcmp_ordered(">", x, number(0.0)), a, b
+        builder.fcmp_ordered(">", x, lane_constant(0.0)), a, b
     ),
 }
 _register((operator.add, operator.iadd), 2, BUILD["add"])
@@ -266,13 +266,13 @@ def fill_lanes(_context, x):
     """Return lanes that all hold the number x."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return in_all(builder, context.cast(builder, args[0], sig.args[0], types.float64))
+        return fill_vector(builder, context.cast(builder, args[0], sig.args[0], types.float64))
 
     return lanes(x), generate
 
 
 @intrinsic
-def spread(_context, x, addresses, offset):
+def scatter(_context, x, addresses, offset):
     """Store each lane of x at one of eight addresses (8,), plus an offset in numbers."""
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -288,7 +288,7 @@ def spread(_context, x, addresses, offset):
 
 
 @intrinsic
-def in_vectors(_context, array):
+def as_lanes(_context, array):
     """View float64 (..., n), n a multiple of 8, as lanes (..., n / 8); lanes are returned unchanged."""
     if array.dtype == lanes:
         same = lambda context, builder, sig, args: impl_ret_borrowed(  # noqa: E731
@@ -316,7 +316,7 @@ def in_vectors(_context, array):
 
 
 @intrinsic
-def _fold(_context, x, largest):
+def _reduce_lanes(_context, x, largest):
     """Sum over the lanes, or the largest one; NaN if any lane is NaN."""
 
     def generate(_context: Any, builder: Any, _sig: Any, args: Any) -> ir.Value:
@@ -332,7 +332,7 @@ def _fold(_context, x, largest):
             return builder.extract_element(x, ir.Constant(_INDEX, 0))
 
         total = combine_halves(args[0], builder.fadd)
-        most = combine_halves(args[0], partial(larger, builder))
+        most = combine_halves(args[0], partial(build_maximum, builder))
         number = builder.fcmp_ordered("ord", total, total)
         most = builder.select(number, most, total)
         return builder.select(args[1], most, total)
@@ -348,5 +348,5 @@ def total_or_worst(x, states):
 @overload(total_or_worst)
 def _overload_total_or_worst(x, states):
     if states.dtype == lanes:
-        return lambda x, states: _fold(x, True)
-    return lambda x, states: _fold(x, False)
+        return lambda x, states: _reduce_lanes(x, True)
+    return lambda x, states: _reduce_lanes(x, False)

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.arrays import same
+from rigidfleet._common.arrays import arrays_equal
 from rigidfleet.kernel.compiler.jit import jit
-from rigidfleet.kernel.compiler.pointers import by_address
+from rigidfleet.kernel.compiler.pointers import address_of
 from rigidfleet.kernel.compiler.simd import WIDTH, LaneArray, empty, pack, unpack
 from rigidfleet.kernel.engine import lane_steps, native
 from rigidfleet.kernel.engine.codegen import (
@@ -67,7 +67,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
     right-hand side to ``evaluations`` (G,). p, an `UnrolledProblem`, and state are overwritten. ``fresh``
     is always True; a literal here would have another type for the compiler.
     """
-    p, state = by_address(p), by_address(state)
+    p, state = address_of(p), address_of(state)
     unsampled = state.clock[:0]
     for g in range(starts.shape[0]):
         for q in range(starts.shape[1]):
@@ -86,7 +86,7 @@ def fly(p, state, t0, t_end, step, starts, before, ends, status, evaluations, ma
 @jit
 def fly_on(p, state, t_end, fresh, times, unsampled, max_steps):
     """Integrate eight flights to ``t_end`` [s], see `dopri5.integrate`; p is an `UnrolledProblem`."""
-    p, state = by_address(p), by_address(state)
+    p, state = address_of(p), address_of(state)
     return integrate(p, p, state, t_end, fresh, times, unsampled, max_steps)
 
 
@@ -117,11 +117,11 @@ def fits(problem: Problem) -> bool:
         and problem.reference.kind != SHAPE
         and not (problem.has_frame or problem.body_formulation or problem.disturbance.active)
         and problem.external.address == 0
-        and _equations(problem) <= _MOST_EQUATIONS
+        and _count_equations(problem) <= _MOST_EQUATIONS
     )
 
 
-def _equations(problem: Problem) -> int:
+def _count_equations(problem: Problem) -> int:
     edges, agents = len(problem.graph.edges), len(problem.vehicles.m)
     return min(edges, 3 * agents) if problem.law.solver == ITERATED else edges
 
@@ -137,7 +137,7 @@ def fit_together(problems: Sequence[Problem]) -> bool:
         and first.law.solver in (ITERATED, EXACT)
         and first.graph.solver == 0
         and first.motion.coefficients.shape[2] == 6
-        and _equations(first) <= _MOST_EQUATIONS
+        and _count_equations(first) <= _MOST_EQUATIONS
     ):
         return False
     return all(
@@ -150,8 +150,8 @@ def fit_together(problems: Sequence[Problem]) -> bool:
         and x.control.kind == first.control.kind
         and _blend(x.reference) == _blend(first.reference)
         and _tables(x.disturbance) == _tables(first.disturbance)
-        and same(x.graph.edges, first.graph.edges)
-        and same(x.motion.knots, first.motion.knots)
+        and arrays_equal(x.graph.edges, first.graph.edges)
+        and arrays_equal(x.motion.knots, first.motion.knots)
         for x in problems
     )
 

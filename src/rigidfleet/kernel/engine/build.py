@@ -28,7 +28,7 @@ from rigidfleet.kernel import (
 )
 from rigidfleet.kernel.avoidance import AvoidanceArrays
 from rigidfleet.kernel.compiler.jit import OPTIONS
-from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, with_sizes
+from rigidfleet.kernel.compiler.pointers import keep_extents, pointer, set_extents
 from rigidfleet.kernel.engine import objects, packing
 from rigidfleet.kernel.measured import Measured
 from rigidfleet.kernel.problem import Problem, Workspace
@@ -57,14 +57,14 @@ _RETURNING = {"solve", "count_blocks", "factor", "inner", "conjugate_gradients"}
 _QUICK = ("sroa", "simplify_cfg", "instruction_combine", "simplify_cfg")
 
 
-def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
+def flight_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]:
     """Object code of the C functions of the first library.
 
     Their arguments are addresses of named tuples. They integrate (and return what `dopri5.integrate` returns),
-    record, and monitor. The ``second`` process, if there is one, makes what is `apart`.
+    record, and monitor. The ``second`` process, if there is one, makes what is `monitor_code`.
     """
     problem, workspace, integrator, segment, record = map(
-        _at, (Problem, Workspace, IntegratorState, Segment, Record)
+        _pointer, (Problem, Workspace, IntegratorState, Segment, Record)
     )
 
     def integrate_segment(p, w, state, s):
@@ -86,20 +86,20 @@ def machine_code(second: "subprocess.Popen[bytes] | None" = None) -> list[bytes]
     functions = zip((integrate_segment, record_segment), entries.items(), strict=False)
     modules = [_module(function, *entry) for function, entry in functions]
     text, symbol, _ = modules[0]
-    codes = [_object(*module) for module in modules]
-    three = _object(text, symbol, "integrate_three", sizes=THREE)
-    made = None if second is None else objects.separate(second.communicate()[0])
-    return [*codes, *(made or apart()), three]
+    codes = [_object_code(*module) for module in modules]
+    three = _object_code(text, symbol, "integrate_three", sizes=THREE)
+    made = None if second is None else objects.split_objects(second.communicate()[0])
+    return [*codes, *(made or monitor_code()), three]
 
 
-def apart() -> list[bytes]:
+def monitor_code() -> list[bytes]:
     """Object codes of monitor, measurement, clearances and recursions, which share little with the rest."""
     problem, workspace, integrator, watching = map(
-        _at, (Problem, Workspace, IntegratorState, Monitor)
+        _pointer, (Problem, Workspace, IntegratorState, Monitor)
     )
 
     def bound_moves(p, state, watch):
-        monitor.bound_moves(problem(p), integrator(state), watching(watch))
+        monitor.bound_changes(problem(p), integrator(state), watching(watch))
         return 0
 
     def watch_distances(first, end, p, state, watch):
@@ -121,12 +121,12 @@ def apart() -> list[bytes]:
         bound_moves,
         watch_distances,
         watch_forces,
-        caller(measurement.measure, _at(Measured)),
-        caller(recursion.follow, _at(Recursion)),
+        caller(measurement.measure, _pointer(Measured)),
+        caller(recursion.recurse, _pointer(Recursion)),
     )
     entries = list(objects.ENTRIES["flight"].items())[2:-1]
     return [
-        _object(*_module(function, name, words))
+        _object_code(*_module(function, name, words))
         for function, (name, words) in zip(functions, entries, strict=True)
     ]
 
@@ -136,9 +136,9 @@ def sampled_code() -> list[bytes]:
     from rigidfleet.kernel import quadrotor, sampled_flight
 
     problem, workspace, flight, state = map(
-        _at, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
+        _pointer, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
     )
-    segment, evaluation = map(_at, (fleet.SampledSegment, fleet.Evaluation))
+    segment, evaluation = map(_pointer, (fleet.SampledSegment, fleet.Evaluation))
 
     def fly(p, w, f, s, call):
         return sampled_flight.fly_ticks(
@@ -150,7 +150,7 @@ def sampled_code() -> list[bytes]:
 
     functions = zip((fly, evaluate), objects.ENTRIES["sampled"].items(), strict=True)
     modules = [_module(function, *entry) for function, entry in functions]
-    return [_object(*module, hot=_HOT_SAMPLED) for module in modules]
+    return [_object_code(*module, hot=_HOT_SAMPLED) for module in modules]
 
 
 def avoidance_code() -> list[bytes]:
@@ -158,15 +158,15 @@ def avoidance_code() -> list[bytes]:
     from rigidfleet.kernel import guard
 
     problem, workspace, flight, state = map(
-        _at, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
+        _pointer, (Problem, Workspace, fleet.SampledFlight, fleet.SampledState)
     )
-    avoidance = _at(AvoidanceArrays)
+    avoidance = _pointer(AvoidanceArrays)
 
     def avoid(f, s, address, _):
         a = avoidance(address)
-        return guard.avoid(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
+        return guard.guard_forces(problem(a.law[0]), workspace(a.law[1]), flight(f), state(s), a)
 
-    return [_object(*_module(avoid, "avoid", objects.ENTRIES["avoidance"]["avoid"]), hot=())]
+    return [_object_code(*_module(avoid, "avoid", objects.ENTRIES["avoidance"]["avoid"]), hot=())]
 
 
 def solids_code() -> list[bytes]:
@@ -174,7 +174,9 @@ def solids_code() -> list[bytes]:
     from rigidfleet.kernel.obstacles import watch_step
 
     row_of = monitor.row_of
-    problem, integrator, watching, solids = map(_at, (Problem, IntegratorState, Monitor, Solids))
+    problem, integrator, watching, solids = map(
+        _pointer, (Problem, IntegratorState, Monitor, Solids)
+    )
 
     def watch_solids(first, end, p, state, watch, s):
         at, trail = integrator(state), integrator(state).trail
@@ -184,7 +186,7 @@ def solids_code() -> list[bytes]:
             watch_step(trail.points[row], start, length, problem(p), solids(s), watching(watch))
         return 0
 
-    return [_object(*_module(watch_solids, "watch_solids", 6), hot=())]
+    return [_object_code(*_module(watch_solids, "watch_solids", 6), hot=())]
 
 
 def large_code() -> list[bytes]:
@@ -195,9 +197,9 @@ def large_code() -> list[bytes]:
         function = getattr(elimination, source, None) or getattr(block_cholesky, source)
         fields = ", ".join(f"x.{field}" for field in kind._fields)
         call = f"return 0.0 + f({fields})" if source in _RETURNING else f"f({fields}); return 0.0"
-        scope = {"at": _at(kind), "f": function}
+        scope = {"at": _pointer(kind), "f": function}
         exec(f"def entry(address):\n    x = at(address)\n    {call}", scope)
-        codes.append(_object(*_module(scope["entry"], name, 1, types.float64), hot=()))
+        codes.append(_object_code(*_module(scope["entry"], name, 1, types.float64), hot=()))
     return codes
 
 
@@ -207,11 +209,11 @@ LIBRARIES = {
     "avoidance": avoidance_code,
     "solids": solids_code,
     "large": large_code,
-    "apart": apart,
+    "apart": monitor_code,
 }
 
 
-def _at(kind: type) -> Any:
+def _pointer(kind: type) -> Any:
     """The compiled function that converts an int64 to the address of a named tuple of this type."""
     return pointer(typeof(packing.example_of(kind)))
 
@@ -219,20 +221,20 @@ def _at(kind: type) -> Any:
 def _module(
     function: Any, name: str, arguments: int, result: Any = types.int64
 ) -> tuple[str, str, str]:
-    """Input of `_object`: the module of a C function of so many addresses, its symbol, and its ``name``."""
+    """Input of `_object_code`: the module of a C function of so many addresses, its symbol, and its ``name``."""
     made = cfunc(result(*(types.int64,) * arguments), **OPTIONS)(function)
     return made.inspect_llvm(), made.native_name, name
 
 
-def _object(
+def _object_code(
     text: str,
     symbol: str,
     name: str,
     hot: tuple[str, ...] = _HOT,
     sizes: Mapping[str, int] = ANY,
 ) -> bytes:
-    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `with_sizes`."""
-    module = _simplify(with_sizes(text, sizes), symbol, name, hot)
+    """Object code of a module of which ``symbol`` alone, the function ``name``, is called; see `set_extents`."""
+    module = _simplify(set_extents(text, sizes), symbol, name, hot)
     builder = _passes(3)
     builder.getModulePassManager().run(module, builder)
     for function in module.functions:
@@ -278,5 +280,5 @@ def main(part: str) -> None:
         second = subprocess.Popen(
             objects.build_command("apart"), cwd=objects.ELSEWHERE, stdout=subprocess.PIPE
         )
-        codes = machine_code(second)
+        codes = flight_code(second)
     sys.stdout.buffer.write(objects.concatenate(codes))

@@ -302,7 +302,7 @@ def _value_of(
 
     def value(x: Symbol | float) -> ir.Value:
         if not isinstance(x, Symbol):
-            return simd.number(x)
+            return simd.lane_constant(x)
         if x.serial not in values:
             if x.serial in loaded or x.operation in SOURCES:
                 values[x.serial] = load(builder, x)
@@ -333,7 +333,7 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
                 array, index = uniform, inputs[x.serial]
             case "time", place:
                 number = builder.gep(time, [ir.Constant(ir.IntType(64), place)])
-                return simd.in_all(builder, builder.load(number))
+                return simd.fill_vector(builder, builder.load(number))
             case "table", which, index:
                 array = rows[which]
             case operation, index:
@@ -368,14 +368,14 @@ def _emit(module: ir.Module, code: Code) -> ir.Function:
     value = _value_of(builder, load_known, code.inputs + code.known)
     for x in code.lines:
         value(x)
-    whole = [builder.fcmp_ordered(">", value(x), simd.number(0.0)) for x in code.positive]
+    whole = [builder.fcmp_ordered(">", value(x), simd.lane_constant(0.0)) for x in code.positive]
     for index, x in enumerate(code.outputs):
         if index < code.coordinates:  # a velocity, see `lane_steps`
             continue
         result = value(x)
         if index == code.coordinates:  # one state without a derivative is enough
             for good in whole:
-                result = builder.select(good, result, simd.number(float("nan")))
+                result = builder.select(good, result, simd.lane_constant(float("nan")))
         builder.store(result, _element(builder, dy, index), align=8)
     branch(builder, OF_GAUGE, of_gauge, end)
 

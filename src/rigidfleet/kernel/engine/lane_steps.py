@@ -20,7 +20,7 @@ step, and forces are known at its middle, too. This takes one more evaluation.
 import numpy as np
 
 from rigidfleet.kernel.compiler.jit import jit, jit_inline
-from rigidfleet.kernel.compiler.simd import spread
+from rigidfleet.kernel.compiler.simd import scatter
 from rigidfleet.kernel.dopri5 import step_to_knot
 from rigidfleet.kernel.dynamics import closed_loop
 from rigidfleet.kernel.records import EVALUATIONS, FIRST_ROW, SAMPLES, TRAILED
@@ -115,7 +115,7 @@ def _weights(w, h):
 
 
 @jit_inline
-def _to_state(k, row, coordinates, w, x, hc, s):
+def _write_state(k, row, coordinates, w, x, hc, s):
     """Write into a row the state that the first s stages, a literal, lead to, so that no term of weight zero is left.
 
     ``w`` and ``x`` are the `_weights` of accelerations in velocities and in positions, ``hc`` the time to it [s].
@@ -136,13 +136,13 @@ def _to_state(k, row, coordinates, w, x, hc, s):
 
 
 @jit_inline
-def _to_stage(k, coordinates, s, h):
+def _write_stage(k, coordinates, s, h):
     """Write the state of stage s, a literal."""
-    _to_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
+    _write_state(k, TRIAL, coordinates, _weights(A[s], h), _weights(_AA[s], h * h), h * C[s], s)
 
 
 @jit_inline
-def _coordinates(k, p):
+def _count_coordinates(k, p):
     """Number of coordinates of all positions, for an `UnrolledProblem` p."""
     return (k.shape[1] - p.before.shape[0]) // 2
 
@@ -150,27 +150,27 @@ def _coordinates(k, p):
 @jit_inline
 def advance(k, stage, _a, h, p):
     """As `dopri5.advance`."""
-    coordinates = _coordinates(k, p)
+    coordinates = _count_coordinates(k, p)
     p.stage[0] = stage
     if stage == 0:
         for q in range(k.shape[1]):
             k[TRIAL, q] = k[STATE, q]
     elif stage == 1:
-        _to_stage(k, coordinates, 1, h)
+        _write_stage(k, coordinates, 1, h)
     elif stage == 2:
-        _to_stage(k, coordinates, 2, h)
+        _write_stage(k, coordinates, 2, h)
     elif stage == 3:
-        _to_stage(k, coordinates, 3, h)
+        _write_stage(k, coordinates, 3, h)
     elif stage == 4:
-        _to_stage(k, coordinates, 4, h)
+        _write_stage(k, coordinates, 4, h)
     elif stage == 5:
-        _to_stage(k, coordinates, 5, h)
+        _write_stage(k, coordinates, 5, h)
     elif stage == 6:
-        _to_stage(k, coordinates, 6, h)
+        _write_stage(k, coordinates, 6, h)
     elif stage == 7:
-        _to_stage(k, coordinates, 7, h)
+        _write_stage(k, coordinates, 7, h)
     else:
-        _to_stage(k, coordinates, 8, h)
+        _write_stage(k, coordinates, 8, h)
 
 
 @jit_inline
@@ -184,7 +184,7 @@ def _squared_error(k, q, e, rtol):
 @jit_inline
 def squared_errors(k, h, rtol, p):
     """As `dopri5.squared_errors`."""
-    coordinates = _coordinates(k, p)
+    coordinates = _count_coordinates(k, p)
     squares = fill_lanes(0.0)
     v, r = _weights(E, h), _weights(_EA, h * h)
     for q in range(coordinates):
@@ -203,7 +203,7 @@ def step_size(t, h, t_end, p):
 
 
 @jit_inline
-def _put_points(points, q, y, quarter, y_new, slope, slope_new):
+def _write_half_step(points, q, y, quarter, y_new, slope, slope_new):
     """Write Bernstein coefficients of a state q over half a step, from its value after a quarter of the step.
 
     Slopes are multiplied by a quarter of the half.
@@ -214,7 +214,7 @@ def _put_points(points, q, y, quarter, y_new, slope, slope_new):
 
 
 @jit_inline
-def _put_halves(k, q, slopes, h, early, late):
+def _write_halves(k, q, slopes, h, early, late):
     """Write the coefficients of a state over both halves of a step into ``early`` and ``late`` (5, n).
 
     Between, it is the polynomial of fifth degree through three states with their derivatives, ``slopes``.
@@ -226,8 +226,8 @@ def _put_halves(k, q, slopes, h, early, late):
     last = (11 / 128) * y + (72 / 128) * middle + (45 / 128) * y_new
     last += (h / 256) * (3.0 * d + 36.0 * d_middle - 9.0 * d_new)
     s = 0.125 * h
-    _put_points(early, q, y, quarter, middle, s * d, s * d_middle)
-    _put_points(late, q, middle, last, y_new, s * d_middle, s * d_new)
+    _write_half_step(early, q, y, quarter, middle, s * d, s * d_middle)
+    _write_half_step(late, q, middle, last, y_new, s * d_middle, s * d_new)
 
 
 @jit
@@ -235,7 +235,7 @@ def keep_forces(p, state, array, row):
     """Write the forces that the code has evaluated into a row of an array of each flight's trail."""
     forces, addresses = state.trail.gauge.shape[1], p.trails[array]
     for g in range(forces):
-        spread(p.gauge[g], addresses, forces * row + g)
+        scatter(p.gauge[g], addresses, forces * row + g)
 
 
 @jit
@@ -245,14 +245,14 @@ def keep_step(t, h, p, w, state):
     The halves of the step are kept as two.
     """
     k, trails, rows = state.K, p.trails, state.trail.clock.shape[0]
-    coordinates, n = _coordinates(k, p), k.shape[1]
+    coordinates, n = _count_coordinates(k, p), k.shape[1]
     # The first half goes to the next row of the trail, the second to the one after it. The forces of the end are there
     # already, as those of the last stage; the code for the middle overwrites them, so they are stored first.
     row = (state.count[FIRST_ROW] + state.count[TRAILED]) % rows
     after = (row + 1) % rows
     keep_forces(p, state, GAUGE, after)
     w_half, x_half = _weights(HALF, h), _weights(_HALF_A, h * h)
-    _to_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
+    _write_state(k, MIDDLE, coordinates, w_half, x_half, 0.5 * h, STAGES)
     p.stage[0] = 0  # forces are asked for, as at a start
     closed_loop(t + 0.5 * h, k[MIDDLE], k[SLOPE], p, w)
     state.count[EVALUATIONS] += 1
@@ -260,16 +260,16 @@ def keep_step(t, h, p, w, state):
     early, late = p.halves[0], p.halves[1]
     for q in range(coordinates):
         i = coordinates + q
-        _put_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
+        _write_halves(k, q, (k[STATE, i], k[MIDDLE, i], k[TRIAL, i]), h, early, late)
     for q in range(coordinates, n):
-        _put_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
+        _write_halves(k, q, (k[0, q], k[SLOPE, q], k[STAGES - 1, q]), h, early, late)
     for half in range(2):
         place = row if half == 0 else after
-        spread(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)
-        spread(fill_lanes(0.5 * h), trails[CLOCK], 2 * place + 1)
+        scatter(fill_lanes(t + half * 0.5 * h), trails[CLOCK], 2 * place)
+        scatter(fill_lanes(0.5 * h), trails[CLOCK], 2 * place + 1)
         for i in range(5):
             for q in range(n):
-                spread(p.halves[half, i, q], trails[POINTS], (5 * place + i) * n + q)
+                scatter(p.halves[half, i, q], trails[POINTS], (5 * place + i) * n + q)
     state.count[TRAILED] += 2
 
 
@@ -294,7 +294,7 @@ def keep_samples(t, h, t_new, times, samples, p, state):
                 (z * z) * points[0, q] + (4.0 * x * z) * points[1, q] + (6.0 * x * x) * points[2, q]
             )
             value += (x * x * x) * ((4.0 * z) * points[3, q] + x * points[4, q])
-            spread(value, p.samples, n * count[SAMPLES] + q)
+            scatter(value, p.samples, n * count[SAMPLES] + q)
         count[SAMPLES] += 1
 
 

@@ -19,21 +19,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rigidfleet._common.files import replacing
+from rigidfleet._common.files import replace_atomically
 from rigidfleet.kernel.compiler.cache import (
     cache_directory,
-    not_kept,
     open_safely,
     sources_digest,
+    warn_not_cached,
     warned,
 )
-from rigidfleet.kernel.compiler.levels import HOST, level, runnable_level
+from rigidfleet.kernel.compiler.levels import HOST, runnable_level, target_level
 from rigidfleet.kernel.engine.objects import (
     ENTRIES,
     concatenate,
     objects_of,
-    separate,
-    shared_object,
+    shared_object_path,
+    split_objects,
     symbol,
     target_machine,
 )
@@ -56,7 +56,7 @@ from rigidfleet.kernel.records import (
     Record,
     Recursion,
     Segment,
-    recorder,
+    new_record,
 )
 from rigidfleet.solids.records import Solids
 from rigidfleet.typing import Floats
@@ -104,7 +104,7 @@ class Integration:
 
 def record(problem: Problem, workspace: Workspace, times: Floats, samples: Floats) -> Record:
     """Forces and references at states ``samples`` (K, n) at ``times`` (K,) [s]."""
-    out = recorder(len(times), len(problem.vehicles.m), len(problem.graph.edges))
+    out = new_record(len(times), len(problem.vehicles.m), len(problem.graph.edges))
     record_into(pack_anew(out), 0, pack(problem), workspace, times, samples)
     return out
 
@@ -170,12 +170,12 @@ def measure(measured: Measured) -> None:
     _call(library().measure, pack_anew(measured))
 
 
-def follow(x: Floats, a: Floats, *, backward: bool = False) -> None:
-    """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.follow`."""
+def recurse(x: Floats, a: Floats, *, backward: bool = False) -> None:
+    """x_k += a_k x_(k-1) in rows x (K, M), with a (K,), or backward, see `rigidfleet.kernel.recursion.recurse`."""
     _call(library().follow, pack_anew(Recursion(x, a, backward)))
 
 
-def follow_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
+def recurse_multiples(y: Floats, first: int, b: Floats, x: Floats, a: Floats) -> None:
     """x_k = b_k y_k + a_k x_(k-1) in rows x (K, M), from the M columns of y (K, C) that begin with ``first``."""
     _call(library().follow, pack_anew(Recursion(x, a, False, y, first, b)))
 
@@ -213,9 +213,9 @@ def library(part: str = "flight") -> Library:
 
 def _load(part: str) -> Library:
     for file in _shipped_code(sources_digest()):
-        return _link(part, *_of_shared_object(file))
-    if (parts := _read(part)) is not None:
-        return _link(part, *_of_objects(parts))
+        return _link(part, *_load_shared_object(file))
+    if (parts := _read_cached_code(part)) is not None:
+        return _link(part, *_link_objects(parts))
     if _shipped_code("*"):
         warnings.warn(
             "the kernel's sources were changed since its machine code was made: they are compiled again",
@@ -223,7 +223,7 @@ def _load(part: str) -> Library:
             stacklevel=2,
         )
     parts = _compile(part)
-    return _link(part, *_of_objects(parts), None if _write(parts, part) else parts)
+    return _link(part, *_link_objects(parts), None if _cache_code(parts, part) else parts)
 
 
 def _link(
@@ -240,13 +240,13 @@ def _link(
     return Library(**calls, addresses=addresses, engine=engine, unkept=unkept)
 
 
-def _of_shared_object(file: Path) -> tuple[Any, Callable[[str], int]]:
+def _load_shared_object(file: Path) -> tuple[Any, Callable[[str], int]]:
     """Load a shared object."""
     engine = ctypes.CDLL(str(file))
     return engine, lambda name: ctypes.cast(engine[name], ctypes.c_void_p).value or 0
 
 
-def _of_objects(parts: Sequence[bytes]) -> tuple[Any, Callable[[str], int]]:
+def _link_objects(parts: Sequence[bytes]) -> tuple[Any, Callable[[str], int]]:
     """Load objects of machine code as a linker would, which not every machine has."""
     import llvmlite.binding as llvm
 
@@ -264,7 +264,7 @@ class Inheritance(NamedTuple):
     warned: bool
 
 
-def bequeath() -> Inheritance:
+def code_to_inherit() -> Inheritance:
     """Code of this process that its child processes cannot find in the cache; to be sent only to them."""
     unkept = {part: library.unkept for part, library in _loaded.items()}
     return Inheritance({part: code for part, code in unkept.items() if code}, warned.is_set())
@@ -275,16 +275,16 @@ def inherit(inheritance: Inheritance) -> None:
     if inheritance.warned:
         warned.set()
     for part, code in inheritance.code.items():
-        _loaded[part] = _link(part, *_of_objects(code), code)
+        _loaded[part] = _link(part, *_link_objects(code), code)
 
 
 def _compile(part: str) -> list[bytes]:
     """Compile the kernel, or another library (``part``), in a separate process if possible."""
-    if (parts := objects_of(part, level())) is not None:
+    if (parts := objects_of(part, target_level())) is not None:
         return parts
     from rigidfleet.kernel.engine import build
 
-    return build.LIBRARIES.get(part, build.machine_code)()
+    return build.LIBRARIES.get(part, build.flight_code)()
 
 
 def _shipped_code(digest: str) -> list[Path]:
@@ -295,11 +295,11 @@ def _shipped_code(digest: str) -> list[Path]:
     RigidfleetError
         The environment fixes a level that this machine cannot run.
     """
-    file = shared_object(runnable_level(), digest)
+    file = shared_object_path(runnable_level(), digest)
     return list(file.parent.glob(file.name))
 
 
-def _file(part: str) -> Path:
+def _cache_file(part: str) -> Path:
     """The cache file of a part of the machine code, for this level or this kind of machine.
 
     Raises
@@ -307,7 +307,7 @@ def _file(part: str) -> Path:
     OSError
         As `cache_directory` does.
     """
-    if (machine := level()) == HOST:
+    if (machine := target_level()) == HOST:
         import llvmlite.binding as llvm
 
         host = f"{llvm.get_process_triple()} {llvm.get_host_cpu_name()} {llvm.get_host_cpu_features().flatten()}"
@@ -315,26 +315,26 @@ def _file(part: str) -> Path:
     return cache_directory() / f"{part}-{machine}.o"
 
 
-def _read(part: str) -> list[bytes] | None:
+def _read_cached_code(part: str) -> list[bytes] | None:
     """Machine code from the cache, if there is any that is safe to run."""
     try:
-        with open_safely(_file(part)) as stream:
-            return separate(stream.read())
+        with open_safely(_cache_file(part)) as stream:
+            return split_objects(stream.read())
     except OSError:
         return None
 
 
-def _write(parts: Sequence[bytes], part: str) -> bool:
+def _cache_code(parts: Sequence[bytes], part: str) -> bool:
     """Store machine code in the cache, or warn that it will be compiled again."""
     try:
-        with replacing(_file(part), private=True) as stream:
+        with replace_atomically(_cache_file(part), private=True) as stream:
             stream.write(concatenate(parts))
     except OSError as error:
-        not_kept(error)
+        warn_not_cached(error)
         return False
     return True
 
 
 def is_compiled() -> bool:
     """Return whether there is machine code, shipped or in the cache, so that nothing has to be compiled."""
-    return bool(_shipped_code(sources_digest())) or _read("flight") is not None
+    return bool(_shipped_code(sources_digest())) or _read_cached_code("flight") is not None

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rigidfleet.kernel.compiler.levels import HOST, KEY, level
+from rigidfleet.kernel.compiler.levels import HOST, KEY, target_level
 
 #: The functions of each library of machine code, by name, with how many words they take: integers, or addresses of
 #: named tuples. They return a word. Flights of points load the first library, those of vehicles the second, too, those
@@ -33,8 +33,8 @@ ENTRIES = {
     "solids": {"watch_solids": 6},  # first, end, problem, integrator, monitor, solids
     "large": dict.fromkeys(
         (
-            "solve", "pull_back", "elimination_tree", "count_blocks", "fill_blocks", "assemble", "factor", "apply_J",
-            "apply_Jt", "inner", "project", "conjugate_gradients", "conjugate_gradients_single",
+            "solve", "multipliers", "elimination_tree", "count_blocks", "fill_blocks", "assemble", "factor", "apply_J",
+            "apply_Jt", "inner", "project_on_solutions", "conjugate_gradients", "conjugate_gradients_single",
         ), 1
     ),
 }  # fmt: skip
@@ -68,7 +68,7 @@ def build_command(part: str = "flight") -> list[str]:
     return [sys.executable, *flags, "-P", "-c", _BUILD.format(part), *path, home]
 
 
-def shared_object(of: str, digest: str) -> Path:
+def shared_object_path(of: str, digest: str) -> Path:
     """Where the package has the machine code of a level, made of sources with this digest."""
     return Path(__file__).with_name(f"{of}-{digest}.so")
 
@@ -89,7 +89,7 @@ def objects_of(part: str, of: str) -> list[bytes] | None:
                 build_command(part), env=os.environ | settings, cwd=ELSEWHERE, capture_output=True, check=False
             )  # fmt: skip
             if done.returncode == 0:
-                return separate(done.stdout)
+                return split_objects(done.stdout)
     return None
 
 
@@ -100,7 +100,7 @@ def target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
-    if (cpu := level()) != HOST:  # code that a linker takes, too
+    if (cpu := target_level()) != HOST:  # code that a linker takes, too
         return target.create_target_machine(cpu=cpu, opt=3, reloc="pic", codemodel="small")
     return target.create_target_machine(
         cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=3, jit=True
@@ -113,7 +113,7 @@ def concatenate(parts: Sequence[bytes]) -> bytes:
     return code + hashlib.sha256(code).digest()
 
 
-def separate(data: bytes) -> list[bytes] | None:
+def split_objects(data: bytes) -> list[bytes] | None:
     """Objects that were `concatenate`; None if they are not whole."""
     code, digest = data[:-32], data[-32:]
     if not code or hashlib.sha256(code).digest() != digest:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel import fleet
-from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance
+from rigidfleet.kernel.avoidance import AvoidanceArrays, avoidance_arrays
 from rigidfleet.kernel.measured import Measured, measurement_of
 from rigidfleet.kernel.problem import (
     CONSTANT,
@@ -42,9 +42,9 @@ from rigidfleet.kernel.records import (
     Segment,
     integrator,
     monitor,
-    recorder,
+    new_record,
 )
-from rigidfleet.solids.records import Solids, half_space, single
+from rigidfleet.solids.records import Solids, half_space, one_solid
 
 
 class Packed(NamedTuple):
@@ -137,7 +137,7 @@ def pack(x: Any) -> Packed:
     return _keep(pack_anew, x)
 
 
-def forget() -> None:
+def forget_last_packed() -> None:
     """Let go of the tuples that this thread has used last; those of a large formation hold much memory."""
     _last.packed.clear()
 
@@ -193,17 +193,17 @@ def examples() -> tuple[
     watching = monitor(one, nowhere, nowhere, 6, 3)
     work = kernel_workspace(1, 0)
     vehicles = fleet.quadrotors([fleet.VehicleDynamics(1.0, point=True)])
-    flight = fleet.flight(vehicles, start=0.0, h=0.0, steps=1)
+    flight = fleet.ideal_flight(vehicles, start=0.0, h=0.0, steps=1)
     S = np.zeros((1, fleet.STATES))
     rotors, rows = np.zeros((1, 4)), np.zeros((0, 1, 3))
     return (
-        problem, work, state, segment, UNRECORDED, watching, flight, fleet.begin(flight, S, work),
+        problem, work, state, segment, UNRECORDED, watching, flight, fleet.initial_state(flight, S, work),
         fleet.segment(1, 0, 0.0), fleet.Evaluation(S, rotors, places, places, frame, S),
-        avoidance(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
+        avoidance_arrays(period=1.0, b=one, lift=one, mass=one, g=0.0, radius=one),
         measurement_of(1, 0, 0, time=none, start=np.zeros(1, dtype=np.int64), attached=np.zeros(0, dtype=np.bool_),
                  framed=False, mass=one, lost_at=one, limit=one, edges=np.zeros((0, 2), dtype=np.int64),
                  r=rows, v=rows, f_u=rows, f_C=rows, p=rows, T_ref=np.zeros((0, 3, 3))),
-        Recursion(np.zeros((0, 1)), none, False), single(half_space(0.0)),
+        Recursion(np.zeros((0, 1)), none, False), one_solid(half_space(0.0)),
     )  # fmt: skip
 
 
@@ -226,7 +226,7 @@ def _examples_of_large() -> tuple[Any, ...]:
     arguments: dict[str, dict[str, Any]] = {
         "solve": {"u": a, "b": b, "r": a, "m": b, "M": 1.0, "order": order, "known": False, "cm": b, "I": frame,
                   "I_inv": frame, "a": a, "f_C": a},
-        "pull_back": {"u": a, "order": order, "f": a, "multiplier": b},
+        "multipliers": {"u": a, "order": order, "f": a, "multiplier": b},
         "elimination_tree": tree,
         "count_blocks": tree | {"count": k, "most": 1},
         "fill_blocks": tree | {"free": k, "out": Pattern(*(k,) * 7)},
@@ -235,7 +235,7 @@ def _examples_of_large() -> tuple[Any, ...]:
         "apply_J": {"u": a, "edges": edges, "a": a, "scale": 1.0, "out": b},
         "apply_Jt": {"u": a, "edges": edges, "b": b, "scale": 1.0, "out": a},
         "inner": {"a": a, "b": a},
-        "project": matrix | {"g": a, "past": many, "gram": frame, "x": a},
+        "project_on_solutions": matrix | {"g": a, "past": many, "gram": frame, "x": a},
         "conjugate_gradients": gradients,
         "conjugate_gradients_single": gradients | {"L": blocks.astype(np.float32)},
     }  # fmt: skip
@@ -248,4 +248,4 @@ OF_LARGE = {type(x).__name__: type(x) for x in _examples_of_large()}
 NOTHING = np.zeros(0)
 
 
-UNRECORDED = recorder(0, 0, 0)
+UNRECORDED = new_record(0, 0, 0)

@@ -28,7 +28,7 @@ def fly_ticks(
     flight brings its own. With ``avoidance``, forces pass through its barriers and its guard.
     """
     work = state.work
-    _check(flight, state, workspace)
+    _check_sizes(flight, state, workspace)
     if problem.body_formulation or problem.disturbance.active:
         raise ValueError(
             "a sampled flight takes a problem in the inertial formulation without disturbances; its Flight has its own"
@@ -38,34 +38,34 @@ def fly_ticks(
         recorder=native.recorder_address(), segment=law.address, record=pack(UNRECORDED).address
     )
     if avoidance is not None:
-        own = _of(avoidance, problem, workspace)
+        own = _pack_avoidance(avoidance, problem, workspace)
         guard = native.library("avoidance").addresses["avoid"]
         call = call._replace(guard=guard, avoidance=own.address)
     arguments = *map(pack, (problem, workspace, flight, state)), pack_anew(call)
     return native.library("sampled").fly_ticks(*(x.address for x in arguments))
 
 
-def avoid(
+def guard_forces(
     problem: Problem,
     workspace: Workspace,
     flight: SampledFlight,
     state: SampledState,
     avoidance: AvoidanceArrays,
 ) -> int:
-    """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.avoid`."""
-    kept = _of(avoidance, problem, workspace)
+    """Filter and guard ``state.force`` once, at ``state.work.law_time``; see `rigidfleet.kernel.guard.guard_forces`."""
+    kept = _pack_avoidance(avoidance, problem, workspace)
     return native.library("avoidance").avoid(
         pack(flight).address, pack(state).address, kept.address, 0
     )
 
 
-def _of(avoidance: AvoidanceArrays, problem: Problem, workspace: Workspace) -> Packed:
+def _pack_avoidance(avoidance: AvoidanceArrays, problem: Problem, workspace: Workspace) -> Packed:
     """Avoidance that knows the law whose forces it changes."""
     avoidance.law[:] = pack(problem).address, pack(workspace).address
     return pack(avoidance)
 
 
-def _check(flight: SampledFlight, state: SampledState, workspace: Workspace) -> None:
+def _check_sizes(flight: SampledFlight, state: SampledState, workspace: Workspace) -> None:
     """Refuse arrays too short for what the machine code reads.
 
     Raises
@@ -88,8 +88,8 @@ def _check(flight: SampledFlight, state: SampledState, workspace: Workspace) -> 
     sizes = len(state.S), len(state.integral), state.work.law_state.shape[1], len(state.mail.stamp)
     if len(state.history) <= sensing.delay.max() or sizes != (n, m, 6 * n + m + 4, links):
         raise ValueError(
-            "the state is of another flight or problem: begin a flight by `fleet.begin`, and a phase by"
-            " `fleet.under_problem`"
+            "the state is of another flight or problem: begin a flight by `fleet.initial_state`, and a phase by"
+            " `fleet.state_under_problem`"
         )
 
 

@@ -135,7 +135,7 @@ class Trace:
         p = self._with_symbols(problem)
         reference = p.reference._replace(d0=p.reference.d0[order], d1=p.reference.d1[order])
         p = p._replace(graph=_reorder(p.graph, order), reference=reference)
-        self._plain(dynamics.closed_loop)(0.0, y, dy, p, w)
+        self._as_plain_python(dynamics.closed_loop)(0.0, y, dy, p, w)
         self.outputs: list[Any] = dy[np.argsort(states)].tolist()
         self.coordinates = 3 * n
         if any(self.outputs[q] is not y[3 * n + q] for q in range(3 * n)):
@@ -168,9 +168,9 @@ class Trace:
 
     def add(self, a: Any, b: Any) -> Any:
         """Return a + b."""
-        if _is(a, 0.0):
+        if _is_number(a, 0.0):
             return b
-        if _is(b, 0.0):
+        if _is_number(b, 0.0):
             return a
         return self.symbol("add", a, b)
 
@@ -178,20 +178,20 @@ class Trace:
         """Return a - b."""
         if a is b:
             return 0.0
-        if _is(b, 0.0):
+        if _is_number(b, 0.0):
             return a
-        if not _is(a, 0.0):
+        if not _is_number(a, 0.0):
             return self.symbol("sub", a, b)
         return b.arguments[0] if b.operation == "neg" else self.symbol("neg", b)
 
     def multiply(self, a: Any, b: Any) -> Any:
         """Return a b."""
         for x, y in ((a, b), (b, a)):
-            if _is(x, 0.0):
+            if _is_number(x, 0.0):
                 return 0.0
-            if _is(x, 1.0):
+            if _is_number(x, 1.0):
                 return y
-            if _is(x, -1.0):
+            if _is_number(x, -1.0):
                 return self.subtract(0.0, y)
         # So that x y and y x are the same symbol.
         swap = isinstance(b, Symbol) and (not isinstance(a, Symbol) or b.serial < a.serial)
@@ -220,25 +220,25 @@ class Trace:
             total = total * xx + weight
         return total
 
-    def _angle(self, x: Any) -> Any:
+    def _checked_angle(self, x: Any) -> Any:
         """The square of an angle [rad], which must not be too wide for the series."""
         xx = x * x
-        self._not_too_wide(xx)
+        self._refuse_wide_angle(xx)
         return xx
 
-    def _not_too_wide(self, xx: Any) -> None:
+    def _refuse_wide_angle(self, xx: Any) -> None:
         if isinstance(xx, Symbol):
             self.positive.append(self.subtract(_WIDEST, xx))
 
     def _sine(self, x: Any) -> Any:
-        return x * self._series(self._angle(x), 1) if isinstance(x, Symbol) else math.sin(x)
+        return x * self._series(self._checked_angle(x), 1) if isinstance(x, Symbol) else math.sin(x)
 
     def _cosine(self, x: Any) -> Any:
-        return self._series(self._angle(x), 0) if isinstance(x, Symbol) else math.cos(x)
+        return self._series(self._checked_angle(x), 0) if isinstance(x, Symbol) else math.cos(x)
 
     def _rate_factors(self, xx: Any, s: Any) -> tuple[Any, ...]:
         """As `control.rate_factors`, without its branch."""
-        self._not_too_wide(xx)
+        self._refuse_wide_angle(xx)
         a, b = self._series(xx, 2), self._series(xx, 3)
         twice = s + s
         return a, b, twice * self._series(xx, 2, 1), twice * self._series(xx, 3, 1)
@@ -255,10 +255,10 @@ class Trace:
         index = next(self._numbers)
         return x if x in (0.0, 1.0) else self.symbol("uniform", index)
 
-    def _plain(self, function: Dispatcher) -> Callable[..., Any]:
+    def _as_plain_python(self, function: Dispatcher) -> Callable[..., Any]:
         """The function, and all that it calls, as plain Python functions with mathematics for symbols."""
         some = lambda operation, plain: (  # noqa: E731
-            lambda a, b: self.symbol(operation, a, b) if _any(a, b) else plain(a, b)
+            lambda a, b: self.symbol(operation, a, b) if _has_symbol(a, b) else plain(a, b)
         )
         mathematics = SimpleNamespace(
             sqrt=self.root, sin=self._sine, cos=self._cosine, nan=math.nan, inf=math.inf
@@ -344,8 +344,8 @@ class FlightTrace(Trace):
 
     def _with_symbols(self, problem: Problem) -> Problem:
         parts: dict[str, dict[str, Any]] = {}
-        there = _there(problem, self._values)
-        for name, index, x in _places(problem):
+        there = _is_nonzero(problem, self._values)
+        for name, index, x in _number_places(problem):
             zero = not there.get(name, True)
             made = [0.0 if zero else self.symbol("uniform", index + k) for k in range(np.size(x))]
             part, field = name.split(".")
@@ -370,13 +370,13 @@ class FlightTrace(Trace):
     def _gauge(self, p: Problem, w: Any, order: Ints) -> list[Any]:
         n, m = len(p.vehicles.m), len(order)
         values = np.full(5 * n + 2 * m, 0.0, dtype=object)
-        self._plain(gauge.read_gauge)(p, w, values)
+        self._as_plain_python(gauge.read_gauge)(p, w, values)
         places = np.arange(len(values))
         places[3 * n : 3 * n + 2 * m] = np.concatenate([3 * n + order, 3 * n + m + order])
         return values[np.argsort(places)].tolist()
 
 
-def _places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
+def _number_places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
     """Name, place among `numbers` and value of each number, and of each array of numbers."""
     index = 0
     values = (*_numbers_of(problem), *_arrays_of(problem))
@@ -389,13 +389,13 @@ def _places(problem: Problem) -> Iterator[tuple[str, int, Any]]:
 _PLACES: dict[tuple[int, int], dict[str, slice]] = {}
 
 
-def _there(problem: Problem, values: Floats) -> dict[str, bool]:
+def _is_nonzero(problem: Problem, values: Floats) -> dict[str, bool]:
     """Whether numbers that may be zero are not zero in all of eight problems."""
     size = len(problem.vehicles.m), len(problem.graph.edges)
     if size not in _PLACES:
         _PLACES[size] = {
             name: slice(index, index + np.size(x))
-            for name, index, x in _places(problem)
+            for name, index, x in _number_places(problem)
             if name in _MAY_BE_ZERO
         }
     return {name: bool(values[place].any()) for name, place in _PLACES[size].items()}
@@ -418,7 +418,7 @@ def flight_structure(problem: Problem, values: Floats, moves: Sequence[bool]) ->
     damps = values[_NUMBERS.index("law.k_def")].astype(bool)
     if damps.any() and not damps.all():
         raise UnfitError("problems that take different branches")
-    there = [*_there(problem, values).values(), *moves]
+    there = [*_is_nonzero(problem, values).values(), *moves]
     kinds = law.solver, law.iterations, problem.reference.kind, control.kind, disturbance.active
     tables = [len(x) > 0 for x in (disturbance.gust, disturbance.noise_r, disturbance.noise_v)]
     pairs = graph.edges.tobytes(), graph.pairs.tobytes()
@@ -455,14 +455,14 @@ class Code:
         needed = self._collect([*self.positive, *self.outputs])
         last = self._collect(self.gauge)
         self.before = [x for x in needed + last if x.known == UNIFORM]
-        self.moment = _in_order(x for x in needed + last if UNIFORM < x.known < STATE)
-        self.lines = _in_order(x for x in needed if x.known == STATE)
-        self.last = _in_order(x for x in last if x.known == STATE)
+        self.moment = _operations_in_order(x for x in needed + last if UNIFORM < x.known < STATE)
+        self.lines = _operations_in_order(x for x in needed if x.known == STATE)
+        self.last = _operations_in_order(x for x in last if x.known == STATE)
         of_state = [x for line in self.lines + self.last for x in line.arguments]
         of_state += self.outputs + self.gauge + self.positive
-        self.known = _distinct(of_state, range(FLIGHT, STATE))
+        self.known = _distinct_symbols(of_state, range(FLIGHT, STATE))
         used = of_state + [x for line in self.moment for x in line.arguments]
-        self.inputs = _distinct(used, range(UNIFORM, FLIGHT))
+        self.inputs = _distinct_symbols(used, range(UNIFORM, FLIGHT))
 
     def _collect(self, wanted: Sequence[Any]) -> list[Symbol]:
         """Everything new that symbols need, each after its arguments; without recursion, because chains are long."""
@@ -482,12 +482,12 @@ class Code:
         return symbols
 
 
-def _in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
+def _operations_in_order(symbols: Iterable[Symbol]) -> list[Symbol]:
     """Those that are no sources, in the order in which the kernel computes them."""
     return sorted((x for x in symbols if x.operation not in SOURCES), key=lambda x: x.serial)
 
 
-def _distinct(values: Iterable[Any], known: range) -> list[Symbol]:
+def _distinct_symbols(values: Iterable[Any], known: range) -> list[Symbol]:
     """The different symbols among values of which so much is known."""
     symbols = (x for x in values if isinstance(x, Symbol) and x.known in known)
     return list({x.serial: x for x in symbols}.values())
@@ -503,7 +503,7 @@ def structure(problem: Problem) -> tuple[bytes, Floats, Ints]:
     others: list[Any] = [problem.has_frame, problem.body_formulation, problem.external]
     used = _parts_in_use(problem)
     for name in _PARTS:
-        _sort_out(getattr(used, name), numbers, others)
+        _separate_numbers(getattr(used, name), numbers, others)
     # By a dictionary: for some hundred numbers, sorting arrays takes several times as long.
     rank: dict[float, int] = {}
     which = [rank.setdefault(x, len(rank)) for x in np.concatenate(numbers).tolist()]
@@ -551,11 +551,11 @@ def _parts_in_use(problem: Problem) -> Problem:
     )
 
 
-def _sort_out(x: Any, numbers: list[Floats], others: list[Any]) -> None:
+def _separate_numbers(x: Any, numbers: list[Floats], others: list[Any]) -> None:
     """List the real numbers of a part, and separately everything else, including the shapes of arrays."""
     if isinstance(x, tuple):
         for field in x:
-            _sort_out(field, numbers, others)
+            _separate_numbers(field, numbers, others)
     elif isinstance(x, np.ndarray) and x.dtype == np.float64:
         numbers.append(x.ravel())
         others.append(x.shape)
@@ -565,9 +565,9 @@ def _sort_out(x: Any, numbers: list[Floats], others: list[Any]) -> None:
         others.append(x.tolist() if isinstance(x, np.ndarray) else x)
 
 
-def _is(x: Any, number: float) -> bool:
+def _is_number(x: Any, number: float) -> bool:
     return not isinstance(x, Symbol) and x == number
 
 
-def _any(*values: Any) -> bool:
+def _has_symbol(*values: Any) -> bool:
     return any(isinstance(x, Symbol) for x in values)

@@ -8,7 +8,7 @@ from rigidfleet.kernel.records import Order, Pattern
 from rigidfleet.typing import Ints
 
 
-def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
+def prepare_order(steps: Ints, edges: NDArray[np.integer]) -> Order:
     """Prepare an order from steps (N, 4), an agent and its edges (-1: none), and edges (m, 2)."""
     agent, edge = steps[:, 0], np.maximum(steps[:, 1:], 0)
     ends = edges[edge].astype(np.int64)
@@ -18,8 +18,8 @@ def order(steps: Ints, edges: NDArray[np.integer]) -> Order:
     return Order(narrow(agent), narrow(edge), narrow(other), np.where(first, 1, -1).astype(np.int8))
 
 
-def pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
-    """Pattern of L with agents eliminated in ``order`` (N,).
+def fill_pattern(n: int, edges: NDArray[np.integer], order: Ints, most: float) -> Pattern:
+    """Pattern of L with agents eliminated in ``prepare_order`` (N,).
 
     If there are more than ``most`` blocks per agent, fill is omitted: the pattern is that of K.
     """

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rigidfleet.kernel.engine.native import call_large
-from rigidfleet.kernel.large.ordering import pattern
+from rigidfleet.kernel.large.ordering import fill_pattern
 from rigidfleet.kernel.problem import ITERATED, ConstraintLaw, Vehicles, Workspace, workspace
 from rigidfleet.kernel.records import LOST_PIVOT, Order, Pattern
 from rigidfleet.typing import Edges, Floats, Ints
@@ -90,7 +90,7 @@ class LargeSolver:
         # Not needed as long as elimination succeeds
         self.pattern: Pattern | None = None
         self.pulled = True  # whether the workspace has the multipliers of the last evaluation
-        self._calls = [_callable(method) for method in (self._solve, self._pull)]
+        self._calls = [_callable(method) for method in (self._solve, self._find_multipliers)]
         self.address, self.multipliers = (
             int(ctypes.cast(call, ctypes.c_void_p).value or 0) for call in self._calls
         )
@@ -108,9 +108,9 @@ class LargeSolver:
             self.error = error
         self._fail()
 
-    def _pull(self) -> None:
+    def _find_multipliers(self) -> None:
         try:
-            self.pull()
+            self.find_multipliers()
         except BaseException as error:
             self.error = error
             self._fail()
@@ -120,7 +120,7 @@ class LargeSolver:
         self.pulled = True
 
     @cached_property
-    def aside(self) -> LargeSolver:
+    def solver_for_thread(self) -> LargeSolver:
         """Another solver of the same equations, in a workspace of its own, for another thread."""
         with_h = self.workspace.H.size > 0
         own = workspace(len(self.a), len(self.edges), with_h=with_h, large=True)
@@ -144,22 +144,22 @@ class LargeSolver:
             if not self.pulled:
                 return
             self.counts.fallbacks += 1
-        if not np.isfinite(w.b).all() or not self._on_vertex_graph():
+        if not np.isfinite(w.b).all() or not self._solve_at_agents():
             self.counts.failures += 1
             self._fail()
         elif order is not None:
             w.f_C[:] = 0.0
             call_large("apply_Jt", w.u, self.edges, w.multiplier, 1.0, w.f_C)
 
-    def pull(self) -> None:
+    def find_multipliers(self) -> None:
         """Find the multipliers of the last evaluation, if elimination has not found them yet."""
         if not self.pulled:
             self.pulled = True
             w, order = self.workspace, self.setup.elimination
             self.a[:] = w.f_C
-            call_large("pull_back", w.u, order, self.a, w.multiplier)
+            call_large("multipliers", w.u, order, self.a, w.multiplier)
 
-    def _on_vertex_graph(self) -> bool:
+    def _solve_at_agents(self) -> bool:
         """Iterated Tikhonov in the agents' coordinates, see `constraint.solve_at_agents`.
 
         The exact law uses the same solve with almost no damping. Its multipliers would be differences of large
@@ -168,7 +168,7 @@ class LargeSolver:
         w, edges, m = self.workspace, self.edges, self.vehicles.m
         if self.pattern is None:
             self._prepare()
-        self._turn()
+        self._find_rotation()
         self.rest[:] = w.b
         y, a = w.multiplier, self.a
         y[:], a[:] = 0.0, 0.0
@@ -176,7 +176,7 @@ class LargeSolver:
         for k in range(self.iterations):
             self.g[:] = 0.0
             call_large("apply_Jt", w.u, edges, self.rest, self.mbar, self.g)
-            x = self._system(k)
+            x = self._solve_system(k)
             if x is None:
                 return False
             call_large("apply_J", w.u, edges, x, -1.0, self.rest)
@@ -187,7 +187,7 @@ class LargeSolver:
         for k in range(0 if iterated else self.iterations):
             self.g[:] = m[:, None] * a
             call_large("apply_Jt", w.u, edges, y, -1.0, self.g)
-            x = self._system(self.iterations + k)
+            x = self._solve_system(self.iterations + k)
             if x is None:
                 return False
             call_large("apply_J", w.u, edges, x, self.mbar, y)
@@ -195,7 +195,7 @@ class LargeSolver:
 
     def _prepare(self) -> None:
         n, edges = len(self.a), self.edges
-        self.pattern = pattern(n, edges, self.setup.order(), _FILL)
+        self.pattern = fill_pattern(n, edges, self.setup.order(), _FILL)
         self.L, self.place = np.zeros((len(self.pattern.row), 9)), np.empty(n, dtype=np.int64)
         # Seven digits are enough for preconditioning, unless the damping of the rigid motions is tiny.
         self.kept = self.L.astype(np.float32) if self.mu > _EXACT_MU else self.L
@@ -211,7 +211,7 @@ class LargeSolver:
         # Axes of the marker agents when the factor was made; None: no factor
         self.axes: Floats | None = None
 
-    def _system(self, number: int) -> Floats | None:
+    def _solve_system(self, number: int) -> Floats | None:
         """The solution x (N, 3) of K x = g for the given system of an evaluation; None if there is none.
 
         Uses the stored factor, or a new one if it has become stale, and starts from past solutions of this system.
@@ -223,13 +223,13 @@ class LargeSolver:
         )
         self.counts.solves += 1
         m, mbar, mu = self.vehicles.m, self.mbar, self.mu
-        call_large("project", w.u, self.edges, m, mbar, mu, self.g, past, self.gram, x)
+        call_large("project_on_solutions", w.u, self.edges, m, mbar, mu, self.g, past, self.gram, x)
         while True:
             new = self.axes is None or self.wasted > self.worth
             if new:
-                self._renew()
+                self._renew_factor()
             most = _MOST if new else 4 * max(_RENEW, self.fresh)
-            taken = self._gradients(x, within, most)
+            taken = self._conjugate_gradients(x, within, most)
             if new:
                 self.fresh, self.wasted = max(taken, 1), 0.0
             elif taken > max(_RENEW, _STALE * self.fresh):
@@ -246,7 +246,7 @@ class LargeSolver:
             if taken > _MOST or not np.isfinite(x).all():
                 x[:] = 0.0
 
-    def _gradients(self, x: Floats, within: float, most: int) -> int:
+    def _conjugate_gradients(self, x: Floats, within: float, most: int) -> int:
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None
         digits = "" if self.kept is self.L else "_single"
@@ -257,12 +257,12 @@ class LargeSolver:
         self.counts.iterations += min(int(taken), most)
         return int(taken)
 
-    def _turn(self) -> None:
+    def _find_rotation(self) -> None:
         """Find the rotation of the formation since the factor was made."""
         self.now = _axes(*self.workspace.r[self.marks].tolist())
         self.turned = np.eye(3) if self.axes is None else self.now.T @ self.axes
 
-    def _renew(self) -> None:
+    def _renew_factor(self) -> None:
         """Factor K at the current shape, with more damping if a factor without fill needs it."""
         w, p, m = self.workspace, self.pattern, self.vehicles.m
         assert p is not None

@@ -47,11 +47,11 @@ class Archive:
         """Store the samples of a tick; ``record`` is that of its end."""
         for piece in pieces:
             archived = self.phases.setdefault((piece.phase, len(piece.edges)), ArchivedPhase())
-            keep = self._even(piece.time)
+            keep = self._is_multiple(piece.time)
             keep[0] |= not archived.moments  # the start
-            archived.moments["end"] = np.inf, rows(piece, [-1])
+            archived.moments["end"] = np.inf, select_rows(piece, [-1])
             if keep.any():
-                archived.pieces.append(rows(piece, keep))
+                archived.pieces.append(select_rows(piece, keep))
                 self.size += _size(archived.pieces[-1])
             if len(archived.pieces) >= _JOINED and len(archived.pieces[-1].time) < _JOINED:
                 archived.pieces = [_join(archived.pieces)]
@@ -65,14 +65,14 @@ class Archive:
         pieces = []
         for archived in self.phases.values():
             every = _join([*archived.pieces, *(piece for _, piece in archived.moments.values())])
-            pieces.append(rows(every, np.unique(every.time, return_index=True)[1].tolist()))
+            pieces.append(select_rows(every, np.unique(every.time, return_index=True)[1].tolist()))
         return pieces
 
-    def begun(self, phase: int) -> bool:
+    def has_phase(self, phase: int) -> bool:
         """Whether there is a sample of a phase."""
         return any(key[0] == phase for key in self.phases)
 
-    def _even(self, time: Floats) -> Bools:
+    def _is_multiple(self, time: Floats) -> Bools:
         """Which times are multiples of the step."""
         away = time / self.step
         return np.abs(away - np.round(away)) * self.step < 1e-6
@@ -82,9 +82,9 @@ class Archive:
         self.step *= 2.0
         for archived in self.phases.values():
             whole = _join(archived.pieces)
-            keep = self._even(whole.time)
+            keep = self._is_multiple(whole.time)
             keep[0] = True  # the start
-            archived.pieces = [rows(whole, keep)]
+            archived.pieces = [select_rows(whole, keep)]
         self.size = sum(_size(archived.pieces[0]) for archived in self.phases.values())
         self.most = max(self.most, 2.0 * self.size if self.size > 0.5 * self.most else 0.0)
 
@@ -107,7 +107,7 @@ def _note_worst(moments: dict[str, tuple[float, Piece]], record: Result) -> None
             moments[name] = value, moments["end"][1]
 
 
-def rows(piece: Piece, which: Bools | list[int]) -> Piece:
+def select_rows(piece: Piece, which: Bools | list[int]) -> Piece:
     """Some samples of a piece."""
     return _combine([piece], lambda x: x[0][which])
 

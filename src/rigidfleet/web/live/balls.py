@@ -51,9 +51,9 @@ class Ball:
         away = self.goal - self.place
         far = float(np.linalg.norm(away))
         speed = min(far / _DRAWN, FASTEST)
-        self.turn(away / far * speed if far > _THERE else np.zeros(3))
+        self.set_velocity(away / far * speed if far > _THERE else np.zeros(3))
 
-    def turn(self, velocity: Floats) -> None:
+    def set_velocity(self, velocity: Floats) -> None:
         """Fly on with another velocity (3,) [m/s]."""
         if not np.array_equal(velocity, self.velocity):
             self.velocity, self.changed = velocity, True

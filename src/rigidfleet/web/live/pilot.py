@@ -20,10 +20,10 @@ from rigidfleet.planning.plan import PhasePlan
 from rigidfleet.planning.reference import Pose
 from rigidfleet.result import Result
 from rigidfleet.simulation.flight import Flight
-from rigidfleet.simulation.recording import assemble
+from rigidfleet.simulation.recording import assemble_result
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.live import balls
-from rigidfleet.web.live.archive import Archive, rows
+from rigidfleet.web.live.archive import Archive, select_rows
 from rigidfleet.web.live.balls import Ball
 
 TICK = 0.05  # time between readings of the user's commands [s]
@@ -148,7 +148,7 @@ class Pilot:
         return self.flight.phases[-1].formation or ""
 
     @property
-    def busy(self) -> bool:
+    def is_changing(self) -> bool:
         """Whether the formation is changing."""
         phase = self.commanded[-1]
         settle = _STEADY if phase.control == "open" else 0.0
@@ -163,7 +163,7 @@ class Pilot:
         self.target.move = move * min(1.0, self.fastest / speed) if speed > 0.0 else move
         self.target.turn, self.target.held = turn, self.t
 
-    def change(self, formation: str) -> None:
+    def change_formation(self, formation: str) -> None:
         """Change to another formation as soon as the current change is complete.
 
         Raises
@@ -185,7 +185,7 @@ class Pilot:
             )
         self.waiting = formation if formation != self.formation else None
 
-    def gust(self, direction: Floats, strength: float) -> None:
+    def send_gust(self, direction: Floats, strength: float) -> None:
         """Send a gust along ``direction`` (3,), at most ``strength`` [N/kg]."""
         if self.flight.ending:
             return
@@ -193,7 +193,7 @@ class Pilot:
         self.gusted = True
         self.gusts.append(Gust(self.t, float((self._positions() @ d).min()), d, strength))
 
-    def push_in(self, place: Floats, radius: float, velocity: Floats) -> Ball:
+    def add_ball(self, place: Floats, radius: float, velocity: Floats) -> Ball:
         """Add a ball at ``place`` (3,) [m] that flies with a constant velocity (3,) [m/s].
 
         Raises
@@ -201,7 +201,7 @@ class Pilot:
         ValueError
             The ball is too small, large, fast, or near a vehicle, or there are too many.
         """
-        taken = {ball.slot for ball in self.flying}
+        taken = {ball.slot for ball in self.flying_balls}
         speed = float(np.linalg.norm(velocity))
         if len(taken) >= balls.AT_ONCE:
             raise ValueError(f"there are {balls.AT_ONCE} balls already: remove one first")
@@ -227,7 +227,7 @@ class Pilot:
         return ball
 
     @property
-    def flying(self) -> list[Ball]:
+    def flying_balls(self) -> list[Ball]:
         """The balls that are there."""
         return [ball for ball in self.balls if ball.until is None]
 
@@ -239,19 +239,19 @@ class Pilot:
         ValueError
             There is none.
         """
-        for ball in self.flying:
+        for ball in self.flying_balls:
             if ball.slot == slot:
                 return ball
         raise ValueError("this ball is gone")
 
-    def pull(self, slot: int, goal: Floats | None) -> None:
+    def pull_ball(self, slot: int, goal: Floats | None) -> None:
         """Draw a ball to a goal (3,) [m], or let go of it: it stays where it is."""
         ball = self.ball(slot)
         ball.goal = goal
         if goal is None:
-            ball.turn(np.zeros(3))
+            ball.set_velocity(np.zeros(3))
 
-    def take_out(self, slot: int) -> None:
+    def remove_ball(self, slot: int) -> None:
         """Remove a ball."""
         ball = self.ball(slot)
         self.moved = True
@@ -268,7 +268,7 @@ class Pilot:
         flight = self.flight
         flight.pieces.clear()
         self.ticks += 1
-        if not self.busy:
+        if not self.is_changing:
             if self.waiting is not None:
                 self._begin_formation(self.waiting)
                 self.waiting = None
@@ -284,17 +284,17 @@ class Pilot:
             self._update_obstacles()
             t = self.t
             flight.advance(self.ticks * TICK - t)
-            for ball in self.flying:
+            for ball in self.flying_balls:
                 ball.move(self.t - t)
             if not flight.ending and (met := flight.contact()) is not None:
                 name = flight.mission.obstacles[met.other].name
                 flight.ending = f"agent {met.who + 1} met '{name}' at {met.time:.2f} s"
         if flight.pieces or self.last is None:
-            end = [rows(flight.pieces[-1], [-1])] if flight.pieces else []
+            end = [select_rows(flight.pieces[-1], [-1])] if flight.pieces else []
             # A record of one moment has no extremes
             phases = [replace(p, extremes={}) for p in self.flight.phases]
             now: dict[str, Any] = {"ending": "", "statistics": {}, "network": flight.network}
-            self.last = assemble(flight.mission, phases, end, **now)
+            self.last = assemble_result(flight.mission, phases, end, **now)
             self.last.mission = flight.mission  # with the balls, and not parsed again
             self.archive.add(flight.pieces, self.last)
         return self.last
@@ -305,7 +305,7 @@ class Pilot:
         Its mission has the phases as they were flown.
         """
         ending = self.flight.ending
-        if not ending and self.busy:
+        if not ending and self.is_changing:
             ending = f"ended by hand on the way to '{self.formation}'"
         flight, now = self.flight, self.flight.mission
         flown = [ball.flown_sphere(self.t) for ball in self.balls if ball.turns]
@@ -340,7 +340,7 @@ class Pilot:
         step = self.archive.step
         low, high = math.floor(t / step + 1e-9) + 1, math.floor(t_end / step + 1e-9) + 1
         grid = np.arange(low, high) * step
-        begun = self.archive.begun(len(self.flight.phases) - 1)
+        begun = self.archive.has_phase(len(self.flight.phases) - 1)
         start = [] if begun else [t and np.nextafter(t, math.inf)]
         return np.concatenate([start, grid[grid < t_end - 1e-9], [t_end]])
 
@@ -428,7 +428,7 @@ class Pilot:
 
     def _update_obstacles(self) -> None:
         """Tell the flight of balls that are new, gone, or fly another way."""
-        for ball in self.flying:
+        for ball in self.flying_balls:
             ball.follow_goal()
             if ball.changed:
                 ball.note_turn(self.t)

@@ -80,7 +80,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Read a request; whatever its method, refuse it unless it comes from our page."""
         if not super().parse_request():
             return False
-        if self._ours():
+        if self._is_from_our_page():
             return True
         self._answer(HTTPStatus.FORBIDDEN, "open the address that the program printed")
         return False
@@ -117,7 +117,7 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: the terminal belongs to the user."""
 
-    def _ours(self) -> bool:
+    def _is_from_our_page(self) -> bool:
         """Whether our page sends the request, to our own address; a command also names its origin."""
         hosts_named, origins = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
         hosts = {f"{name}:{self.port}" for name in (_HOST, "localhost")}
@@ -153,7 +153,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", "text/event-stream")
         self.end_headers()
-        messages = self.session.join()
+        messages = self.session.add_page()
         try:
             while True:
                 try:
@@ -168,4 +168,4 @@ class _Handler(BaseHTTPRequestHandler):
                 if not self._send(message):
                     return
         finally:
-            self.session.leave(messages)
+            self.session.remove_page(messages)

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from rigidfleet._common.plain import plain
+from rigidfleet._common.plain import to_json_data
 from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.result import Result
 from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
 from rigidfleet.web.live.guarding import with_avoidance
 from rigidfleet.web.live.pilot import TICK, Pilot
-from rigidfleet.web.replay.page import page, read
-from rigidfleet.web.replay.scene import describe, observe, sight_points, weight
+from rigidfleet.web.replay.page import page, page_text
+from rigidfleet.web.replay.scene import describe, page_samples, sight_points, weight
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -41,8 +41,8 @@ _WAITING = 64  # greatest number of messages queued for a slow page; further one
 class Session:
     """One flight by hand, and the pages that show it.
 
-    `run` flies in real time while a page is open, until `stop`; other threads call `command`, `join`
-    and `leave`. Each flight that a page has shown is passed to ``landed`` when it ends, which returns the
+    `run` flies in real time while a page is open, until `stop`; other threads call `command`, `add_page`
+    and `remove_page`. Each flight that a page has shown is passed to ``landed`` when it ends, which returns the
     text that the pages then show.
     """
 
@@ -66,7 +66,7 @@ class Session:
         self.pilot = Pilot(self.mission)
         self.flights += 1
         self.result = self.pilot.step()
-        columns = observe(self.result, self.shown, self.tension)
+        columns = page_samples(self.result, self.shown, self.tension)
         start = self.mission.fleet.position
         ends = start.min(axis=0) - _AROUND, start.max(axis=0) + _AROUND
         near = sight_points(self.mission, *ends)
@@ -105,10 +105,10 @@ class Session:
     def html(self) -> str:
         """The page."""
         with self.lock:
-            info = self.info | self.story()
-        return page(info, start="live/live.js", style=read("live/live.css"), connect="'self'")
+            info = self.info | self.page_state()
+        return page(info, start="live/live.js", style=page_text("live/live.css"), connect="'self'")
 
-    def story(self) -> dict[str, Any]:
+    def page_state(self) -> dict[str, Any]:
         """Information that changes only now and then."""
         pilot = self.pilot
         return {
@@ -119,8 +119,8 @@ class Session:
             "ending": pilot.flight.ending,
             "formation": pilot.formation,
             "waiting": pilot.waiting,
-            "busy": pilot.busy,
-            "balls": [{"slot": b.slot, "name": b.name} for b in pilot.flying],
+            "busy": pilot.is_changing,
+            "balls": [{"slot": b.slot, "name": b.name} for b in pilot.flying_balls],
             "held_off": pilot.held_off,
             "paused": self.paused,
             "speed": self.speed,
@@ -128,16 +128,16 @@ class Session:
             "flight": self.flights,
         }
 
-    def join(self) -> queue.Queue[bytes | None]:
+    def add_page(self) -> queue.Queue[bytes | None]:
         """A page's messages: events of a stream, None at the end."""
         messages: queue.Queue[bytes | None] = queue.Queue(_WAITING)
         with self.lock:
             self.pages.add(messages)
             self.left = math.inf
-            messages.put(_event("story", json.dumps(plain(self.story()))))
+            messages.put(_event("story", json.dumps(to_json_data(self.page_state()))))
         return messages
 
-    def leave(self, messages: queue.Queue[bytes | None]) -> None:
+    def remove_page(self, messages: queue.Queue[bytes | None]) -> None:
         """Remove a page that was closed."""
         with self.lock:
             self.pages.discard(messages)
@@ -153,10 +153,10 @@ class Session:
     def _sample_event(self) -> bytes:
         """The last sample as numbers: time and the columns of the page, one after the other."""
         target, balls = self.pilot.target, np.full((AT_ONCE, 4), np.nan)
-        for ball in self.pilot.flying:
+        for ball in self.pilot.flying_balls:
             balls[ball.slot] = *ball.place, ball.radius
         pose = np.concatenate([target.r, att.quaternion_from_dcm(target.attitude)])
-        samples = observe(self.result, self.shown, self.tension)
+        samples = page_samples(self.result, self.shown, self.tension)
         values = {name: c.values.ravel() for name, c in samples.items()}
         values |= {"time": self.result.time[-1:], "target": pose, "balls": balls.ravel()}
         names = ["time", *(column["name"] for column in self.info["columns"])]
@@ -178,21 +178,21 @@ class Session:
                 case {"move": move, "turn": turn}:
                     self.pilot.steer(_vector(move, _FASTEST), _vector(turn, _TURNING))
                 case {"formation": str(name)} if name in self.pilot.formations:
-                    self.pilot.change(name)
+                    self.pilot.change_formation(name)
                 case {"gust": direction, "strength": strength}:
                     strength = _number(strength, _STRONGEST)
                     direction = _vector(direction, 1.0)
                     if not np.linalg.norm(direction) > 0.0:  # the square of a tiny one is 0
                         raise ValueError("a gust needs a direction")
-                    self.pilot.gust(direction, strength)
+                    self.pilot.send_gust(direction, strength)
                 case {"ball": place, "radius": radius, "velocity": velocity}:
                     place, velocity = _vector(place, _FARTHEST), _vector(velocity, _FASTEST)
-                    self.pilot.push_in(place, _number(radius, _FARTHEST), velocity)
+                    self.pilot.add_ball(place, _number(radius, _FARTHEST), velocity)
                 case {"pull": int(slot), "to": place}:
                     goal = None if place is None else _vector(place, _FARTHEST)
-                    self.pilot.pull(slot, goal)
+                    self.pilot.pull_ball(slot, goal)
                 case {"remove": int(slot)}:
-                    self.pilot.take_out(slot)
+                    self.pilot.remove_ball(slot)
                 case {"loss": share}:
                     self.pilot.flight.lose(min(abs(_number(share, 0.95)), 0.95))
                 case {"pause": bool(paused)}:
@@ -223,9 +223,9 @@ class Session:
                 with self.lock:
                     self.land()
             finally:
-                self._say_goodbye()
+                self._close_pages()
 
-    def _say_goodbye(self) -> None:
+    def _close_pages(self) -> None:
         with self.lock:
             for messages in self.pages:
                 with messages.mutex:
@@ -253,12 +253,12 @@ class Session:
                     self._send_to_pages(self._sample_event())
                 else:
                     self.pace = 1.0
-                story = self.story()
+                story = self.page_state()
             # The end of the phase under way moves all the time; it alone is no reason to send an update.
             news = story | {"phases": len(story["phases"])}
             if news != sent:
                 sent = news
-                self._send_to_pages(_event("story", json.dumps(plain(story))))
+                self._send_to_pages(_event("story", json.dumps(to_json_data(story))))
             due = max(due + TICK / self.speed, now - _LATE)
             self.stopped.wait(max(0.0, due - time.monotonic()))
 

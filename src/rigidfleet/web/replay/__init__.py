@@ -19,11 +19,11 @@ from rigidfleet._common.files import write_file
 from rigidfleet.math.piecewise import piece_at
 from rigidfleet.plotting.logged import off_plan
 from rigidfleet.result import Result, as_result
-from rigidfleet.result.lights import has_lights, view
+from rigidfleet.result.lights import has_lights, view_angles
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import page
-from rigidfleet.web.replay.scene import describe, observe, sight_points, typical_reach, weight
+from rigidfleet.web.replay.scene import describe, page_samples, sight_points, typical_reach, weight
 
 __all__ = ["Replay", "html_page", "replay"]
 
@@ -95,7 +95,7 @@ def html_page(result: Result) -> str:
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
     scale = weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
-    columns, swarm = observe(result, shown, tension), result.n_agents > _SWARM
+    columns, swarm = page_samples(result, shown, tension), result.n_agents > _SWARM
     if swarm:  # dots have neither attitudes nor slots
         columns = {k: c for k, c in columns.items() if k not in _SHAPES}
     described, data = pack(
@@ -106,7 +106,7 @@ def html_page(result: Result) -> str:
     )
     info = describe(result, shown, tension) | _story(result, time)
     if has_lights(result):
-        azimuth, elevation = view(result)
+        azimuth, elevation = view_angles(result)
         info |= {"night": True, "azimuth": azimuth, "elevation": elevation}
     info |= {"columns": described, "count": len(time), "beyond": most > tension}
     info |= {"note": _note(result, shown, tension, most), "swarm": swarm}

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from importlib import resources
 from typing import Any
 
-from rigidfleet._common.plain import plain
+from rigidfleet._common.plain import to_json_data
 from rigidfleet._common.templates import templates
 from rigidfleet.web.policy import content_policy
 
@@ -30,7 +30,7 @@ def page(
     style : CSS in addition to that of every page
     connect : hosts that the page may connect to; see `content_policy`
     """
-    style = read("replay/page.css") + style
+    style = page_text("replay/page.css") + style
     script = bundle(start)
     template = templates("rigidfleet.web.replay", "").get_template("page.html")
     return template.render(
@@ -38,7 +38,7 @@ def page(
         title=f"{info['name']} – rigidfleet",
         style=style,
         # No markup inside: a user's text must not end the script.
-        info=json.dumps(plain(info), ensure_ascii=False).replace("<", "\\u003c"),
+        info=json.dumps(to_json_data(info), ensure_ascii=False).replace("<", "\\u003c"),
         data=data,
         script=script,
     )
@@ -55,7 +55,7 @@ def bundle(start: str) -> str:
     def parts(name: str) -> Iterator[str]:
         if name not in seen:
             seen.add(name)
-            text = read(name)
+            text = page_text(name)
             for target in _IMPORT.findall(text):
                 yield from parts(
                     posixpath.normpath(posixpath.join(posixpath.dirname(name), target))
@@ -65,6 +65,6 @@ def bundle(start: str) -> str:
     return "\n".join(parts(start))
 
 
-def read(name: str) -> str:
+def page_text(name: str) -> str:
     """Text of a file below the package of the pages."""
     return (resources.files("rigidfleet.web") / name).read_text(encoding="utf-8")

@@ -101,7 +101,7 @@ def _areas(mission: Mission) -> list[dict[str, Any]]:
     ]
 
 
-def observe(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
+def page_samples(result: Result, shown: Ints, tension: float) -> dict[str, PackedColumn]:
     """Samples for the page, at the result's times; ``shown`` are the edges drawn."""
     mission = result.mission
     # Fine enough for a vehicle that fills the screen.
