@@ -134,7 +134,7 @@ class _Screen:
     def __init__(self) -> None:
         self.console = err()
         self.progress: Progress | None = None
-        self.begun = self.told = perf_counter()
+        self.begun = self.shown_at = perf_counter()
         self.cold = False
         self.still = threading.Event()
         self.animation = threading.Thread(target=self._animate, daemon=True)
@@ -188,11 +188,11 @@ class _Screen:
         """Show the progress; without animation as a line, if the last line was long ago."""
         if self.progress is not None:
             self.progress.update(self.task, total=total, completed=done)
-            if self.still.is_set() and now - self.told > _OFTEN:
-                self.told = now
+            if self.still.is_set() and now - self.shown_at > _OFTEN:
+                self.shown_at = now
                 self.progress.refresh()
-        elif now - self.told > _SELDOM:
-            self.told = now
+        elif now - self.shown_at > _SELDOM:
+            self.shown_at = now
             self.console.print(self._words())
 
     def _words(self) -> str:

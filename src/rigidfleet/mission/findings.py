@@ -20,7 +20,7 @@ Keys = tuple[str | int, ...]
 P = TypeVar("P", bound=Part)
 
 #: Maximum number of findings of one kind that are listed; the others are counted.
-_TOLD = 8
+_MOST_OF_A_KIND = 8
 _UNKNOWN = "unknown key"
 _NONE: dict[str, Any] = {}
 #: Stands for any index of a list.
@@ -41,7 +41,7 @@ class FindingCollector:
         self.data = data
         self.origin = origin
         self._findings: dict[tuple[str, str], Finding] = {}
-        self._told: Counter[Keys] = Counter()
+        self._counts: Counter[Keys] = Counter()
         self._wrong: set[Keys] = set()
 
     @property
@@ -52,11 +52,11 @@ class FindingCollector:
                 self.origin,
                 _key_path(kind),
                 None,
-                f"{n - _TOLD:,} more of this kind",
+                f"{n - _MOST_OF_A_KIND:,} more of this kind",
                 "correct all of them",
             )
-            for kind, n in self._told.items()
-            if n > _TOLD
+            for kind, n in self._counts.items()
+            if n > _MOST_OF_A_KIND
         ]
         return [*self._findings.values(), *more]
 
@@ -68,15 +68,15 @@ class FindingCollector:
             return
         kind = _counting_key(path, problem)
         if problem == _UNKNOWN or _ANY in kind:
-            self._told[kind] += 1
-            if self._told[kind] > _TOLD:
+            self._counts[kind] += 1
+            if self._counts[kind] > _MOST_OF_A_KIND:
                 return
         shown = value[0] if value else look_up(self.data, path)
         self._findings[key, problem] = Finding(self.origin, key, shown, problem, remedy)
 
     def add_unknown_key(self, path: Keys, known: Iterable[str]) -> None:
         """Record an unknown key of a table. Only the first ones get a suggestion, as finding one takes long."""
-        guess = self._told[_counting_key(path, _UNKNOWN)] < _TOLD
+        guess = self._counts[_counting_key(path, _UNKNOWN)] < _MOST_OF_A_KIND
         self.add(path, *(unknown_key(path[-1], known) if guess else (_UNKNOWN, "")))
 
     def is_valid(self, path: Keys, *keys: str) -> bool:

@@ -133,7 +133,7 @@ class ActivePhase:
             self.lost = plan.before.lost
         self.parted = plan.links_lost[1] <= plan.start  # (L,) links that are lost
         self.next_loss = self._loss_ahead()  # of a vehicle or a link [s]
-        self.asked = 0  # number of calls of the user's controller
+        self.control_calls = 0  # number of calls of the user's controller
         self.held: Problem | None = None  # with the controller's force
         # Evaluations, steps and rejections before a loss.
         self.counted = np.zeros(3, dtype=np.int64)
@@ -197,11 +197,13 @@ class ActivePhase:
         start = 0.0 if self.stepper.by_ticks else self.plan.start
         while self.t < t_end:
             # Control instants are the start of the phase and multiples since, not the ends of its segments.
-            if self.held is None or self.t >= start + self.asked / rate:
+            if self.held is None or self.t >= start + self.control_calls / rate:
                 self.held = self._problem_under_controller(controller)
                 # Instants that differ by a rounding error, far less than a millionth of a period, are one.
-                self.asked = max(self.asked, math.floor((self.t - start) * rate + 1e-6)) + 1
-            self._integrate(self.held, min(start + self.asked / rate, t_end))
+                self.control_calls = (
+                    max(self.control_calls, math.floor((self.t - start) * rate + 1e-6)) + 1
+                )
+            self._integrate(self.held, min(start + self.control_calls / rate, t_end))
 
     def _problem_under_controller(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""

@@ -39,12 +39,12 @@ def mission_as_flown(
     if pushed:
         tables = [thing.model_dump(mode="json", exclude_unset=True) for thing in pushed]
         data["obstacles"] = [*own, *tables]
-    as_given = dict(data)
+    original = dict(data)
     data |= _data_as_flown(mission, data, begun, records, step)
     try:
         return mission.rewritten(data, "<dict>"), records
     except MissionError:
-        return mission.rewritten(as_given, "<dict>"), records
+        return mission.rewritten(original, "<dict>"), records
 
 
 def phase_of_table(

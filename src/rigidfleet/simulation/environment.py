@@ -164,12 +164,12 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
 
     def answer(self, view: View, action: Sequence[float] | Vector) -> tuple[Floats, Floats]:
         """Force [N] and message of a vehicle by an action."""
-        asked_for = np.minimum(np.maximum(np.asarray(action, dtype=float), -1.0), 1.0)
-        a = self.acceleration * asked_for[:3]
+        clipped = np.minimum(np.maximum(np.asarray(action, dtype=float), -1.0), 1.0)
+        a = self.acceleration * clipped[:3]
         if not math.isnan(view.reference_acceleration[0]):
             a += view.reference_acceleration
         a[2] += view.gravity
-        return view.mass * a, np.concatenate([view.position, view.velocity, asked_for[3:]])
+        return view.mass * a, np.concatenate([view.position, view.velocity, clipped[3:]])
 
     def _act(self, view: View) -> tuple[Floats, Floats]:
         return self.answer(view, self._actions[self.possible_agents[view.agent]])

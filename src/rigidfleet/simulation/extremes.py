@@ -438,8 +438,8 @@ class Extremes(CurveWatch):
             self._thread = ThreadPoolExecutor(1)
         self._taking = self._thread.submit(self._take_aside, problem, work, taken)
 
-    def _take_aside(self, *given: Any) -> None:
-        self.take_steps(*given, last=False)
+    def _take_aside(self, *arguments: Any) -> None:
+        self.take_steps(*arguments, last=False)
         packing.forget_last_packed()  # the phase may be over before this thread packs others
 
     def wait(self) -> None:

@@ -259,8 +259,8 @@ class Flight:
         self._built_in = controller is None and agent is None  # whether the mission's own laws fly
         self.external = ExternalForce(force, mission.n_agents) if force is not None else None
         self._push = External(self.external.address, float(max_step)) if self.external else External()  # fmt: skip
-        asked_for = None if times is None else requested_times(times, mission.latest_end)
-        self.sampler = sampler or Sampling(mission.output_step, asked_for).times_between
+        own_times = None if times is None else requested_times(times, mission.latest_end)
+        self.sampler = sampler or Sampling(mission.output_step, own_times).times_between
         self.flips = flips
         self._reached = state_at_start(mission)
         self._vehicles = (
@@ -275,7 +275,7 @@ class Flight:
             None  # the phase before, if its last state is not known yet
         )
         self._t = 0.0  # end of the phase before [s]
-        self._asked: list[Phase] = []  # each phase as it was begun
+        self._phases_begun: list[Phase] = []  # each phase as it was begun
         self._cut: set[int] = set()  # phases left before their end
         self._finished = False
         self._route = list(mission.phases)  # phases to fly; after a loss, those that it asks for
@@ -369,16 +369,18 @@ class Flight:
         elif isinstance(phase, Mapping):  # no phase yet
             # Checked first: a phase under way goes on where it has errors.
             flown = len(self.phases) - (self._active is not None and not self._active.flew)
-            phase = phase_of_table(self.mission, self._asked[:flown], self.phases[:flown], phase)
+            phase = phase_of_table(
+                self.mission, self._phases_begun[:flown], self.phases[:flown], phase
+            )
         else:
             check_formation(self.mission, phase)
         self._leave_phase(changed=True)
         if self.mission.on_loss == "continue" or not self._is_current_of_route(phase):
             self._state_now.blend = None
-        if self._asked:
+        if self._phases_begun:
             self._report(phase, planning=True)
         try:
-            leg = timed_leg(self.mission, phase, self._state_now, len(self._asked))
+            leg = timed_leg(self.mission, phase, self._state_now, len(self._phases_begun))
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
@@ -399,7 +401,7 @@ class Flight:
         except StoppedError as stop:
             self.ending = str(stop)
             return False
-        self._asked.append(phase)
+        self._phases_begun.append(phase)
         if self.mission.abandons_at < math.inf:
             self._plans.append(plan)
         # Nobody asks a controller of the user's to follow the plan.
@@ -530,8 +532,8 @@ class Flight:
         if not self.pieces:
             raise FlightError(self.ending or "the flight ended before the first time to record")
         route = tuple(self._route)
-        last = len(self._asked) - 1
-        own = tuple(self._asked) == route[: last + 1] and self._cut <= {last}
+        last = len(self._phases_begun) - 1
+        own = tuple(self._phases_begun) == route[: last + 1] and self._cut <= {last}
         whole = own and last + 1 == len(route) and not self._cut
         if own and not whole and not self.ending:
             self.ending = f"ended at t = {self.t:.2f} s, before the mission's end"
@@ -539,7 +541,7 @@ class Flight:
         if self._ended is not None:  # no phase follows
             self._ended.release()
             self._ended = None
-        return self.record(self.pieces, None if own else self._asked)
+        return self.record(self.pieces, None if own else self._phases_begun)
 
     @property
     def network(self) -> tuple[Links, Mail] | None:
@@ -641,7 +643,7 @@ class Flight:
 
         Phases begun by hand go on: who began them decides.
         """
-        routed = self._is_current_of_route(self._asked[-1])
+        routed = self._is_current_of_route(self._phases_begun[-1])
         return self.mission.abandons_at if routed and not self._reacted else math.inf
 
     def _is_current_of_route(self, phase: Phase) -> bool:
@@ -659,8 +661,8 @@ class Flight:
         legs = self._answer.legs
         if legs:
             self._reached = legs[0].before
-        self._route = [*self._asked, *(leg.phase for leg in legs)]
-        self._following = len(self._asked)
+        self._route = [*self._phases_begun, *(leg.phase for leg in legs)]
+        self._following = len(self._phases_begun)
 
     def _whole_plan(self) -> list[Leg]:
         """The legs of the phases begun, and of those of the route that were to follow."""
@@ -682,8 +684,8 @@ class Flight:
             return
         self._active = None
         if not active.flew:  # as if it had never begun: if it is the mission's, it is still to come
-            self._following -= self._is_current_of_route(self._asked[-1])
-            del self.phases[-1], self._asked[-1], self._plans[-1:]
+            self._following -= self._is_current_of_route(self._phases_begun[-1])
+            del self.phases[-1], self._phases_begun[-1], self._plans[-1:]
             return
         if not (active.has_settled or active.over or abandoned):
             self._cut.add(len(self.phases) - 1)
@@ -714,7 +716,7 @@ class Flight:
 
     def _check_frame(self, plan: PhasePlan) -> None:
         """Stop if the formation has flipped: its slots no longer agree with the body frame."""
-        both = {plan.phase.control, *(phase.control for phase in self._asked[-1:])}
+        both = {plan.phase.control, *(phase.control for phase in self._phases_begun[-1:])}
         now = self._state_now
         if self.flips or both != {"body"} or now.frame is None or plan.frame is None:
             return
