@@ -693,7 +693,9 @@ class Flight:
         record = self.phases[-1]
         record.extremes = self._extremes.end_phase()
         record.abandoned = abandoned
-        record.controller = None if self._built_in else self.controller is None or active.asked > 0
+        record.controller = (
+            None if self._built_in else self.controller is None or active.control_calls > 0
+        )
         if active.stepper.delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.has_settled
