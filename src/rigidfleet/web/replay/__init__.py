@@ -180,7 +180,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
         "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,
     }
     if (off := off_plan(result)) is not None:
-        story["drifts"] = [x._asdict() for x in off.drifts(result.time)]
+        story["drifts"] = [x._asdict() for x in off.drift_spans(result.time)]
         story["off"] = off.limit
     if not np.isfinite(result.mission.ground):
         # A grid to see motion against; high above the ground, it moves along with the flight.
