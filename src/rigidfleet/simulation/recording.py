@@ -205,7 +205,7 @@ def assemble_result(
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = []
     if len(states) == len(pieces):
         r, v = (np.concatenate(parts) for parts in zip(*states, strict=True))
-        now = {"position": r, "velocity": v}
+        now = {"position": r.copy(), "velocity": v}  # what is computed later is of what was flown
         later = [(names, recorded), (CLOSE, partial(distances, mission, worst, r, time))]
     else:
         made = recorded()
