@@ -476,7 +476,7 @@ def test_who_watches_a_large_formation_does_not_change_what_is_found(solver, mon
     assert len(threads) > 1, "each phase's last steps are taken here"
 
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
-        extremes.take(problem, work, state, last=False)
+        extremes.take_steps(problem, work, state, last=False)
 
     monkeypatch.setattr(watching.Extremes, "hand_over", take_here)
     for one, other in ((aside, simulate(mission)), (looked, flown())):
@@ -502,7 +502,7 @@ def test_no_step_is_overwritten_before_it_has_been_watched(monkeypatch):
         take(*given, **options)
 
     def take_here(extremes: Any, problem: Any, work: Any, state: Any) -> None:
-        extremes.take(problem, work, state, last=False)
+        extremes.take_steps(problem, work, state, last=False)
 
     monkeypatch.setattr(watching.Extremes, "take_steps", take_slowly)
     aside = flown()

@@ -1086,8 +1086,8 @@ def test_matplotlib_waits_until_something_is_drawn():
     code = (
         "import sys, rigidfleet.plotting as f\n"
         "assert 'matplotlib' not in sys.modules\n"
-        "from rigidfleet.plotting.style import settings\n"
-        "with settings(): pass\n"
+        "from rigidfleet.plotting.style import apply_style\n"
+        "with apply_style(): pass\n"
         "import matplotlib.figure, mpl_toolkits.mplot3d.art3d\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"
     )

@@ -210,7 +210,7 @@ def test_by_body():
     assert pilot.flight.phases[-1].control == "body"
     np.testing.assert_allclose(records[-1].cm[0], pilot.target.r, atol=1e-3)
     assert worst(records, "constraint") < 1e-3
-    pilot.change("line")
+    pilot.change_formation("line")
     flown(pilot, 6.0)
     assert pilot.formation == "line"
     assert pilot.flight.ending == ""

@@ -389,7 +389,7 @@ def test_named_frameworks_of_pyrigi(pyrigi, name, arguments, rigidity_class):
     result = analyse(slots, edges, space=framework.dim)
     assert result.rigidity_class is rigidity_class
     assert len(result.flexes) == len(framework.inf_flexes(numerical=True))
-    assert len(edges) - result.rank == len(framework.stress_dimension(numerical=True))
+    assert len(edges) - result.rank == len(framework.stresses(numerical=True))
     assert (result.rigidity_class is RIGID) == framework.is_inf_rigid(numerical=True)
     if rigidity_class is not UNDECIDED and result.flexes:
         assert (rigidity_class is STABLE) == framework.is_prestress_stable(numerical=True)

@@ -438,7 +438,7 @@ def test_a_flight_goes_on_under_another_problem():
     other, wide, *_ = planned("cube-passage", 1, SIH)
     m = len(wide.c)
     assert m != len(work.c)
-    with pytest.raises(ValueError, match=r"fleet\.under_problem"):
+    with pytest.raises(ValueError, match=r"fleet\.state_under_problem"):
         sampled.fly_ticks(other, wide, flight, state, fleet.segment(8, m, flight.start + 0.2))
     state = fleet.state_under_problem(state, wide, np.full(m, 0.01))
     fly(other, wide, flight, state, flight.start + 0.2)

@@ -55,7 +55,7 @@ def solver_of(p, edges, masses, law, *, eliminated=False, tolerance=1e-13) -> La
 def solved(solver, b) -> np.ndarray:
     solver.workspace.b[:] = b
     solver.solve()
-    solver.pull()
+    solver.find_multipliers()
     return solver.workspace.multiplier.copy()
 
 

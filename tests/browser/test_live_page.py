@@ -243,7 +243,7 @@ def test_space_after_a_click(page, session):
     page.wait("return document.querySelector('[data-formation=triangle]').className === 'waiting'")
     page.click("[data-formation=line]")
     until(lambda: session.pilot.waiting is None)
-    session.pilot.change("triangle")
+    session.pilot.change_formation("triangle")
     page.wait("return document.getElementById('play').getAttribute('aria-label') === 'Play'")
     ActionChains(page.driver).send_keys(" ").perform()
     until(lambda: not session.paused)

@@ -337,7 +337,7 @@ class Measurements:
         for index, fit, *ways in zip(flat, flat.values(), *wanted, strict=True):
             # Only tracked slots steer a line; otherwise its direction follows from the shape before.
             steers = 2 if fit.dimension == 2 else self.result.phases[index].control == "tracking"
-            angles = (angle_between(fit.points, aim) for aim in ways[:steers])
+            angles = (angle_between(fit.turned_axis, aim) for aim in ways[:steers])
             flips[index] = next(filter(math.isfinite, angles), None)
         return flips
 

@@ -22,7 +22,7 @@ _NAMED = 20
 def notes(measured: Measurements, phases: list[PhaseVerdict]) -> Iterator[str]:
     """Facts that fail no check but that a reader should know."""
     yield from _abandonment_notes(measured)
-    yield from _dip_notes(measured)
+    yield from _below_zero_notes(measured)
     yield from _turnover_notes(measured, phases)
     yield from _fall_notes(measured)
     pairs, times = measured.mission.links_lost
@@ -134,7 +134,7 @@ def _fall_notes(measured: Measurements) -> Iterator[str]:
             yield f"{words} is still falling at z = {r[-1, 2]:.1f} m when the flight ends"
 
 
-def _dip_notes(measured: Measurements) -> Iterator[str]:
+def _below_zero_notes(measured: Measurements) -> Iterator[str]:
     """Note agents below z = 0 if the mission has neither a ground nor a geofence."""
     mission = measured.mission
     if mission.limits.geofence is not None or any(

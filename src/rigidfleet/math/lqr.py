@@ -66,7 +66,7 @@ def infinite_horizon(
     slowest = np.abs(modes.real).min()
     start = np.eye(len(A))
     if not riccati.is_semidefinite(W):
-        start = riccati.stable_subspace(H)
+        start = riccati.solution_by_subspace(H)
     elif not slowest > 1e-12 * np.abs(modes).max():
         raise ValueError(
             "the Riccati equation has no stabilising solution to rounding: bring the magnitudes of"

@@ -146,7 +146,7 @@ def _flow(
     return S, *_propagate(A, G, Q, tau, rate)[:3]
 
 
-def stable_subspace(H: Floats) -> Floats:
+def solution_by_subspace(H: Floats) -> Floats:
     """P (n, n), to some digits, from the stable half of a Hamiltonian matrix (2 n, 2 n).
 
     Raises ValueError if an eigenvalue lies on the imaginary axis, within rounding of the matrix.

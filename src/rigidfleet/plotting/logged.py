@@ -56,7 +56,7 @@ class OffPlan(NamedTuple):
         """Who is surely beyond the limit (K, N)."""
         return self.interval[0] > self.limit
 
-    def drifts(self, time: Floats) -> list[Drift]:
+    def drift_spans(self, time: Floats) -> list[Drift]:
         """Each time in which a vehicle is off, those of one after the other."""
         drifts = []
         for i, off in enumerate(self.is_off.T):
@@ -117,7 +117,7 @@ def plan_and_flight(result: Result) -> Figure:
         above.plot(*slots[:, i, :2].T, **st.REFERENCE, zorder=3)
         below.fill_between(time, low[:, i], high[:, i], **look, alpha=0.25, linewidth=0)
         st.draw_line(below, time, 1e3 * off.far[:, i], **look)
-        mine = [drift for drift in off.drifts(time) if drift.who == i]
+        mine = [drift for drift in off.drift_spans(time) if drift.who == i]
         for drift in mine:  # where and when it is off, in bold
             k = slice(*np.searchsorted(time, [drift.start, drift.end]))
             bold = {"color": colours[i], "linewidth": 3.5, "alpha": 0.6, "gid": "drift"}

@@ -136,7 +136,7 @@ def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
     F = frame.flexes
     chosen: list[Floats] = []
     parts = np.zeros((F.shape[1], 0))  # of the chosen motions in the flexes, orthonormal
-    for motion in _candidates(frame) if F.size else ():
+    for motion in _candidate_flexes(frame) if F.size else ():
         part = F.T @ motion.ravel()
         rest = part - parts @ (parts.T @ part)
         rest -= parts @ (parts.T @ rest)
@@ -148,7 +148,7 @@ def localised_flexes(frame: Framework) -> list[tuple[tuple[int, ...], Floats]]:
     return _without_common_parts(chosen)
 
 
-def _candidates(frame: Framework) -> Iterator[Floats]:
+def _candidate_flexes(frame: Framework) -> Iterator[Floats]:
     """Flexes (N, d) among which there is a basis, those that move few agents first."""
     yield from _motions_of_single_agents(frame)
     few = sparse_flexes(frame.flexes, frame.rigid, len(frame.p))

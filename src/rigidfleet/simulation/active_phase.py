@@ -50,9 +50,9 @@ class Stepper:
     #: Whether a controller's calls are counted from the start of the flight, as ticks are, and not of the phase.
     by_ticks = False
     #: Time by which the events of the phase come later than planned [s].
-    delay = 0.0
+    event_delay = 0.0
     #: Time by which the plan's references are behind now, in the mean of the vehicles' own clocks [s].
-    behind = 0.0
+    lateness = 0.0
     #: How vehicles turn about the vertical, a `YawTurn`; None of points.
     turn: Any = None
 
@@ -226,7 +226,7 @@ class ActivePhase:
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
                 return  # between two checks
-            quiet = self.t - self.stepper.behind >= least and self._error() <= settle.tolerance
+            quiet = self.t - self.stepper.lateness >= least and self._error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
     def steer(self, problem: Problem) -> None:
@@ -243,7 +243,7 @@ class ActivePhase:
 
     def evaluate(self) -> None:
         """Evaluate the law at the current state; forces and references are then in the workspace."""
-        y, t = self.state.y, self.t - self.stepper.behind
+        y, t = self.state.y, self.t - self.stepper.lateness
         native.closed_loop(t, y, np.empty_like(y), self.plan.problem, self.workspace)
 
     def observe(self) -> Observation:

@@ -696,7 +696,7 @@ class Flight:
         record.controller = (
             None if self._built_in else self.controller is None or active.control_calls > 0
         )
-        if active.stepper.delay > 0.0:
+        if active.stepper.event_delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.has_settled
         active.count_work()

@@ -109,7 +109,7 @@ class Leader:
         n = max(1, round(_PERIOD / self.period))
         self.period *= n
 
-    def next_end(self, t: float, step: float) -> float:
+    def end_of_period(self, t: float, step: float) -> float:
         """End [s] of the period that t [s] lies in; exactly a multiple of ``step`` [s] if it is one to rounding."""
         end = (np.floor(t / self.period + 1e-6) + 1.0) * self.period
         sample = round(end / step) * step

@@ -205,7 +205,7 @@ def assemble_result(
     later: list[tuple[tuple[str, ...], Callable[[], dict[str, Any]]]] = []
     if len(states) == len(pieces):
         r, v = (np.concatenate(parts) for parts in zip(*states, strict=True))
-        now = {"position": r, "velocity": v}
+        now = {"position": r.copy(), "velocity": v}  # what is computed later is of what was flown
         later = [(names, recorded), (CLOSE, partial(distances, mission, worst, r, time))]
     else:
         made = recorded()
@@ -260,7 +260,7 @@ def _forces_and_references(
         thrust = flown.thrust
         if mission.agents.saturate:  # the thrust flown, not the commanded one
             thrust = np.minimum(thrust, mission.agents.thrust_limit)
-    if (left := _left(mission, time)) is not None:
+    if (left := _flying_mask(mission, time)) is not None:
         r_ref = np.where(left[:, :, None], r_ref, np.nan)
     constraint = record.c
     if d is not None and d.noise is not None:
@@ -302,7 +302,7 @@ def recorded_text(mission: Mission) -> dict[str, str]:
     return {"mission_text": mission.text}
 
 
-def _left(mission: Mission, time: Floats) -> Bools | None:
+def _flying_mask(mission: Mission, time: Floats) -> Bools | None:
     """Mask (K, N) of the agents that are not lost; None if none is."""
     lost_at = mission.lost_at
     return None if time[-1] <= lost_at.min() else time[:, None] <= lost_at
@@ -319,7 +319,7 @@ def distances(
 
     Vehicles count that are not lost, or those ``left`` (K, N).
     """
-    left = _left(mission, time) if left is None else left
+    left = _flying_mask(mission, time) if left is None else left
     if left is None:
         left = np.ones((len(time), mission.n_agents), dtype=np.bool_)
     close = proximity.closeness(r, mission.agents.radius, mission.obstacles, time, left)
@@ -374,7 +374,7 @@ def _references(
             angles.append(yaws)
             last, until = yaws[-1, 0], time[-1]
     state, angle = np.concatenate(states), np.concatenate(angles)
-    left = _left(mission, np.concatenate([times for times, _ in pieces]))
+    left = _flying_mask(mission, np.concatenate([times for times, _ in pieces]))
     if left is not None:
         state[~left[:, None].repeat(3, axis=1)] = np.nan
         angle[~left[:, None].repeat(2, axis=1)] = np.nan

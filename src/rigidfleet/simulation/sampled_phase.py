@@ -176,7 +176,7 @@ class SampledPhase(Stepper):
         if leader is None or arrays is None or not by_law or self.steered:
             return math.inf
         t = self.phase.t
-        end = leader.next_end(t, self.vehicles.output_step)
+        end = leader.end_of_period(t, self.vehicles.output_step)
         if t >= self.decided_until:
             self.decided_until = end
             if (problem := leader.lead(t, end, arrays)) is not None:

@@ -498,7 +498,7 @@ class _Check:
         if self.mission is not None:
             self._check_values(self.mission)
         if header is not None and header.own[1]:
-            self._check_law(*header.own, header)
+            self._check_own_law(*header.own, header)
         if "rate" in self.data and not self.data.get("controller"):
             self.add(("rate",), "is that of a controller", "give a controller, or remove rate")
         self._check_groups(variations)
@@ -588,7 +588,7 @@ class _Check:
                 remedy = f"in the mission, {finding.remedy}"
                 self.add(("vary", k, "path"), problem, remedy, column.variation.path)
 
-    def _check_law(self, key: str, name: str, header: SweepHeader) -> None:
+    def _check_own_law(self, key: str, name: str, header: SweepHeader) -> None:
         """Check that the user's law can be imported, and suits the mission."""
         try:
             controllers.import_law(name)

@@ -22,7 +22,7 @@ from rigidfleet.web.live.balls import AT_ONCE, FASTEST, LARGEST, SMALLEST
 from rigidfleet.web.live.guarding import with_avoidance
 from rigidfleet.web.live.pilot import TICK, Pilot
 from rigidfleet.web.replay.page import page, page_text
-from rigidfleet.web.replay.scene import describe, page_samples, sight_points, weight
+from rigidfleet.web.replay.scene import describe, page_samples, sight_points, vehicle_weight
 
 SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0)
 #: Full colour of an edge, as a share of a vehicle's weight.
@@ -52,7 +52,7 @@ class Session:
         self.flown: Result | None = None  # the last flight that ended
         self.farewell = ""
         self.shown = np.arange(min(len(mission.edges), _EDGES))
-        self.tension = _TENSION * weight(mission)
+        self.tension = _TENSION * vehicle_weight(mission)
         self.lock = threading.RLock()
         self.pages: set[queue.Queue[bytes | None]] = set()
         self.stopped = threading.Event()

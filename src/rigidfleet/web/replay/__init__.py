@@ -23,7 +23,13 @@ from rigidfleet.result.lights import has_lights, view_angles
 from rigidfleet.typing import Floats, Ints
 from rigidfleet.web.replay.pack import PackedColumn, pack
 from rigidfleet.web.replay.page import page
-from rigidfleet.web.replay.scene import describe, page_samples, sight_points, typical_reach, weight
+from rigidfleet.web.replay.scene import (
+    describe,
+    page_samples,
+    sight_points,
+    typical_reach,
+    vehicle_weight,
+)
 
 __all__ = ["Replay", "html_page", "replay"]
 
@@ -93,7 +99,7 @@ def html_page(result: Result) -> str:
     """The page that `replay` writes."""
     time, shown = _page_times(result), _drawn_edges(result)
     most = float(np.nanmax(np.abs(result.multiplier[:, shown]), initial=0.0))
-    scale = weight(result.mission)
+    scale = vehicle_weight(result.mission)
     tension = min(max(most, _IDLE * scale), _HEAVY * scale)
     columns, swarm = page_samples(result, shown, tension), result.n_agents > _SWARM
     if swarm:  # dots have neither attitudes nor slots
@@ -180,7 +186,7 @@ def _story(result: Result, time: Floats) -> dict[str, Any]:
         "azimuth": math.atan2(-way[1], -way[0]) + 0.6 if far else -1.1,
     }
     if (off := off_plan(result)) is not None:
-        story["drifts"] = [x._asdict() for x in off.drifts(result.time)]
+        story["drifts"] = [x._asdict() for x in off.drift_spans(result.time)]
         story["off"] = off.limit
     if not np.isfinite(result.mission.ground):
         # A grid to see motion against; high above the ground, it moves along with the flight.

@@ -227,7 +227,7 @@ def typical_reach(result: Result) -> float:
     return float(np.median(reach))
 
 
-def weight(mission: Mission) -> float:
+def vehicle_weight(mission: Mission) -> float:
     """Weight [N] of a vehicle; without gravity a tenth of that on Earth."""
     return float(np.mean(mission.agents.mass)) * max(mission.gravity, 1.0)
 
