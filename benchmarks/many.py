@@ -33,12 +33,12 @@ from rich.table import Table
 from rigidfleet.assessment import assess
 from rigidfleet.assessment.fits import fits_of
 from rigidfleet.formation import distance_geometry, shapes
+from rigidfleet.formation.graphs import GRAPHS as DESIGNS
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.mission import Mission, load_mission
 from rigidfleet.planning.solvers import WORDS
 from rigidfleet.result import Result
 from rigidfleet.rigidity import spectrum
-from rigidfleet.rigidity.design import GRAPHS as DESIGNS
 from rigidfleet.simulation.flight import simulate
 
 SPACING, DURATION, RATE = 2.0, 20.0, 0.1  # [m], [s], [rad/s]

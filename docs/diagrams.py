@@ -482,12 +482,12 @@ def way_home() -> Figure:
         data = load_mission("change-of-picture").to_dict() | {"abort": {"to": to}}
         mission = complete_times(Mission.from_dict(data))
         aborts = Aborts(mission, legs_from(mission, state_at_start(mission), mission.phases))
-        abort = aborts.at(19.0)
+        abort = aborts.abort_at(19.0)
         before = aborts.plan.at(np.linspace(16.0, abort.begins, 20))
         t = abort.begins
         parts = [(before, FAINT, 1.0)]
         for k, step in enumerate(abort.steps):
-            r = abort.at(np.linspace(t, t + step.duration - 1e-9, 2 if k else 12))
+            r = abort.positions_at(np.linspace(t, t + step.duration - 1e-9, 2 if k else 12))
             parts.append((r, ORANGE if k == 0 else BLUE, 2.0 if k == 0 else 1.0))
             t += step.duration
         for r, colour, width in parts:

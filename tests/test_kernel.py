@@ -831,9 +831,9 @@ from rigidfleet.kernel.engine import build, objects
 second = subprocess.Popen(objects.build_command("apart"), stdout=subprocess.PIPE)
 if not {helped}:
     second.kill()
-made, apart = [], build.apart
-build.apart = lambda: made.append(1) or apart()
-assert len(build.machine_code(second)) == len(objects.ENTRIES["flight"])
+made, monitor_code = [], build.monitor_code
+build.monitor_code = lambda: made.append(1) or monitor_code()
+assert len(build.flight_code(second)) == len(objects.ENTRIES["flight"])
 assert len(made) == {int(not helped)}
 """
     environment = os.environ | {"NUMBA_OPT": "0"}
