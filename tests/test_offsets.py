@@ -8,10 +8,11 @@ import pytest
 from scipy.linalg import expm
 
 from rigidfleet.assessment import assess
+from rigidfleet.math.pid import exponential
 from rigidfleet.mission import Mission
 from rigidfleet.mission.vehicles import MODELS
 from rigidfleet.preflight.check import check
-from rigidfleet.preflight.offsets import exponential, offsets
+from rigidfleet.preflight.offsets import offsets
 from rigidfleet.simulation.flight import simulate
 
 SQUARE = np.array([[2.0, 2, 0], [-2, 2, 0], [-2, -2, 0], [2, -2, 0]])
@@ -243,7 +244,9 @@ def test_exponentials_are_those_of_scipy(size):
     """Of several matrices at once, of any size."""
     A = size * np.random.default_rng(1).normal(size=(5, 4, 4))
     want = expm(A)
-    np.testing.assert_allclose(exponential(A), want, rtol=1e-11, atol=1e-12 * np.abs(want).max())
+    np.testing.assert_allclose(
+        exponential(A, np.ones(5)), want, rtol=1e-11, atol=1e-12 * np.abs(want).max()
+    )
 
 
 def test_a_check_of_steady_wind_loads_no_scipy():

@@ -182,11 +182,9 @@ def meanings_of(names: Sequence[str]) -> list[ColumnMeaning]:
     kinds = [meaning_of(name) for name in names]
     if any(map(CRAZYFLIE.fullmatch, names)):
         # Its client writes the vehicle's stamps; a time of another name is the user's own.
-        stamps = [q.kind == "time" and "stamp" in names[k].lower() for k, q in enumerate(kinds)]
-        kinds = [
-            q._replace(unit=q.unit or "ms") if own else q
-            for q, own in zip(kinds, stamps, strict=True)
-        ]
+        for k, q in enumerate(kinds):
+            if q.kind == "time" and "stamp" in names[k].lower():
+                kinds[k] = q._replace(unit=q.unit or "ms")
     known, place = {q.kind for q in kinds}, {name.lower(): k for k, name in enumerate(names)}
     alike: dict[str, dict[str, tuple[list[int], str]]] = {}
     for name in place:

@@ -70,7 +70,7 @@ def error_response(
     t = np.asarray(t, dtype=float)
     p, A = _companion(alpha, beta, gamma)
     z0 = np.stack([p * I0, c0, cdot0 / p])
-    z = np.tensordot(_exponential(A, p * t), z0, axes=1)
+    z = np.tensordot(exponential(A, p * t), z0, axes=1)
     integral, c, c_dot = np.moveaxis(z, t.ndim, 0)
     return c, p * c_dot, integral / p
 
@@ -113,14 +113,15 @@ def _companion(alpha: float, beta: float, gamma: float) -> tuple[float, Floats]:
     return p, np.array([[0, 1, 0], [0, 0, 1], [-gamma / p**3, -((beta / p) ** 2), -2 * alpha / p]])
 
 
-def _exponential(A: Floats, x: Floats) -> Floats:
-    """e^(A x) (..., n, n) for x (...): a Taylor series for |A x| <= 1/2, then repeated doubling.
+def exponential(A: Floats, x: Floats) -> Floats:
+    """e^(A x) (..., n, n) for A (..., n, n) and x (...): a Taylor series for |A x| <= 1/2, then repeated doubling.
 
-    For many small matrices, much faster than `scipy.linalg.expm`. The doubling uses e^(A x) - 1:
-    squaring a matrix near 1 doubles its rounding error each time.
+    For many small matrices, much faster than `scipy.linalg.expm`, which takes long to load, too. The doubling uses
+    e^(A x) - 1: squaring a matrix near 1 doubles its rounding error each time.
     """
     with np.errstate(divide="ignore"):
-        doublings = np.ceil(np.log2(2.0 * np.linalg.norm(A) * np.abs(x))).clip(min=0.0)
+        doublings = np.log2(2.0 * np.linalg.norm(A, axis=(-2, -1)) * np.abs(x))
+    doublings = np.ceil(doublings).clip(min=0.0)
     step = A * (x * 0.5**doublings)[..., None, None]
     D = term = step
     for k in range(2, 17):
@@ -130,7 +131,7 @@ def _exponential(A: Floats, x: Floats) -> Floats:
         more = doublings > k
         d = D[more]
         D[more] = 2.0 * d + d @ d
-    return np.eye(len(A)) + D
+    return np.eye(A.shape[-1]) + D
 
 
 def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Floats:
@@ -149,7 +150,7 @@ def _time_grid(alpha: float, beta: float, gamma: float, tolerance: float) -> Flo
     X = np.linalg.solve(np.kron(A.T, one) + np.kron(one, A.T), -one.ravel()).reshape(A.shape)
     bound = np.linalg.inv(X)[1 - first, 1 - first]
     x = 1.0
-    while bound * (z := _exponential(A, np.array(x)) @ z0) @ X @ z > tolerance**2:
+    while bound * (z := exponential(A, np.array(x)) @ z0) @ X @ z > tolerance**2:
         x *= 2.0
     s = poles(alpha, beta, gamma)
     swings = np.abs(s.imag).max() * x / p / math.pi

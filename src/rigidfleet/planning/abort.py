@@ -291,17 +291,21 @@ class Aborts:
         on[0, ..., :2] = np.moveaxis(Piecewise(time, pieces[-1]).states(time[-1:], 2)[:, 0], 0, -1)
         return Piecewise(np.concatenate([*times, time[-1:] + 1.0]), np.concatenate([*pieces, on]))
 
-    @property
+    @cached_property
+    def air(self) -> Boundaries:
+        """How vehicles fall, and where to."""
+        return Boundaries(self.mission)
+
+    @cached_property
     def astray(self) -> Floats:
         """How far from its fall by the plan each vehicle (N,) may be that is lost [m]."""
-        air = Boundaries(self.mission)
+        air = self.air
         return self.off + _ASTRAY + _BLOWN * air.k * float(np.linalg.norm(air.wind))
 
     @cached_property
     def wrecks(self) -> list[Sphere]:
         """The lost vehicles, wider by `astray`, which fall from where they were by the plan, and then lie."""
-        air, lost_at, wrecks = Boundaries(self.mission), self.mission.lost_at, []
-        astray = self.astray
+        air, lost_at, wrecks = self.air, self.mission.lost_at, []
         for i in self.wrecked.tolist():
             states = self.plan.states(lost_at[[i]], 2)
             (r, v), k = states[:, 0, i], air.k[[i]]
@@ -310,7 +314,7 @@ class Aborts:
             time = np.linspace(0.0, max(tau, SHORTEST), 2 + math.ceil(tau / _FALLING))
             places = falls.places(r, v, np.minimum(time, tau), float(k[0]), air.wind, air.g)
             moves = {"waypoints": places.tolist(), "times": (lost_at[i] + time).tolist()}
-            size = float(self.radius[i] + astray[i])
+            size = float(self.radius[i] + self.astray[i])
             wrecks.append(Sphere(kind="sphere", name=f"lost agent {i + 1}", radius=size, **moves))
         return wrecks
 

@@ -7,7 +7,6 @@ constraint law. Gusts and noise are left out: they have no mean.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -18,6 +17,7 @@ from rigidfleet._common.waypoints import UNITS, WAYPOINT_TOLERANCE
 from rigidfleet.math import attitude as att
 from rigidfleet.math import proximity, rigid_body
 from rigidfleet.math.margins import input_shares
+from rigidfleet.math.pid import exponential
 from rigidfleet.mission import Mission
 from rigidfleet.planning.preview import PlannedPhase
 from rigidfleet.planning.vehicles import air_force, jet_speeds
@@ -59,28 +59,14 @@ def offsets(mission: Mission, way: list[PlannedPhase]) -> list[Floats]:
             now = np.zeros_like(now)
             by_phase.append(pushed)
             continue
-        flat, steps = (
-            pushed.reshape(len(pushed), -1),
-            exponential(laws * np.diff(planned.time[:2])[0]),
-        )
+        flat = pushed.reshape(len(pushed), -1)
+        steps = exponential(laws, np.diff(planned.time[:2]))
         answers = np.empty((len(flat), 2, flat.shape[1]))
         for k, push in enumerate(flat):
             answers[k] = now[:, 1]
             now = steps[:, :3, :3] @ now + steps[:, :3, 3:] * push
         by_phase.append(_offsets_with_edges(mission, planned, pushed, answers))
     return by_phase
-
-
-def exponential(A: Floats) -> Floats:
-    """Exponentials of matrices A (..., n, n), by scaling and squaring: to load SciPy takes longer than the check."""
-    halvings = max(0, math.frexp(float(np.abs(A).sum(axis=-1).max()))[1])
-    whole = term = np.eye(A.shape[-1])
-    for k in range(1, 19):  # the next term is below rounding
-        term = term @ A / (k * 2.0**halvings)
-        whole = whole + term
-    for _ in range(halvings):
-        whole = whole @ whole
-    return whole
 
 
 def _unknown_accelerations(mission: Mission, planned: PlannedPhase) -> Floats:
