@@ -44,8 +44,14 @@ _CHECK = 0.1
 Sampler = Callable[..., Floats]
 
 
-class Stepper:
-    """How a phase under way is flown: what differs between points and vehicles with sampled control."""
+class ActivePhase:
+    """A phase under way; `PointPhase` and `SampledPhase` say how points, and vehicles with sampled control, fly it.
+
+    Attributes
+    ----------
+    plan : the plan that is flown
+    pieces : samples recorded so far
+    """
 
     #: Whether a controller's calls are counted from the start of the flight, as ticks are, and not of the phase.
     by_ticks = False
@@ -56,67 +62,10 @@ class Stepper:
     #: How vehicles turn about the vertical, a `YawTurn`; None of points.
     turn: Any = None
 
-    def __init__(self, phase: ActivePhase) -> None:
-        self.phase = phase
-        self.flown: Problem | None = None  # the problem of the steps in the trail
-
-    def begin(self, y: Floats, t: float) -> None:
-        """Begin the phase's ``state`` of the integration, at a state vector (n,) and time [s]."""
-        raise NotImplementedError
-
-    def fly(self, problem: Problem, t_end: float) -> None:
-        """Fly to ``t_end`` [s] and record the samples on the way."""
-        raise NotImplementedError
-
-    def watch(self, *, last: bool) -> None:
-        """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
-        raise NotImplementedError
-
-    def lead_reference(self, *, by_law: bool) -> float:
-        """Decide how to fly on, ``by_law`` or under a controller; returns until when that holds [s]."""
-        return math.inf
-
-    def steer(self, problem: Problem) -> None:
-        """Take up a problem that was made by hand."""
-
-    def seen_by_controller(self, observation: Observation) -> Observation:
-        """What a controller sees, from the states of the integrator."""
-        return observation
-
-    def drop_command(self) -> None:
-        """Drop the last command of vehicles."""
-
-    def problem_under(self, command: Command) -> Problem:
-        """The problem under a command of vehicles.
-
-        Raises
-        ------
-        FlightError
-            They do not take it.
-        """
-        raise NotImplementedError
-
-    def end(self) -> None:
-        """End the phase."""
-
-    def release(self) -> None:
-        """Give back what the phase holds."""
-
-
-class ActivePhase:
-    """A phase under way.
-
-    Attributes
-    ----------
-    plan : the plan that is flown
-    pieces : samples recorded so far
-    """
-
     def __init__(
         self,
         index: int,
         plan: PhasePlan,
-        stepper: Callable[[ActivePhase], Stepper],
         *,
         extremes: Extremes,
         external: ExternalForce | None,
@@ -141,14 +90,50 @@ class ActivePhase:
         self.quiet_since = math.inf  # since when the phase has been settled [s]
         self.stop = math.inf  # time at which the caller wants a sample [s]
         self.begun = False  # whether samples exist since the start or the last loss
+        self.flown: Problem | None = None  # the problem of the steps in the trail
         self.state: IntegratorState
-        self.stepper = stepper(self)
         self._start(plan.initial_state(), plan.start)
 
     def _start(self, y: Floats, t: float) -> None:
         """Start to integrate the plan at a state (n,) and time [s]."""
         self.workspace, self.solver = workspace_and_solver(self.plan, self.workspaces)
-        self.stepper.begin(y, t)
+        self.begin(y, t)
+
+    # -- what differs between points and vehicles ---------------------------------------------------
+
+    def begin(self, y: Floats, t: float) -> None:
+        """Begin the ``state`` of the integration at a state vector (n,) and time [s]."""
+        raise NotImplementedError
+
+    def fly(self, problem: Problem, t_end: float) -> None:
+        """Fly to ``t_end`` [s] and record the samples on the way."""
+        raise NotImplementedError
+
+    def watch(self, *, last: bool) -> None:
+        """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
+        raise NotImplementedError
+
+    def problem_under(self, command: Command) -> Problem:
+        """The problem under a command of vehicles.
+
+        Raises
+        ------
+        FlightError
+            They do not take it.
+        """
+        raise NotImplementedError
+
+    def lead_reference(self, *, by_law: bool) -> float:
+        """Decide how to fly on, ``by_law`` or under a controller; returns until when that holds [s]."""
+        return math.inf
+
+    def drop_command(self) -> None:
+        """Drop the last command of vehicles."""
+
+    def release(self) -> None:
+        """Give back what the phase holds, after the end: nothing more is asked of it."""
+
+    # -- where it is ----------------------------------------------------------------------------------
 
     @property
     def t(self) -> float:
@@ -185,7 +170,7 @@ class ActivePhase:
         """
         whole = t_end >= self.plan.t_end
         while self.t < (self.plan.t_end if whole else t_end):
-            decided = self.stepper.lead_reference(by_law=controller is None)
+            decided = self.lead_reference(by_law=controller is None)
             end = min(decided, self.plan.t_end if whole else t_end)
             if controller is None or self.plan.phase.control != "tracking":
                 self._integrate(self.plan.problem, end)
@@ -194,7 +179,7 @@ class ActivePhase:
 
     def _fly_under(self, controller: Controller, rate: float, t_end: float) -> None:
         """Fly to ``t_end`` [s] under the user's controller."""
-        start = 0.0 if self.stepper.by_ticks else self.plan.start
+        start = 0.0 if self.by_ticks else self.plan.start
         while self.t < t_end:
             # Control instants are the start of the phase and multiples since, not the ends of its segments.
             if self.held is None or self.t >= start + self.control_calls / rate:
@@ -207,10 +192,10 @@ class ActivePhase:
 
     def _problem_under_controller(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""
-        self.stepper.drop_command()
+        self.drop_command()
         answer = call_user("the controller", self.t, controller, self.observe())
         if isinstance(answer, Command):
-            return self.stepper.problem_under(answer)
+            return self.problem_under(answer)
         force = checked_force(answer, len(self.lost), "the controller", self.t)
         control = self.plan.problem.control._replace(kind=OPEN, force=force)
         return self.plan.problem._replace(control=control)
@@ -226,16 +211,11 @@ class ActivePhase:
             self.fly_to(min(t, t_end), controller, rate)
             if self.t < min(t, self.plan.t_end):
                 return  # between two checks
-            quiet = self.t - self.stepper.lateness >= least and self._error() <= settle.tolerance
+            quiet = self.t - self.lateness >= least and self._error() <= settle.tolerance
             self.quiet_since = min(self.quiet_since, self.t) if quiet else math.inf
 
     def steer(self, problem: Problem) -> None:
         """Continue with another problem of the same size, such as one with a different reference, by hand."""
-        self.stepper.steer(problem)
-        self.continue_with(problem)
-
-    def continue_with(self, problem: Problem) -> None:
-        """Continue with another problem of the same size."""
         self.plan.problem = problem
         self.counted[records.EVALUATIONS] += self.state.count[records.EVALUATIONS]
         # A different law: its derivative is not known yet.
@@ -243,7 +223,7 @@ class ActivePhase:
 
     def evaluate(self) -> None:
         """Evaluate the law at the current state; forces and references are then in the workspace."""
-        y, t = self.state.y, self.t - self.stepper.lateness
+        y, t = self.state.y, self.t - self.lateness
         native.closed_loop(t, y, np.empty_like(y), self.plan.problem, self.workspace)
 
     def observe(self) -> Observation:
@@ -254,20 +234,12 @@ class ActivePhase:
         r, v = (w.r_seen, w.v_seen) if noisy else (w.r, w.v)
         tracked = self.plan.problem.control.kind == TRACKING  # elsewhere, there are no slots
         r_ref, v_ref, a_ref = (np.where(tracked, x, np.nan) for x in (w.r_ref, w.v_ref, w.a_ref))
-        return self.stepper.seen_by_controller(
-            Observation(
-                self.t, self.plan.phase.name, r.copy(), v.copy(), r_ref, v_ref, a_ref, self.plan.masses.copy(),
-                vehicles.g,
-            )
+        return Observation(
+            self.t, self.plan.phase.name, r.copy(), v.copy(), r_ref, v_ref, a_ref, self.plan.masses.copy(), vehicles.g
         )  # fmt: skip
-
-    def watch(self, *, last: bool) -> None:
-        """Search the steps flown for extremes; ``last``: no further steps of this problem follow."""
-        self.stepper.watch(last=last)
 
     def end(self) -> PhaseState:
         """End the phase at its current state; return the state that the next phase starts from."""
-        self.stepper.end()
         self.raise_errors()
         if not (self.state.count[records.EVALUATIONS] or self.t > self.plan.start):
             return self.plan.before
@@ -280,11 +252,6 @@ class ActivePhase:
             self.solver.check()
             self.solver.solver_for_thread.check()
 
-    def release(self) -> None:
-        """Give back what the phase holds, after the end: nothing more is asked of it."""
-        self.stepper.release()
-        del self.stepper  # which refers back to the phase: its memory is free at once
-
     # -- inside -----------------------------------------------------------------------------------
 
     def _integrate(self, problem: Problem, t_end: float) -> None:
@@ -296,7 +263,7 @@ class ActivePhase:
             if self.next_loss <= self.t:
                 problem = self._remove_lost(problem, ~self.lost & (self.plan.lost_at <= self.t))
             else:
-                self.stepper.fly(problem, min(t_end, self.next_loss))
+                self.fly(problem, min(t_end, self.next_loss))
 
     def _remove_lost(self, problem: Problem, now: Bools) -> Problem:
         """Continue without the vehicles that are lost ``now`` (N,) and without the links lost by now.
@@ -380,7 +347,7 @@ class ActivePhase:
     ) -> None:
         """Store a piece of the phase, with what the slots follow if they are tracked."""
         plan, followed = self.plan, ()
-        problem, turn = plan.problem, self.stepper.turn
+        problem, turn = plan.problem, self.turn
         if problem.control.kind == TRACKING and len(times):
             followed = ((times[0], problem.reference, problem.motion, turn),)
         samples = times, source, integral, frame

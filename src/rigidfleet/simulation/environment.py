@@ -176,18 +176,17 @@ class FormationEnv(ParallelEnv[str, Vector, Vector]):
 
     def _observations(self, active: ActivePhase) -> dict[str, Vector]:
         """Observations of all vehicles that fly."""
-        stepper = active.stepper
-        assert isinstance(stepper, SampledPhase)
-        views = [view for view in stepper.views() if view is not None]
+        assert isinstance(active, SampledPhase)
+        views = [view for view in active.views() if view is not None]
         return {self.possible_agents[view.agent]: self.observation(view) for view in views}
 
     def _rewards(self, active: ActivePhase) -> dict[str, float]:
         """Rewards of all vehicles, at their true states."""
-        stepper, w, n = active.stepper, active.workspace, len(self.possible_agents)
-        assert isinstance(stepper, SampledPhase)
-        r, edge = stepper.sampled.S[:, :3], stepper.sampled.mail.edge
+        w, n = active.workspace, len(self.possible_agents)
+        assert isinstance(active, SampledPhase)
+        r, edge = active.sampled.S[:, :3], active.sampled.mail.edge
         held = edge >= 0
-        i, j = stepper.flight.network.links[held].T
+        i, j = active.flight.network.links[held].T
         apart = r[i] - r[j]
         off = np.abs(np.sqrt((apart * apart).sum(axis=1)) - w.d[edge[held]])
         error = np.bincount(i, off, n) / np.maximum(np.bincount(i, minlength=n), 1)

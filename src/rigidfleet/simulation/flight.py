@@ -384,11 +384,11 @@ class Flight:
             plan = plan_phase(self.mission, leg, disturbance=self._disturbance, external=self._push)
             phase = plan.phase
             self._check_frame(plan)
-            stepper = PointPhase
+            fly = PointPhase
             if self._vehicles is not None:
-                stepper = partial(SampledPhase, vehicles=self._vehicles)
-            self._active = ActivePhase(
-                len(self.phases), plan, stepper, extremes=self._extremes, external=self.external,
+                fly = partial(SampledPhase, vehicles=self._vehicles)
+            self._active = fly(
+                len(self.phases), plan, extremes=self._extremes, external=self.external,
                 sampler=self.sampler, pieces=self.pieces, pause=lambda _: self._report(phase),
                 workspaces=self._workspaces,
             )  # fmt: skip
@@ -696,7 +696,7 @@ class Flight:
         record.controller = (
             None if self._built_in else self.controller is None or active.control_calls > 0
         )
-        if active.stepper.event_delay > 0.0:
+        if active.event_delay > 0.0:
             record.target = active.plan.target
         record.settled = None if abandoned else active.has_settled
         active.count_work()

@@ -13,7 +13,7 @@ from rigidfleet.kernel import records
 from rigidfleet.kernel.engine import native, packing
 from rigidfleet.kernel.problem import Problem
 from rigidfleet.planning.tolerances import most_steps
-from rigidfleet.simulation.active_phase import ActivePhase, Stepper
+from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import Command, article_and_kind
 from rigidfleet.simulation.diagnosis import diagnose
 from rigidfleet.simulation.recording import Unevaluated
@@ -38,66 +38,63 @@ class Stretch(NamedTuple):
     first: float  # the first time after the start [s]
 
 
-class PointPhase(Stepper):
+class PointPhase(ActivePhase):
     """A phase under way that points fly."""
 
-    def __init__(self, phase: ActivePhase) -> None:
-        super().__init__(phase)
-        #: Whether another thread searches the steps for extremes. It must not ask the user's force.
-        self.aside = False
-        #: Steps per call of the integrator; more once their duration is known.
-        self.steps = 0
+    #: Whether another thread searches the steps for extremes. It must not ask the user's force.
+    aside = False
+    #: Steps per call of the integrator; more once their duration is known.
+    steps = 0
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to integrate at a state (n,) and time [s]."""
-        phase, plan = self.phase, self.phase.plan
-        self.aside = plan.large and phase.external is None
-        phase.state = phase.extremes.begin(
+        plan = self.plan
+        self.aside = plan.large and self.external is None
+        self.state = self.extremes.begin(
             y, t, len(plan.edges), rtol=plan.integrator.rtol, atol=plan.tolerances
         )
         if self.steps:  # after a loss
             return
         self.steps = _FIRST_STEPS
-        if phase.external is None:
+        if self.external is None:
             self.steps = max(_FIRST_STEPS, _FIRST_NUMBERS // len(y))
-        if phase.solver is not None:
-            phase.state.clock[records.NEXT_STEP] = first_step(plan, phase.workspace, phase.state)
+        if self.solver is not None:
+            self.state.clock[records.NEXT_STEP] = first_step(plan, self.workspace, self.state)
 
     def fly(self, problem: Problem, t_end: float) -> None:
         """Integrate to ``t_end`` [s] and record the samples on the way."""
-        phase = self.phase
-        stretch = self.prepare(problem, phase.sample_times(t_end))
-        state, fresh = phase.state, stretch.fresh
+        stretch = self.prepare(problem, self.sample_times(t_end))
+        state, fresh = self.state, stretch.fresh
         status = records.PAUSED
         go_on = native.Integration(
-            problem, phase.workspace, state, t_end, stretch.times, stretch.samples
+            problem, self.workspace, state, t_end, stretch.times, stretch.samples
         )
         try:
             while status == records.PAUSED:
                 begun = clock.perf_counter()
-                most = phase.extremes.free_steps(state) if self.aside else self.steps
+                most = self.extremes.free_steps(state) if self.aside else self.steps
                 status = go_on(fresh, min(self.steps, most))
                 took = max(clock.perf_counter() - begun, 1e-6)
                 if status == records.PAUSED:
                     self.steps = min(_STEPS, max(1, int(self.steps * min(_PAUSE / took, 10.0))))
                 fresh = False
-                if phase.external is not None:
-                    phase.external.check()
-                phase.raise_errors()
+                if self.external is not None:
+                    self.external.check()
+                self.raise_errors()
                 full = state.count[records.TRAILED] == len(state.trail.clock)
                 if self.aside:
-                    full = phase.extremes.free_steps(state) < 1
+                    full = self.extremes.free_steps(state) < 1
                 if status == records.PAUSED or full:
                     self.watch(last=False)
-                phase.pause(phase.t)
+                self.pause(self.t)
                 if status == records.PAUSED and self.has_stalled():
                     break
         finally:
             self.record(stretch)
         if status != records.FINISHED:
             collapsed = status == records.COLLAPSED
-            own_force = phase.external is not None
-            raise StoppedError(diagnose(phase, own_force=own_force, collapsed=collapsed))
+            own_force = self.external is not None
+            raise StoppedError(diagnose(self, own_force=own_force, collapsed=collapsed))
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes.
@@ -105,34 +102,32 @@ class PointPhase(Stepper):
         In a large formation, the search takes as long as the flight: another thread does it meanwhile. The user's
         force, which may not be ready for two threads, is asked by one.
         """
-        phase = self.phase
-        phase.extremes.wait()
-        if not phase.state.count[records.TRAILED] or self.flown is None:
+        self.extremes.wait()
+        if not self.state.count[records.TRAILED] or self.flown is None:
             return
-        work = phase.workspace if phase.solver is None else phase.solver.solver_for_thread.workspace
+        work = self.workspace if self.solver is None else self.solver.solver_for_thread.workspace
         if last or not self.aside:
-            phase.extremes.take_steps(self.flown, work, phase.state, last=last)
+            self.extremes.take_steps(self.flown, work, self.state, last=last)
         else:
-            phase.extremes.hand_over(self.flown, work, phase.state)
+            self.extremes.hand_over(self.flown, work, self.state)
 
     def prepare(self, problem: Problem, times: Floats) -> Stretch:
         """Prepare to integrate a problem from now on, and to record the states at some times (K,) [s]."""
-        phase = self.phase
-        evaluations = phase.state.count[records.EVALUATIONS]
-        fresh = evaluations == 0 or problem is not phase.plan.problem
+        evaluations = self.state.count[records.EVALUATIONS]
+        fresh = evaluations == 0 or problem is not self.plan.problem
         if fresh:
             self.watch(last=True)
             self.flown = problem
-            if phase.solver is not None:  # a solver keeps state: the monitor has its own
-                self.flown = problem_with_solver(phase.solver.solver_for_thread, problem)
-        phase.begun = True
-        samples = np.empty((len(times), len(phase.state.y)))
-        phase.state.count[records.SAMPLES] = 0
-        return Stretch(problem, times, samples, fresh, math.nextafter(phase.t, math.inf))
+            if self.solver is not None:  # a solver keeps state: the monitor has its own
+                self.flown = problem_with_solver(self.solver.solver_for_thread, problem)
+        self.begun = True
+        samples = np.empty((len(times), len(self.state.y)))
+        self.state.count[records.SAMPLES] = 0
+        return Stretch(problem, times, samples, fresh, math.nextafter(self.t, math.inf))
 
     def record(self, stretch: Stretch) -> None:
         """Store the samples of what was integrated since `prepare`."""
-        state, (problem, times, samples, _, first) = self.phase.state, stretch
+        state, (problem, times, samples, _, first) = self.state, stretch
         done = int(state.count[records.SAMPLES])
         tried = state.count[records.EVALUATIONS] > 0 and state.count[records.ACCEPTED] == 0
         if tried and len(times) and times[0] <= first:
@@ -142,32 +137,32 @@ class PointPhase(Stepper):
 
     def has_stalled(self) -> bool:
         """Whether the phase takes far more steps than its duration explains."""
-        state, since = self.phase.state, self.phase.t - self.phase.plan.start
+        state, since = self.state, self.t - self.plan.start
         steps = int(state.count[records.ACCEPTED] + state.count[records.REJECTED])
         return steps > most_steps(since)
 
     def problem_under(self, command: Command) -> Problem:
         """Point masses take no command of vehicles."""
         raise FlightError(
-            f"the controller returned {article_and_kind(command)} at t = {self.phase.t:.3f} s, which point masses do"
+            f"the controller returned {article_and_kind(command)} at t = {self.t:.3f} s, which point masses do"
             " not take; return forces [N], or give the agents a vehicle"
         )
 
     def release(self) -> None:
         """Let go of what a large formation has packed."""
-        if self.phase.solver is not None:
+        if self.solver is not None:
             packing.forget_last_packed()
 
     def _record(self, problem: Problem, times: Floats, samples: Floats) -> None:
         """Store the samples; forces and references at them are evaluated when they are asked for."""
-        phase, plan = self.phase, self.phase.plan
+        plan = self.plan
         n, m = len(plan.masses), len(plan.edges)
-        setup = None if phase.solver is None else phase.solver.setup
+        setup = None if self.solver is None else self.solver.setup
         source = Unevaluated(native.pack(problem), plan.problem, samples, setup)
-        if phase.external is not None:  # a user's function is asked while it is at hand
-            source = source.evaluate(times, phase.workspace)
+        if self.external is not None:  # a user's function is asked while it is at hand
+            source = source.evaluate(times, self.workspace)
         frame = np.full((len(times), 4), np.nan)
         if plan.frame is not None:
             q = samples[:, 6 * n + m : 6 * n + m + 4]
             frame = q / np.linalg.norm(q, axis=1, keepdims=True)
-        phase.store(times, source, samples[:, 6 * n : 6 * n + m], frame)
+        self.store(times, source, samples[:, 6 * n : 6 * n + m], frame)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from rigidfleet.math import attitude as att
 from rigidfleet.mission import Mission
 from rigidfleet.planning.avoidance import avoidance_in_flight
 from rigidfleet.planning.derivatives import slots_by_own_clocks
+from rigidfleet.planning.plan import PhasePlan
+from rigidfleet.planning.reference import PhaseState
 from rigidfleet.planning.vehicles import (
     TickTables,
     YawTurn,
@@ -30,7 +33,7 @@ from rigidfleet.planning.vehicles import (
 )
 from rigidfleet.planning.virtual_clock import delay_by
 from rigidfleet.result import Extremum
-from rigidfleet.simulation.active_phase import ActivePhase, Stepper
+from rigidfleet.simulation.active_phase import ActivePhase
 from rigidfleet.simulation.callbacks import (
     AttitudeCommand,
     Command,
@@ -96,19 +99,17 @@ class FleetState:
         self.flight = self.flight._replace(network=network)
 
 
-class SampledPhase(Stepper):
+class SampledPhase(ActivePhase):
     """A phase under way that vehicles with sampled control fly, between the ticks of their autopilots.
 
-    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, the phase's ``state.y``
-    holds the true state, in the layout of the continuous flight.
+    The law of the plan is evaluated at measured states, at ticks. Whenever the kernel returns, ``state.y`` holds the
+    true state, in the layout of the continuous flight.
     """
 
     by_ticks = True
     turn: YawTurn
 
-    def __init__(self, phase: ActivePhase, vehicles: FleetState) -> None:
-        super().__init__(phase)
-        plan = phase.plan
+    def __init__(self, index: int, plan: PhasePlan, *, vehicles: FleetState, **around: Any) -> None:
         self.vehicles, self.flight = vehicles, vehicles.flight
         self.tabled: Problem | None = None  # the plan's problem for which the tables are
         if vehicles.avoidance is not None:
@@ -127,26 +128,27 @@ class SampledPhase(Stepper):
         #: When own clocks were last looked at, and by how much they were late then [s].
         self.late = plan.start, 0.0
         self.slowed: tuple[float, int] | None = None  # when they first waited [s], and for whom
+        super().__init__(index, plan, **around)
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
-        phase, plan, fleet_state = self.phase, self.phase.plan, self.vehicles
+        plan, fleet_state = self.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
         rtol, atol = plan.integrator.rtol, plan.tolerances
-        phase.state = phase.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
-        lost = self.flight.vehicles._replace(lost=phase.lost.copy())
+        self.state = self.extremes.begin(y, t, m, rtol=rtol, atol=atol, states=6 * n)
+        lost = self.flight.vehicles._replace(lost=self.lost.copy())
         self.flight = self.flight._replace(vehicles=lost)
         frame = y[6 * n + m : 6 * n + m + 4] if plan.frame is not None else None
         integral, before = y[6 * n : 6 * n + m], fleet_state.state
         law = plan.problem.law
         begun = fleet.initial_state(
-            self.flight, fleet_state.S, phase.workspace, frame=frame,
+            self.flight, fleet_state.S, self.workspace, frame=frame,
             iterations=law.iterations if law.solver == ITERATED else 1,
         )  # fmt: skip
         if before is None:
             begun.integral[:] = integral
         else:
-            renewed = fleet.state_under_problem(before, phase.workspace, integral, frame=frame)
+            renewed = fleet.state_under_problem(before, self.workspace, integral, frame=frame)
             if self.first_tick is None:  # extremes are those of the phase, also after a loss in it
                 fresh = ("peak", "peak_time", "worst", "worst_time", "saturations")
                 renewed = renewed._replace(**{name: getattr(begun, name) for name in fresh})
@@ -154,7 +156,7 @@ class SampledPhase(Stepper):
         # Edges that end within a phase are those of what is lost.
         lose = self.first_tick is not None
         give_edges_to_links(self.flight.network, begun.mail, plan.edges, integral, lose=lose)
-        trail = phase.state.trail
+        trail = self.state.trail
         self.sampled = fleet_state.state = begun._replace(
             trail=trail._replace(gauge=trail.gauge[:, :0])
         )
@@ -162,7 +164,7 @@ class SampledPhase(Stepper):
             fleet_state.avoidance = avoidance.with_edges(fleet_state.avoidance, m)
         if self.first_tick is None:
             self.first_tick = int(begun.count[fleet.TICKS])
-            self.gone = phase.lost.copy()  # (N,) vehicles that do not fly in this phase
+            self.gone = self.lost.copy()  # (N,) vehicles that do not fly in this phase
             begun.peak_time[:] = begun.worst_time[:] = t
         self.tabled = None
 
@@ -172,10 +174,10 @@ class SampledPhase(Stepper):
         """Let the layers above the barriers lead the reference, if there are any; returns until when that holds [s]."""
         leader, arrays = self.leader, self.vehicles.avoidance
         if self.flight.clocks.own:
-            return (math.floor(self.phase.t / _STRETCH + 1e-6) + 1.0) * _STRETCH
+            return (math.floor(self.t / _STRETCH + 1e-6) + 1.0) * _STRETCH
         if leader is None or arrays is None or not by_law or self.steered:
             return math.inf
-        t = self.phase.t
+        t = self.t
         end = leader.end_of_period(t, self.vehicles.output_step)
         if t >= self.decided_until:
             self.decided_until = end
@@ -195,7 +197,7 @@ class SampledPhase(Stepper):
         if not self.flight.clocks.own:
             return 0.0
         tau, ticks = self.sampled.tau[~self.flight.vehicles.lost], self.sampled.count[fleet.TICKS]
-        since = self.phase.t - max(ticks - 1, 0) * self._tick  # clocks run on between ticks
+        since = self.t - max(ticks - 1, 0) * self._tick  # clocks run on between ticks
         return float(-(tau[:, OFF] + since * (tau[:, RATE] - 1.0)).mean())
 
     @property
@@ -204,7 +206,7 @@ class SampledPhase(Stepper):
 
     def _delay_events(self) -> None:
         """Move the events of the plan that have not come yet by what own clocks are late."""
-        plan, t, (t_before, before) = self.phase.plan, self.phase.t, self.late
+        plan, t, (t_before, before) = self.plan, self.t, self.late
         late = max(0, round(self.lateness / self._tick)) * self._tick
         self.late = t, late
 
@@ -225,24 +227,20 @@ class SampledPhase(Stepper):
         self.steered = True
         if self.leader is not None:
             self.leader.now = None
-        self._turn_along_way(problem)
+        self._continue_with(problem)
 
     def _continue_with(self, problem: Problem) -> None:
-        """Continue with a problem that the leader has made of the plan's."""
-        self._turn_along_way(problem)
-        self.phase.continue_with(problem)
-
-    def _turn_along_way(self, problem: Problem) -> None:
-        """Let vehicles that turn along their way do so from the yaw they have now, by another problem."""
-        tables, t = self.vehicles.tables, self.phase.t
+        """Continue with another problem; vehicles that turn along their way do so from the yaw they have now."""
+        tables, t = self.vehicles.tables, self.t
         if tables.yaw.kind == "along":
-            now = tables.yaw_at(self.phase.plan.problem, t, self.turn)
+            now = tables.yaw_at(self.plan.problem, t, self.turn)
             self.turn = turn_from(problem, t, tables.yaw, now)
         self.by_pieces = True
+        super().steer(problem)
 
-    def seen_by_controller(self, observation: Observation) -> Observation:
+    def observe(self) -> Observation:
         """What a controller sees: states of now or, with noise, as the law knows them at a tick and until the next."""
-        S = self.sampled.S
+        observation, S = super().observe(), self.sampled.S
         seen = S[:, :6]
         if self.vehicles.tables.noise is not None:
             self._measure_if_due()
@@ -257,28 +255,26 @@ class SampledPhase(Stepper):
     def _measure_if_due(self) -> None:
         """Measure what the law will know if a tick is due."""
         self._supply_tables()
-        now = fleet.segment(
-            len(self.sampled.S), len(self.phase.plan.edges), self.phase.t, max_steps=0
-        )
-        fly_ticks(self.phase.plan.problem, self.phase.workspace, self.flight, self.sampled, now)
+        now = fleet.segment(len(self.sampled.S), len(self.plan.edges), self.t, max_steps=0)
+        fly_ticks(self.plan.problem, self.workspace, self.flight, self.sampled, now)
 
     def views(self) -> list[View | None]:
         """What each vehicle with a law of its own will know if a tick of the laws is due; None for those lost."""
         self._measure_if_due()
-        phase, laws = self.phase, self.vehicles.laws
+        laws = self.vehicles.laws
         assert laws is not None
         return laws.views(
-            phase.plan.phase.name, phase.plan.problem, phase.workspace, self.flight, self.sampled
+            self.plan.phase.name, self.plan.problem, self.workspace, self.flight, self.sampled
         )
 
     def drop_command(self) -> None:
         """Drop the last command of vehicles."""
-        self.flight = self.flight._replace(commands=fleet.no_commands(len(self.phase.lost)))
+        self.flight = self.flight._replace(commands=fleet.no_commands(len(self.lost)))
 
     def problem_under(self, command: Command) -> Problem:
         """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
-        t = self.phase.t
-        arrays = checked_command(command, len(self.phase.lost), t)
+        t = self.t
+        arrays = checked_command(command, len(self.lost), t)
         if self.flight.vehicles.point.any():
             raise FlightError(
                 f"the controller returned {article_and_kind(command)} at t = {t:.3f} s, but some agents are points;"
@@ -294,42 +290,41 @@ class SampledPhase(Stepper):
         else:
             commands = self.flight.commands._replace(kind=fleet.ROTORS, speeds=arrays["speed"])
         self.flight = self.flight._replace(commands=commands)
-        return self.phase.plan.problem._replace()  # not the plan's own: a loss has to keep it held
+        return self.plan.problem._replace()  # not the plan's own: a loss has to keep it held
 
     def watch(self, *, last: bool) -> None:
         """Search the steps flown for extremes."""
-        phase = self.phase
-        phase.extremes.avoidance = self.vehicles.avoidance
+        self.extremes.avoidance = self.vehicles.avoidance
         if self.leader is not None:
-            phase.extremes.of_layers = self.leader.extremes(phase.t)
+            self.extremes.of_layers = self.leader.extremes(self.t)
         if self.slowed is not None:
             time, who = self.slowed
-            phase.extremes.of_layers = {"clock": Extremum(self.event_delay, time, who, -1)}
+            self.extremes.of_layers = {"clock": Extremum(self.event_delay, time, who, -1)}
         if rows := int(self.sampled.count[fleet.TRAILED]):
             assert self.flown is not None
             # A motion that grows beyond all bounds has extremes up to there.
-            points = phase.state.trail.points[:rows]
+            points = self.state.trail.points[:rows]
             if not -_FAR < points.min() <= points.max() < _FAR:  # NaN is not, either
                 rows = int((abs(points) < _FAR).all(axis=(1, 2)).argmin())
-            phase.state.count[records.TRAILED] = rows
-            phase.extremes.take_path(self.flown, phase.workspace, phase.state)
-            self.sampled.count[fleet.TRAILED] = phase.state.count[records.TRAILED] = 0
+            self.state.count[records.TRAILED] = rows
+            self.extremes.take_path(self.flown, self.workspace, self.state)
+            self.sampled.count[fleet.TRAILED] = self.state.count[records.TRAILED] = 0
             self.unjudged = True
         if last and self.unjudged:  # the rest is kept by the flight itself
             assert self.first_tick is not None  # it has begun
             ticks = int(self.sampled.count[fleet.TICKS]) - self.first_tick
-            phase.extremes.take_vehicles(
-                self.sampled, self.flight.vehicles, self.gone, phase.lost, ticks
+            self.extremes.take_vehicles(
+                self.sampled, self.flight.vehicles, self.gone, self.lost, ticks
             )
             self.unjudged = False
 
     def fly(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
-        phase, plan, sampled = self.phase, self.phase.plan, self.sampled
+        plan, sampled = self.plan, self.sampled
         n, m = len(plan.masses), len(plan.edges)
         self.flown = problem
-        times = phase.sample_times(t_end)
-        phase.begun, arrays = True, self.vehicles.avoidance
+        times = self.sample_times(t_end)
+        self.begun, arrays = True, self.vehicles.avoidance
         network, laws = self.vehicles.flight.network, self.vehicles.laws
         if network is not self.flight.network:
             self.flight = self.flight._replace(network=network)
@@ -342,18 +337,18 @@ class SampledPhase(Stepper):
                 if status == records.PAUSED:
                     self._supply_tables()
                 elif laws is not None:
-                    laws.call_laws(plan.phase.name, problem, phase.workspace, self.flight, sampled)
-                status = fly_ticks(problem, phase.workspace, self.flight, sampled, call, arrays)
+                    laws.call_laws(plan.phase.name, problem, self.workspace, self.flight, sampled)
+                status = fly_ticks(problem, self.workspace, self.flight, sampled, call, arrays)
                 self._take_over_state()
                 if status == records.ASKS:
                     continue
                 if status == records.FINISHED:  # to a rounding error of the grid of steps
-                    phase.state.clock[records.TIME] = t_end
-                if phase.external is not None:
-                    phase.external.check()
-                phase.raise_errors()
+                    self.state.clock[records.TIME] = t_end
+                if self.external is not None:
+                    self.external.check()
+                self.raise_errors()
                 self.watch(last=False)
-                phase.pause(phase.t)
+                self.pause(self.t)
         finally:
             done = int(sampled.count[fleet.SAMPLES])
             finite = np.isfinite(call.S[:done]).all(axis=(1, 2)) & np.isfinite(call.dS[:done]).all(
@@ -367,31 +362,31 @@ class SampledPhase(Stepper):
         if not np.isfinite(sampled.S).all():
             who = agent_names(np.flatnonzero(~np.isfinite(sampled.S).all(axis=1)))
             raise StoppedError(
-                f"the motion of {who} grows beyond all bounds by t = {phase.t:.2f} s: the control is unstable. Lower"
+                f"the motion of {who} grows beyond all bounds by t = {self.t:.2f} s: the control is unstable. Lower"
                 " the gains, or raise the rates in [autopilot]"
             )
         if arrays is not None and arrays.count[avoidance.FULL]:
             raise StoppedError(
-                f"avoidance cannot go on at t = {phase.t:.2f} s: too many vehicles are near each other for their"
+                f"avoidance cannot go on at t = {self.t:.2f} s: too many vehicles are near each other for their"
                 " speeds. Fly slower, or farther apart"
             )
         if status != records.FINISHED:
-            own = phase.external is not None
-            raise StoppedError(diagnose(phase, own_force=own, collapsed=True))
+            own = self.external is not None
+            raise StoppedError(diagnose(self, own_force=own, collapsed=True))
 
     def _supply_tables(self) -> None:
         """Make tables for the next ticks, if those that there are end here or belong to another reference."""
         tables, tick = self.flight.tables, int(self.sampled.count[fleet.TICKS])
-        planned, source = self.phase.plan.problem, self.vehicles.tables
+        planned, source = self.plan.problem, self.vehicles.tables
         if planned is self.tabled and tables.first <= tick < tables.last:
             return
         before, tau = None, self.sampled.tau if self.flight.clocks.own else None
         if planned is not self.tabled and source.compensated:
             before = source.start_path(planned, tick, tables, tau)
         # A piece of a reference that is led holds until the next stop
-        until = self.phase.plan.t_end
+        until = self.plan.t_end
         if self.by_pieces:
-            until = min(until, self.decided_until if not self.steered else self.phase.stop)
+            until = min(until, self.decided_until if not self.steered else self.stop)
         last = min(tick + _TICKS, math.ceil(until * source.rate) + 1)
         made = source.tables_for(tick, max(last, tick + 1), planned, self.turn, tau)
         if before is not None:  # states that were measured about another path
@@ -402,7 +397,7 @@ class SampledPhase(Stepper):
 
     def _take_over_state(self) -> None:
         """Take over the true state, and what it cost."""
-        plan, state, sampled = self.phase.plan, self.phase.state, self.sampled
+        plan, state, sampled = self.plan, self.state, self.sampled
         n, m, y = len(plan.masses), len(plan.edges), state.y
         y[: 3 * n], y[3 * n : 6 * n] = sampled.S[:, :3].ravel(), sampled.S[:, 3:6].ravel()
         y[6 * n : 6 * n + m] = sampled.integral
@@ -412,9 +407,9 @@ class SampledPhase(Stepper):
         state.count[records.EVALUATIONS] = 4 * sampled.count[fleet.STEPS]
         state.count[records.ACCEPTED] = sampled.count[fleet.STEPS]
 
-    def end(self) -> None:
+    def end(self) -> PhaseState:
         """End the phase; the vehicles keep their states, and so the workspace, to which these may refer."""
-        plan, t = self.phase.plan, self.phase.t
+        plan, t = self.plan, self.t
         self.vehicles.yaw = self.vehicles.tables.yaw_at(plan.problem, t - self.lateness, self.turn)
         if self.flight.clocks.own:
             # The next phase is planned from now on: its times are later by as much, for all clocks alike.
@@ -429,12 +424,13 @@ class SampledPhase(Stepper):
         self.vehicles.S, self.vehicles.state = self.sampled.S, self.sampled
         if self.leader is not None:
             self.vehicles.scale = self.leader.deviation.scale
+        return super().end()
 
     # -- recording --------------------------------------------------------------------------------
 
     def _keep(self, problem: Problem, call: fleet.SampledSegment, done: int) -> None:
         """Store samples: states and forces as flown, references and constraints of the plan."""
-        plan = self.phase.plan
+        plan = self.plan
         S, times = call.S[:done], call.times[:done]
         parts = [S[..., :3].reshape(done, -1), S[..., 3:6].reshape(done, -1), call.integral[:done]]
         frame = np.full((done, 4), np.nan)
@@ -447,14 +443,14 @@ class SampledPhase(Stepper):
             plan_time = (times - self.vehicles.waited)[:, None, None] + tau[..., :1]
             tau = np.concatenate([tau, plan_time], axis=2)
         else:
-            planned = native.record(plan.problem, self.phase.workspace, times, y)
+            planned = native.record(plan.problem, self.workspace, times, y)
             tau = tau[..., :0]
         out, kept = _as_flown(planned, call, done, self.flight, problem, tau)
-        self.phase.store(times, out, call.integral[:done], frame, kept, self._layers(call, done))
+        self.store(times, out, call.integral[:done], frame, kept, self._layers(call, done))
 
     def _record_by_own_clocks(self, times: Floats, y: Floats, tau: Floats) -> Record:
         """A record at the mean of own clocks ``tau`` (K, N, 3), with forces of now, and the slot by each clock."""
-        problem, work = self.phase.plan.problem, self.phase.workspace
+        problem, work = self.plan.problem, self.workspace
         off, rate = tau[:, ~self.flight.vehicles.lost, :2].mean(axis=1).T
         f_E = native.record(problem, work, times, y).f_E
         planned = native.record(problem, work, times + off, y)._replace(f_E=f_E)

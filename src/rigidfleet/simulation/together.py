@@ -53,13 +53,13 @@ def simulate_together(missions: Sequence[Mission]) -> list[Result]:
         if not any(going):
             return [flight.finish() for flight in flights]
         active = [flight.under_way() for flight, goes in zip(flights, going, strict=True) if goes]
-        steppers = [x.stepper for x in active if isinstance(x.stepper, PointPhase)]
-        if all(going) and len(steppers) == len(active) and _can_share_steps(active):
+        points = [phase for phase in active if isinstance(phase, PointPhase)]
+        if all(going) and len(points) == len(active) and _can_share_steps(active):
             if vector is None:
                 from rigidfleet.kernel.engine import batch
 
                 vector = batch.Vector(_fill_lanes([x.plan.problem.disturbance for x in active]))
-            if not _fly(steppers, vector):
+            if not _fly(points, vector):
                 return [simulate(mission) for mission in missions]
             for flight in flights:
                 flight.arrive()
@@ -99,14 +99,13 @@ def _sharing_key(phase: ActivePhase) -> tuple[object, ...]:
     return *times, plan.integrator.rtol, len(phase.state.y), extremes.directed
 
 
-def _fly(steppers: Sequence[PointPhase], vector: batch.Vector) -> bool:
+def _fly(active: Sequence[PointPhase], vector: batch.Vector) -> bool:
     """Fly phases to their end in common steps and record them; return whether they came there."""
     from rigidfleet.kernel.engine.tracer import UnfitError
 
-    active = [stepper.phase for stepper in steppers]
     t_end = active[0].plan.t_end
     times = active[0].sample_times(t_end)
-    stretches = [stepper.prepare(stepper.phase.plan.problem, times) for stepper in steppers]
+    stretches = [phase.prepare(phase.plan.problem, times) for phase in active]
     try:
         vector.begin(
             _fill_lanes([stretch.problem for stretch in stretches]),
@@ -123,10 +122,10 @@ def _fly(steppers: Sequence[PointPhase], vector: batch.Vector) -> bool:
         if status == records.PAUSED:
             for phase in active:
                 phase.watch(last=False)
-            if steppers[0].has_stalled():
+            if active[0].has_stalled():
                 return False
-    for stepper, stretch in zip(steppers, stretches, strict=True):
-        stepper.record(stretch)
+    for phase, stretch in zip(active, stretches, strict=True):
+        phase.record(stretch)
     return status == records.FINISHED
 
 
