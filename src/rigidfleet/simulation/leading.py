@@ -7,6 +7,7 @@ at the time of the virtual clock, moved by the deviation of the body. Where neit
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -301,12 +302,8 @@ class Leader:
         r, v, rise, arms = self._slots(t)
         z = self.deviation.scale[0]
         limit = _STEERING * float(a.b.min())
-        cones = [self._cone_rows(o, r, v, rise, arms, limit, a) for o in moving]
-        rows, needed, who = (
-            (np.concatenate(parts) for parts in zip(*cones, strict=True))
-            if cones
-            else (np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))
-        )
+        cones = (self._cones(o, r, v, rise, a) for o in moving)
+        rows, needed, who = self._rows_of(cones, arms, limit)
         if len(rows):
             accelerations = self.deviation.decay(NEAR)
         short = needed - rows @ accelerations
@@ -316,9 +313,9 @@ class Leader:
         if not self.calm:
             self.who = int(who[short.argmax()])
         # Off the planned path, what stands still counts, too
-        for o in np.flatnonzero(sight.moves == 0):
-            more, least, _ = self._barrier_rows(o, r, v, rise, arms, limit, a)
-            rows, needed = np.vstack([rows, more]), np.append(needed, least)
+        barriers = (self._barriers(o, r, v, rise, a) for o in np.flatnonzero(sight.moves == 0))
+        more, least, _ = self._rows_of(barriers, arms, limit)
+        rows, needed = np.vstack([rows, more]), np.append(needed, least)
         if self._any_scale([self.deviation]) or self._scalable:
             more, least = scale_rows(self.deviation)
             rows, needed = np.vstack([rows, more]), np.append(needed, least)
@@ -367,17 +364,22 @@ class Leader:
         a = c[2] + d[0] @ Q[2].T + 2.0 * d[1] @ Q[1].T + turned[2]
         return r, v, a, turned[0]
 
-    def _cone_rows(
-        self,
-        o: int,
-        r: Floats,
-        v: Floats,
-        rise: Floats,
-        arms: Floats,
-        limit: float,
-        a: AvoidanceArrays,
+    def _rows_of(
+        self, barriers: Iterable[tuple[Floats, Floats]], arms: Floats, limit: float
     ) -> tuple[Floats, Floats, Ints]:
-        """Rows (R, 7) of slots against obstacle o, which moves, what they need (R,), and the vehicles (R,).
+        """Rows (R, 7) of the barriers that may act, what they need (R,), and the vehicles (R,)."""
+        parts = [(np.zeros((0, 7)), np.zeros(0), np.zeros(0, dtype=int))]
+        for normal, needed in barriers:
+            some = np.flatnonzero(needed > -limit)
+            rows = rigid_rows(normal[some], arms[some], self.deviation.scale[0])
+            parts.append((rows, needed[some], some))
+        rows, needed, who = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return rows, needed, who
+
+    def _cones(
+        self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
+    ) -> tuple[Floats, Floats]:
+        """Normals (N, 3) of barriers of slots against obstacle o, which moves, and what they need (N,) along these.
 
         With x the place of a slot relative to the middle of a ball round the obstacle, w its relative velocity and s
         the length of a tangent from it to the ball, h = x . w + |w| s is not negative if w points past the ball: a
@@ -395,21 +397,13 @@ class Leader:
         h = along + speed * s
         needed = -_CONE * h - speed**2 - speed * along / s
         needed = (needed - (normal * rise).sum(axis=1)) / length
-        some = np.flatnonzero((along < 0.0) & (-along < _HORIZON * speed**2) & (needed > -limit))
-        rows = rigid_rows(normal[some] / length[some, None], arms[some], self.deviation.scale[0])
-        return rows, needed[some], some
+        nears = (along < 0.0) & (-along < _HORIZON * speed**2)
+        return normal / length[:, None], np.where(nears, needed, -np.inf)
 
-    def _barrier_rows(
-        self,
-        o: int,
-        r: Floats,
-        v: Floats,
-        rise: Floats,
-        arms: Floats,
-        limit: float,
-        a: AvoidanceArrays,
-    ) -> tuple[Floats, Floats, Ints]:
-        """Barriers of slots against obstacle o, which stands still, that may act; see `_cone_rows`."""
+    def _barriers(
+        self, o: int, r: Floats, v: Floats, rise: Floats, a: AvoidanceArrays
+    ) -> tuple[Floats, Floats]:
+        """Barriers of slots against obstacle o, which stands still; see `_cones`."""
         solids = a.solids
         at = own_axes(*r.T, o, solids)
         away = signed_distance(*at, o, solids)
@@ -419,9 +413,5 @@ class Leader:
         rate = (normal * v).sum(axis=1)
         gap = away - a.reach - a.spare - np.maximum(0.0, -rate) * (self.period + a.lag)
         strength = _STEERING * a.share * a.b
-        needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate) - (normal * rise).sum(
-            axis=1
-        )
-        some = np.flatnonzero(needed > -limit)
-        rows = rigid_rows(normal[some], arms[some], self.deviation.scale[0])
-        return rows, needed[some], some
+        needed = needed_rate(gap, rate, 0.0, strength, _EARLIER * a.rate)
+        return normal, needed - (normal * rise).sum(axis=1)
