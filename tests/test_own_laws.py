@@ -257,12 +257,12 @@ def fails(answer: Any) -> Any:
             "returned None at tick 50, t = 0.500 s: return a force (3,) [N] and a message",
         ),
         (lambda me: np.zeros(3), "returned array([0., 0., 0.]) at tick 50"),
-        (lambda me: (np.zeros(4), 1.0), "returned a force of shape (4,) at tick 50"),
-        (lambda me: ("up", 1.0), "returned the force 'up' at tick 50"),
-        (lambda me: (np.zeros(3) * 1j, None), "returned the force array("),
+        (lambda me: (np.zeros(4), 1.0), "returned as its force an array of shape (4,) at tick 50"),
+        (lambda me: ("up", 1.0), "returned as its force 'up' at tick 50"),
+        (lambda me: (np.zeros(3) * 1j, None), "returned as its force complex numbers at tick 50"),
         (
             lambda me: ([0.0, np.nan, 1.0], 1.0),
-            "returned a force that is not finite at tick 50, t = 0.500 s: [0.0, nan",
+            "as its force [0.0, nan, 1.0], which is not finite at tick 50, t = 0.500 s: return a",
         ),
         (
             lambda me: (np.zeros(3), "hello"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -101,21 +102,41 @@ def article_and_kind(command: Command) -> str:
     return f"{'an' if isinstance(command, AttitudeCommand) else 'a'} {type(command).__name__}"
 
 
+def finite_numbers(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """A copy of finite numbers of a shape, as a user's function gives them.
+
+    Raises
+    ------
+    ValueError
+        They are something else, which the message names.
+    """
+    try:
+        complex_numbers, array = np.iscomplexobj(x), np.array(x, dtype=np.float64, order="C")
+    except (TypeError, ValueError):
+        raise ValueError(reprlib.repr(x)) from None
+    if complex_numbers:
+        raise ValueError("complex numbers")
+    if array.shape != shape:
+        raise ValueError(f"an array of shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{reprlib.repr(x)}, which is not finite")
+    return array
+
+
 def checked_command(command: Command, n: int, t: float) -> dict[str, Floats]:
     """Arrays of a command, by their names; an error says which one is wrong."""
     rows = {"thrust": (n,), "attitude": (n, 4), "rates": (n, 3), "speed": (n, 4)}
     arrays = {}
     for name, value in vars(command).items():
         try:
-            array = np.array(np.zeros(rows[name]) if value is None else value, dtype=np.float64)
-        except (TypeError, ValueError):
-            array = np.full((), np.nan)
-        if array.shape != rows[name] or not np.isfinite(array).all():
+            arrays[name] = finite_numbers(
+                np.zeros(rows[name]) if value is None else value, rows[name]
+            )
+        except ValueError as error:
             raise FlightError(
                 f"the controller returned {article_and_kind(command)} at t = {t:.3f} s whose {name} is not an array"
-                f" {rows[name]} of finite numbers"
-            )
-        arrays[name] = np.ascontiguousarray(array)
+                f" {rows[name]} of finite numbers, but {error}"
+            ) from None
     if "attitude" in arrays:
         size = np.linalg.norm(arrays["attitude"], axis=1, keepdims=True)
         if not (size > 0.0).all():
@@ -126,24 +147,12 @@ def checked_command(command: Command, n: int, t: float) -> dict[str, Floats]:
 
 def checked_force(f: ArrayLike, n: int, who: str, t: float) -> Floats:
     """Forces (N, 3) [N] from a user's function, checked; an error says what it returned instead."""
-    if np.iscomplexobj(f):
-        raise FlightError(
-            f"{who} returned complex numbers at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
-        )
     try:
-        force = np.array(f, dtype=np.float64)
-    except (TypeError, ValueError):
+        return finite_numbers(f, (n, 3))
+    except ValueError as error:
         raise FlightError(
-            f"{who} returned {f!r} at t = {t:.3f} s; return an array ({n}, 3) of forces [N]"
+            f"{who} returned {error} at t = {t:.3f} s; return an array ({n}, 3) of forces, a row for each agent [N]"
         ) from None
-    if force.shape != (n, 3):
-        raise FlightError(
-            f"{who} returned an array of shape {force.shape} at t = {t:.3f} s; return an array ({n}, 3), a row for"
-            " each agent [N]"
-        )
-    if not np.isfinite(force).all():
-        raise FlightError(f"{who} returned a force that is not finite at t = {t:.3f} s")
-    return np.ascontiguousarray(force)
 
 
 class ExternalForce:

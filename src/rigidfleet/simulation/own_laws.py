@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from rigidfleet.errors import FlightError
 from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
 from rigidfleet.kernel.mail import NONE
 from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
+from rigidfleet.simulation.callbacks import finite_numbers
 from rigidfleet.typing import Floats
 
 
@@ -70,7 +70,6 @@ class View:
 
 #: A law returns the force (3,) [N] of its vehicle, weight included, and what it says to its neighbours; None: nothing.
 Law = Callable[[View], tuple[ArrayLike, Any]]
-_FORCE = "return a force (3,) [N], weight included, and a message"
 
 
 class OwnLaws:
@@ -187,15 +186,10 @@ def _answer_of(answer: Any) -> tuple[Floats, Any, int]:
     except (TypeError, ValueError):
         raise ValueError(repr(answer), "return a force (3,) [N] and a message") from None
     try:
-        f = np.array(force)
-    except (TypeError, ValueError):
-        f = np.array(None)
-    if f.dtype.kind not in "biuf":
-        raise ValueError(f"the force {force!r}", _FORCE)
-    if f.shape != (3,):
-        raise ValueError(f"a force of shape {f.shape}", _FORCE)
-    if not all(map(math.isfinite, f.tolist())):
-        raise ValueError("a force that is not finite", f.tolist())
+        f = finite_numbers(force, (3,))
+    except ValueError as error:
+        what = f"as its force {error}"
+        raise ValueError(what, "return a force (3,) [N], weight included, and a message") from None
     try:
         return f, *((None, 0) if message is None else plain_copy(message))
     except TypeError as error:
