@@ -40,8 +40,6 @@ _LEAST = 0.1
 _TOUCH, _INSTANT = 1e-6, 1e-6
 #: Greatest rotation of a piece of a step in the body formulation [rad].
 _TURN = 0.1
-#: Shortest piece of a step, as a share of the step.
-_SHORTEST = 2.0**-20
 #: Agents that are asked for their nearest one, to choose how far the list reaches.
 _ASKED = 2000
 #: The monitor's number of each quantity that it finds; the clearances at the start and the end belong to the flight.
@@ -278,30 +276,20 @@ class CurveWatch:
     def _watch_step(
         self, problem: Problem, work: Workspace, state: records.IntegratorState, step: int
     ) -> None:
-        """Monitor the distances of one step, in pieces so short that only the listed pairs matter."""
-        (row,) = _rows(state, (step,))
-        (start, length), whole = state.trail.clock[row], state.trail.points[row]
-        gauge, none = state.trail.gauge[:0], state.trail.start
-        pieces: list[tuple[float, float, Floats]] = [(start, length, whole)]
-        while pieces:
-            t, h, points = pieces.pop()
-            trail = records.Trail(np.array([[t, h]]), points[None], gauge, none)
-            piece = state._replace(trail=trail)
-            self.monitor.bound_moves(problem, piece)
-            moved = self.monitor.monitor.moves.copy()
-            if not self.stacks:
-                moved[1] = 0.0
-            if (self.moved + moved > self.spare).any():
-                self._list_near_pairs(problem, points[0], 0.0)
-            if moved.max() > self.spare:
-                if h > _SHORTEST * length:
-                    clock, halves = _halves(t, h, points)
-                    pieces += [(*clock[k], halves[k]) for k in (1, 0)]
-                    continue
-                self._list_near_pairs(problem, points[0], float(moved.max()))
-            self.moved += moved
-            self.monitor.distances(problem, piece, 0, 1)
-            self._find_contacts(problem, work, piece, np.zeros(1, dtype=np.int64))
+        """Monitor the distances of one step, in which only the listed pairs matter."""
+        row = _rows(state, (step,))
+        clock, points = state.trail.clock[row], state.trail.points[row]
+        trail = records.Trail(clock, points, state.trail.gauge[:0], state.trail.start)
+        alone = state._replace(trail=trail)
+        self.monitor.bound_moves(problem, alone)
+        moved = self.monitor.monitor.moves.copy()
+        if not self.stacks:
+            moved[1] = 0.0
+        if (self.moved + moved > self.spare).any():
+            self._list_near_pairs(problem, points[0, 0], float(moved.max()))
+        self.moved += moved
+        self.monitor.distances(problem, alone, 0, 1)
+        self._find_contacts(problem, work, alone, np.zeros(1, dtype=np.int64))
 
     def _list_near_pairs(self, problem: Problem, y: Floats, moves: float) -> None:
         """List the pairs that are near each other, or one below the other, at a state (n,).
@@ -344,10 +332,12 @@ class CurveWatch:
     def _watch_listed(self, spare: float) -> None:
         """Monitor the listed pairs; no others matter until distances have changed by ``spare`` [m]."""
         self.spare, self.moved[:] = spare, 0.0
+        self._renew_monitor(pairs=self.pairs, columns=self.columns)
+
+    def _renew_monitor(self, **arrays: Any) -> None:
+        """Go on with other arrays in place of some."""
         before = self.monitor.monitor
-        self.monitor = native.Watch(
-            before._replace(pairs=self.pairs, columns=self.columns, count=before.count.copy())
-        )
+        self.monitor = native.Watch(before._replace(count=before.count.copy(), **arrays))
 
 
 class Extremes(CurveWatch):
@@ -368,10 +358,7 @@ class Extremes(CurveWatch):
         """Continue among these obstacles; the first of them are those before."""
         self._take_obstacles(obstacles)
         if "monitor" in vars(self):
-            arrays = self.monitor.monitor
-            self.monitor = native.Watch(
-                arrays._replace(boxes=self.boxes, count=arrays.count.copy())
-            )
+            self._renew_monitor(boxes=self.boxes)
 
     def begin(
         self,
