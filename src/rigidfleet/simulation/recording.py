@@ -488,37 +488,23 @@ def _singular_values(r: Floats, counts: Sequence[int], edges: Sequence[Ints]) ->
     """Smallest non-zero singular value of J (K,); NaN if the formation is too large to compute it.
 
     ``counts`` and ``edges`` are those of each piece. In formations of some tens of agents it is computed at some
-    samples of each phase, and linear in between.
+    samples of each piece, and linear in between.
     """
-    ends = np.cumsum(counts).tolist()
-    spans: list[tuple[list[int], Ints]] = []  # pieces with the same edges, one after the other
-    for end, some in zip(ends, edges, strict=True):
-        if spans and arrays_equal(spans[-1][1], some):
-            spans[-1][0].append(end)
-        else:
-            spans.append(([end], some))
-    values, begin = [], 0
-    for parts, some in spans:
-        within = [end - begin for end in parts[:-1]]
-        values += _smallest_singular_values(r[begin : parts[-1]], within, some)
-        begin = parts[-1]
+    # Pieces with the same edges at once, if that is not too much.
+    whole = all(arrays_equal(some, edges[0]) for some in edges)
+    whole = whole and len(r) * min(len(edges[0]), 3 * r.shape[1]) ** 3 <= _WORK
+    parts = [r] if whole else np.split(r, np.cumsum(counts)[:-1])
+    values = [_smallest_singular_values(*each) for each in zip(parts, edges, strict=False)]
     return {"singular_value": np.concatenate(values)}
 
 
-def _smallest_singular_values(r: Floats, within: Sequence[int], edges: Ints) -> list[Floats]:
-    """Smallest non-zero singular value of J (K,) at positions r (K, N, 3) of phases that begin at 0 and ``within``."""
+def _smallest_singular_values(r: Floats, edges: Ints) -> Floats:
+    """Smallest non-zero singular value of J (K,) at positions r (K, N, 3) of a piece of a flight."""
     size = min(len(edges), 3 * r.shape[1])
     if size > _SINGULAR or not len(edges):
-        return [np.full(len(r), np.nan)]
+        return np.full(len(r), np.nan)
     count = max(_LEAST, _WORK // size**3)
     if count >= len(r):
-        return [smallest_singular_value(r, edges)]
-    least = []
-    for part in np.split(r, within):
-        if count >= len(part):
-            least.append(smallest_singular_value(part, edges))
-            continue
-        some = np.unique(np.linspace(0, len(part) - 1, count).round().astype(np.int64))
-        values = smallest_singular_value(part[some], edges)
-        least.append(np.interp(np.arange(len(part)), some, values))
-    return least
+        return smallest_singular_value(r, edges)
+    some = np.unique(np.linspace(0, len(r) - 1, count).round().astype(np.int64))
+    return np.interp(np.arange(len(r)), some, smallest_singular_value(r[some], edges))
