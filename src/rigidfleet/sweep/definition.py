@@ -48,8 +48,6 @@ _LEAST = 2.0**-54
 _RUNS = 10**8
 #: Tables with seeds of random numbers.
 _SEEDED = ("disturbances", "noise"), ("disturbances", "gusts"), ("network",), ("avoidance",)
-#: Keys that stores have since there are any: they are kept where they are not their defaults.
-_LATER = {"random_numbers", "controller", "rate", "agent", "drill"}
 
 
 class SweepHeader(Part):
@@ -95,11 +93,10 @@ class SweepHeader(Part):
 
 @dataclass(frozen=True)
 class SweepColumn:
-    """A number that varies: its variation, its place in the mission, and its values if it is on a grid."""
+    """A number that varies: its variation, and its place in the mission."""
 
     variation: Variation
     keys: Keys
-    grid: tuple[Any, ...] | None
 
     @property
     def name(self) -> str:
@@ -280,12 +277,7 @@ class Sweep:
     @cached_property
     def columns(self) -> list[SweepColumn]:
         """All numbers that vary, in order."""
-        return [
-            SweepColumn(v, keys, grid)
-            for v in self.variations
-            for grid in [v.grid if isinstance(v, Gridded) else None]
-            for keys in self._places(v.path)
-        ]
+        return [SweepColumn(v, keys) for v in self.variations for keys in self._places(v.path)]
 
     def _places(self, path: str) -> list[Keys]:
         """Keys of all places that match a path; a case of a drill is none of the mission."""
@@ -294,21 +286,22 @@ class Sweep:
     @cached_property
     def grid_sizes(self) -> dict[str | int, int]:
         """Number of values of each grid, by its column, or by its group if it has one; in order of first occurrence."""
-        return {_axis(c, k): len(c.grid) for k, c in enumerate(self.columns) if c.grid is not None}
+        grids = {_axis(c, k): c.variation.grid for k, c in enumerate(self.columns)}
+        return {axis: len(grid) for axis, grid in grids.items() if grid}
 
     def values(self, run: int) -> list[Any]:
         """Value of every column in a run; runs count from 0."""
         stream = np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(run,)))
-        drawn = sum(column.grid is None for column in self.columns)
+        drawn = sum(not column.variation.grid for column in self.columns)
         fractions = np.maximum(np.random.Generator(stream).random(drawn), _LEAST).tolist()
         point, places = run, {}
         for axis, size in reversed(self.grid_sizes.items()):  # the last grid varies fastest
             point, places[axis] = divmod(point, size)
         return [
-            column.variation.quantile(fractions.pop(0))
-            if column.grid is None
-            else column.grid[places[_axis(column, k)]]
-            for k, column in enumerate(self.columns)
+            grid[places[_axis(c, k)]]
+            if (grid := c.variation.grid)
+            else c.variation.quantile(fractions.pop(0))
+            for k, c in enumerate(self.columns)
         ]
 
     def varied(
@@ -372,14 +365,14 @@ class Sweep:
         return phase_spans(complete_times(self.mission))[-1][1]
 
     def _data(self) -> dict[str, Any]:
-        return {
+        return self.header.model_dump(exclude_defaults=True) | {
             "name": self.name,
             "mission": self.mission.text,
             "vary": [v.model_dump() for v in self.variations],
             "runs": self.runs,
             "seed": self.seed,
             "evaluate": self.evaluate,
-        } | self.header.model_dump(include=_LATER, exclude_defaults=True)
+        }
 
 
 def _axis(column: SweepColumn, k: int) -> str | int:
@@ -505,7 +498,7 @@ class _Check:
         if self.data.get("vary", []) == []:
             remedy = 'for example, give --vary "agents.mass.* *= normal(1, 0.05)"'
             self.add(("vary",), "nothing varies", remedy)
-        gridded = any(isinstance(v, Gridded) for v in variations)
+        gridded = any(v.grid for v in variations)
         if "runs" not in self.data and variations and not gridded:
             self.add(("runs",), "is missing", "give the number of runs; only a grid determines it")
         return variations
@@ -566,7 +559,7 @@ class _Check:
                 remedy = f"remove it, or {_WHOLE}"
             else:
                 if absent or keypaths.is_absent(self.whole, keys):
-                    self.lacked.append((k, SweepColumn(v, keys, None)))
+                    self.lacked.append((k, SweepColumn(v, keys)))
                 continue
             self.add(where, problem, remedy, path)
 
@@ -575,7 +568,7 @@ class _Check:
         document = mission.to_dict()
         for _, column in self.lacked:
             v = column.variation
-            value = v.grid[0] if isinstance(v, Gridded) else v.quantile(0.5)
+            value = v.grid[0] if v.grid else v.quantile(0.5)
             apply_value(document, self.whole, column, value)
         try:
             Mission.from_plain(document, "<dict>")

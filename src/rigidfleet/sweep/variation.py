@@ -13,7 +13,6 @@ import json
 import operator
 import re
 import sys
-from abc import abstractmethod
 from functools import cached_property
 from statistics import NormalDist
 from typing import Annotated, Any, Literal, get_args
@@ -50,6 +49,11 @@ class Variation(Part):
         "set: replaces the value in the mission; add: is added to it; scale: multiplies it", "set"
     )
 
+    @property
+    def grid(self) -> tuple[Any, ...]:
+        """Values that are taken in turn; none of a distribution."""
+        return ()
+
     def apply(self, there: Any, value: Any) -> Any:
         """What is in the place of a number, or of an array, for a value of the variation."""
         return _CHANGES[self.change](there, value)
@@ -79,11 +83,6 @@ class Gridded(Variation):
         " default: every grid is combined with all others",
         "",
     )
-
-    @property
-    @abstractmethod
-    def grid(self) -> tuple[Any, ...]:
-        """The values."""
 
 
 class Normal(Variation):
@@ -199,7 +198,7 @@ class Linspace(_Spaced):
 
     kind: Literal["linspace"] = required_key("grid with equal differences")
 
-    @property
+    @cached_property
     def grid(self) -> tuple[float, ...]:
         """The values."""
         return tuple(np.linspace(self.low, self.high, self.count).tolist())
@@ -212,7 +211,7 @@ class Geomspace(_Spaced):
     low: Positive = required_key("first value, > 0")
     high: Positive = required_key("last value, > 0")
 
-    @property
+    @cached_property
     def grid(self) -> tuple[float, ...]:
         """The values."""
         return tuple(np.geomspace(self.low, self.high, self.count).tolist())

@@ -55,13 +55,19 @@ def processes(count: int) -> Generator[Executor]:
 
     before = set(multiprocessing.active_children())
     forked = _has_one_thread()
-    context: Any = _fork_context() if forked else multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork" if forked else "spawn")
     own = None if forked else code_to_inherit()
     # Before a spawned process receives the module path of its parent, it would search the current folder first, even
     # for modules of the standard library; so would multiprocessing's resource tracker.
     with keep_folder_off_path():
         pool = ProcessPoolExecutor(count, context, _begin_worker, (own,))
         try:
+            if forked:  # all forks begin at once, and Ctrl-C waits from their start
+                before_fork = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+                try:
+                    pool.submit(int)
+                finally:
+                    signal.pthread_sigmask(signal.SIG_SETMASK, before_fork)
             yield pool
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -78,24 +84,6 @@ def _has_one_thread() -> bool:
         return len(os.listdir("/proc/self/task")) == 1
     except OSError:
         return False
-
-
-def _fork_context() -> Any:
-    """Context of forks, for which Ctrl-C waits from the start."""
-    from multiprocessing.context import ForkContext, ForkProcess
-
-    class Process(ForkProcess):
-        @staticmethod
-        def _Popen(process_obj: Any) -> Any:  # noqa: N802
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                return ForkProcess._Popen(process_obj)
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-    context: Any = ForkContext()
-    context.Process = Process
-    return context
 
 
 def _begin_worker(inheritance: Inheritance | None) -> None:
