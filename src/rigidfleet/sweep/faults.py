@@ -219,8 +219,6 @@ class Show:
         solid = any(not isinstance(thing, Ground) for thing in mission.obstacles)
         #: Whether it matters where the show is as a whole: flat ground is the same everywhere.
         self.bounded = solid or limits.geofence or mission.fences or mission.people
-        #: Coefficients (P, N, 4, K): arithmetic on long rows is fast.
-        self._rows = np.ascontiguousarray(self.curve.pieces.transpose(3, 1, 2, 0))
         self._chords = _Chords.of(self.curve)
         self._on_knots: dict[bytes, _Chords] = {}  # one for each magnitude of a delay
         #: The ways of earlier versions.
@@ -366,7 +364,7 @@ class Show:
 
     def _ways_of(self, who: Ints) -> Piecewise:
         """The ways of some vehicles."""
-        return Piecewise(self.curve.time, self._rows[:, who].transpose(3, 1, 2, 0))
+        return Piecewise(self.curve.time, self.curve.pieces[:, who])
 
 
 @lru_cache(maxsize=2)

@@ -13,11 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rigidfleet.assessment.fits import THIN
+from rigidfleet.assessment.fits import fits_of
 from rigidfleet.errors import MissionError
-from rigidfleet.formation.distance_geometry import dimension, distances
-from rigidfleet.formation.graphs import complete_graph
-from rigidfleet.math.rigid_body import centred
 from rigidfleet.mission import Mission
 from rigidfleet.mission.bounds import LENGTH, SPEED
 from rigidfleet.mission.formations import coincident_pairs
@@ -128,16 +125,13 @@ def _evaluate(mission: Mission, flown: Ensemble) -> tuple[dict[str, Bools], dict
         slots = mission.formation_slots(formation)
         if slots is None or len(slots) < 2:
             continue
-        pairs = complete_graph(len(slots))
-        intended = distances(slots, pairs)
-        metrics["shape_end"] = error = max_edge_error(r, pairs, intended)
+        fits = [*fits_of(r, slots, np.arange(len(slots)), allowed)]
+        metrics["shape_end"] = error = np.array([fit.error for fit in fits])
         metrics["shape"] = np.fmax(metrics["shape"], error)
-        misshapen = error > allowed(intended.min())
-        mirrored = np.zeros(count, dtype=bool)
-        if dimension(slots, THIN) == 3:
-            x = r - r.mean(axis=1, keepdims=True)
-            mirrored = np.linalg.det(x.swapaxes(1, 2) @ centred(slots)) < 0.0
-            metrics["handed"] = np.fmin(metrics["handed"], np.where(mirrored, 0.0, 1.0))
+        misshapen = error > fits[0].limit
+        mirrored = np.array([fit.is_mirrored for fit in fits])
+        if fits[0].dimension == 3:
+            metrics["handed"] = np.fmin(metrics["handed"], 1.0 - mirrored)
         if judged:
             wrong["shape"] |= misshapen
             wrong["handedness"] |= mirrored & ~misshapen
