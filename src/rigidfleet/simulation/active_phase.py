@@ -92,18 +92,13 @@ class ActivePhase:
         self.begun = False  # whether samples exist since the start or the last loss
         self.flown: Problem | None = None  # the problem of the steps in the trail
         self.state: IntegratorState
-        self._start(plan.initial_state(), plan.start)
-
-    def _start(self, y: Floats, t: float) -> None:
-        """Start to integrate the plan at a state (n,) and time [s]."""
-        self.workspace, self.solver = workspace_and_solver(self.plan, self.workspaces)
-        self.begin(y, t)
+        self.begin(plan.initial_state(), plan.start)
 
     # -- what differs between points and vehicles ---------------------------------------------------
 
     def begin(self, y: Floats, t: float) -> None:
-        """Begin the ``state`` of the integration at a state vector (n,) and time [s]."""
-        raise NotImplementedError
+        """Begin the ``state`` of the integration at a state (n,) and time [s]: at the start, and after a loss."""
+        self.workspace, self.solver = workspace_and_solver(self.plan, self.workspaces)
 
     def fly(self, problem: Problem, t_end: float) -> None:
         """Fly to ``t_end`` [s] and record the samples on the way."""
@@ -193,7 +188,8 @@ class ActivePhase:
     def _problem_under_controller(self, controller: Controller) -> Problem:
         """The problem with what a user's controller asks for now: forces, or a command of vehicles."""
         self.drop_command()
-        answer = call_user("the controller", self.t, controller, self.observe())
+        when = f"at t = {self.t:.3f} s"
+        answer = call_user("the controller", when, controller, self.observe())
         if isinstance(answer, Command):
             return self.problem_under(answer)
         force = checked_force(answer, len(self.lost), "the controller", self.t)
@@ -286,7 +282,7 @@ class ActivePhase:
         rest = y[6 * n + len(kept) :]
         y = np.concatenate([y[: 6 * n], integral, rest])
         self.begun = False
-        self._start(y, self.t)
+        self.begin(y, self.t)
         if own:
             return plan.problem
         mu = plan.problem.law.mu

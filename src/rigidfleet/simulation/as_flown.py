@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import Any
 
 from rigidfleet.errors import Finding, MissionError, wrong_type
@@ -107,16 +108,14 @@ def check_formation(mission: Mission, phase: Phase) -> None:
     shaping = phase.shaping
     if shaping is None:
         return
-    name, known = shaping.formation, mission.formations
+    name, known, problem = shaping.formation, mission.formations, ""
     if name not in known:
-        remedy = suggest(name, known) or f"formations: {', '.join(known)}"
         problem = "there is no such formation"
-        raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
-    if phase.control == "tracking" and mission.formation_slots(name) is None:
-        problem, remedy = (
-            "has no slots to track",
-            "give it a shape or slots, or use another control",
-        )
+        remedy = suggest(name, known) or f"formations: {', '.join(known)}"
+    elif phase.control == "tracking" and mission.formation_slots(name) is None:
+        problem = "has no slots to track"
+        remedy = "give it a shape or slots, or use another control"
+    if problem:
         raise MissionError([Finding("begin()", "formation", name, problem, remedy)])
 
 
@@ -126,12 +125,9 @@ def _with_unique_names(flown: Sequence[PhaseRecord]) -> list[PhaseRecord]:
     seen: set[str] = set()
     records = []
     for record in flown:
-        name, count = record.name, 1
-        while name in seen:
-            count += 1
-            name = f"{record.name} ({count})"
-            if name in taken:  # by a phase of that name
-                name = record.name
+        others = (f"{record.name} ({k})" for k in count(2))
+        free = (name for name in others if name not in seen | taken)
+        name = next(free) if record.name in seen else record.name
         seen.add(name)
         records.append(replace(record, name=name))
     return records

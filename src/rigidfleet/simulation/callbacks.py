@@ -88,13 +88,12 @@ Command = AttitudeCommand | RotorCommand
 Controller = Callable[[Observation], "ArrayLike | Command"]
 
 
-def call_user(who: str, t: float, function: Callable[..., Any], *arguments: object) -> Any:
+def call_user(who: str, when: str, function: Callable[..., Any], *arguments: object) -> Any:
     """What a user's function returns; its exceptions are told as those of a flight."""
     try:
         return function(*arguments)
     except Exception as error:
-        words = f"{who} raised {type(error).__name__} at t = {t:.3f} s: {error}"
-        raise FlightError(words) from error
+        raise FlightError(f"{who} raised {type(error).__name__} {when}: {error}") from error
 
 
 def article_and_kind(command: Command) -> str:
@@ -111,10 +110,12 @@ def finite_numbers(x: ArrayLike, shape: tuple[int, ...]) -> Floats:
         They are something else, which the message names.
     """
     try:
-        complex_numbers, array = np.iscomplexobj(x), np.array(x, dtype=np.float64, order="C")
+        array = np.asarray(x)
+        if array.dtype.kind != "c":
+            array = np.array(array, dtype=np.float64, order="C")
     except (TypeError, ValueError):
         raise ValueError(reprlib.repr(x)) from None
-    if complex_numbers:
+    if array.dtype.kind == "c":
         raise ValueError("complex numbers")
     if array.shape != shape:
         raise ValueError(f"an array of shape {array.shape}")
@@ -181,7 +182,7 @@ class ExternalForce:
             x = places(r).copy(), places(v).copy()
             try:
                 if self.error is None:
-                    answer = call_user("the force", t, force, t, *x)
+                    answer = call_user("the force", f"at t = {t:.3f} s", force, t, *x)
                     places(f)[:] = checked_force(answer, n, "the force", t)
                     return
             except BaseException as error:

@@ -99,7 +99,7 @@ def establish(
     return Ensemble(
         flights.r,
         flights.v,
-        flights.error,
+        max_edge_error(flights.r, flights.plan.edges, flights.plan.distances),
         flights.finished,
         flights.evaluations,
         tuple(ends),
@@ -142,15 +142,8 @@ class _Flights:
         self.integral: dict[tuple[int, int], Floats] = {}
         self.finished = np.ones(count, dtype=bool)
         self.evaluations = np.zeros(count, dtype=np.int64)
-        self.plan: PhasePlan | None = None
+        self.plan: PhasePlan  # that flew last
         self.vectors = True
-
-    @property
-    def error(self) -> Floats:
-        """Greatest error (B,) of a distance of the last formation [m]."""
-        if self.plan is None:
-            return np.zeros(len(self.r))
-        return max_edge_error(self.r, self.plan.edges, self.plan.distances)
 
     def fly(self, phase: Phase, vectors: bool | None, threads: int) -> None:
         """Fly one phase and store its final states."""

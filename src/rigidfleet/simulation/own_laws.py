@@ -15,7 +15,7 @@ from rigidfleet.errors import FlightError
 from rigidfleet.kernel.fleet import ANSWERED, TICKS, SampledFlight, SampledState
 from rigidfleet.kernel.mail import NONE
 from rigidfleet.kernel.problem import TRACKING, Problem, Workspace
-from rigidfleet.simulation.callbacks import finite_numbers
+from rigidfleet.simulation.callbacks import call_user, finite_numbers
 from rigidfleet.typing import Floats
 
 
@@ -113,11 +113,7 @@ class OwnLaws:
         for i, view in enumerate(self.views(phase, problem, w, flight, state)):
             if view is None:
                 continue
-            try:
-                answer = self.laws[i](view)
-            except Exception as error:
-                what = f"the law of agent {i + 1} raised {type(error).__name__} {where}: {error}"
-                raise FlightError(what) from error
+            answer = call_user(f"the law of agent {i + 1}", where, self.laws[i], view)
             try:
                 state.f_u[i], said[i], numbers = _answer_of(answer)
             except ValueError as unfit:

@@ -48,6 +48,7 @@ class PointPhase(ActivePhase):
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to integrate at a state (n,) and time [s]."""
+        super().begin(y, t)
         plan = self.plan
         self.aside = plan.large and self.external is None
         self.state = self.extremes.begin(

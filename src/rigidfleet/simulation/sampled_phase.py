@@ -132,6 +132,7 @@ class SampledPhase(ActivePhase):
 
     def begin(self, y: Floats, t: float) -> None:
         """Begin to fly at a state (n,) and time [s]; vehicles go on from the states that they have."""
+        super().begin(y, t)
         plan, fleet_state = self.plan, self.vehicles
         n, m = len(plan.masses), len(plan.edges)
         rtol, atol = plan.integrator.rtol, plan.tolerances
@@ -275,16 +276,14 @@ class SampledPhase(ActivePhase):
         """The plan's problem, beside the thrust and attitude, or the speeds of rotors, that a controller commands."""
         t = self.t
         arrays = checked_command(command, len(self.lost), t)
+        why = ""
         if self.flight.vehicles.point.any():
-            raise FlightError(
-                f"the controller returned {article_and_kind(command)} at t = {t:.3f} s, but some agents are points;"
-                " return forces [N]"
-            )
-        if self.vehicles.avoidance is not None:
-            raise FlightError(
-                f"the controller returned {article_and_kind(command)} at t = {t:.3f} s, which [avoidance] cannot"
-                " change; return forces [N], or remove [avoidance]"
-            )
+            why = "but some agents are points; return forces [N]"
+        elif self.vehicles.avoidance is not None:
+            why = "which [avoidance] cannot change; return forces [N], or remove [avoidance]"
+        if why:
+            what = article_and_kind(command)
+            raise FlightError(f"the controller returned {what} at t = {t:.3f} s, {why}")
         if isinstance(command, AttitudeCommand):
             commands = self.flight.commands._replace(kind=fleet.ATTITUDE, **arrays)
         else:
