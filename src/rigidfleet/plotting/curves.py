@@ -385,9 +385,6 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     large = seen[seen > _SMALLEST]
     if len(large):
         ax.set_ylim(max(_SMALLEST, 0.5 * float(large.min())), 3 * float(large.max()))
-        if ax.get_ylim()[0] == _SMALLEST and len(large) < len(seen):
-            words = f"not drawn: below {_SMALLEST:g} m (rounding)"
-            st.annotate(ax, words, st.corner_places()[::-1], color=st.GREY)
     else:
         ax.set_ylim(_SMALLEST, 1.0)
         st.write_note(ax, f"only rounding errors: at most {seen.max():.1g} m")
@@ -433,7 +430,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
             st.draw_limit(ax, limit, f"limit {limit:g} m")
         return
     st.draw_line(ax, result.time, values, color=st.TONES[0])
-    st.draw_limit(ax, limit, f"limit {limit:g} m" if limit or name == "people" else "contact")
+    st.draw_limit(ax, limit, f"limit {limit:g} m")
     if name == "separation":
         _draw_planned(ax, result)
         if (flying := QUANTITIES["separation_flying"].limit_of(result.mission)) is not None:
@@ -448,8 +445,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
     look: dict[str, Any] = {"markerfacecolor": "none", "markeredgecolor": st.INK}
     ax.plot(x.time, x.value, "o", markersize=5, clip_on=False, **look)
     who = st.clean_name(owner_name(result, q, x.who, x.other))
-    places = st.places_around(x.time, x.value)
-    st.annotate(ax, f"{x.value:.3g} m at {x.time:.2f} s, {who}", places)
+    st.write_above(ax, f"least {x.value:.3g} m at {x.time:.2f} s, {who}")
     low, high = min(float(np.nanmin(values)), limit), max(float(np.nanmax(values)), limit)
     room = 0.25 * max(high, -low, 0.1)
     ax.set_ylim(min(low, 0.0) - room, max(high, 0.0) + room)
@@ -462,9 +458,7 @@ def _draw_planned(ax: Axes, result: Result) -> None:
     for least, p in proved:
         ax.hlines(least, p.t_start, p.t_end, st.ALERT, linewidth=0.8, linestyle=":", gid="planned")
     if proved:
-        least, p = min(proved, key=lambda each: each[0])
-        words = f"as planned, less {allowed:g} m"
-        st.annotate(ax, words, st.places_around(p.t_start, least), color=st.ALERT)
+        st.write_above(ax, f"dotted: as planned, less {allowed:g} m")
 
 
 def _distances_shown(result: Result) -> list[str]:

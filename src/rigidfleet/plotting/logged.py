@@ -125,16 +125,14 @@ def plan_and_flight(result: Result) -> Figure:
             below.plot(time[k], 1e3 * off.far[k, i], **bold)
         if mine:
             worst = max(mine, key=lambda drift: drift.worst)
-            words = f"{names[i]}: {value(1e3 * worst.worst, 'mm')} at {worst.at:.2f} s"
-            place = st.places_around(worst.at, 1e3 * worst.worst)
-            st.annotate(below, words, place, color=colours[i])
+            names[i] += f": {value(1e3 * worst.worst, 'mm')} at {worst.at:.2f} s"
     below.set_ylim(0.0, 1.25 * float(np.fmax.reduce(high, axis=None, initial=1e-3)))
     words = "unusual from" if result.mission.limits.tracking_error is None else "limit"
     st.draw_limit(below, 1e3 * off.limit, f"{words} {value(1e3 * off.limit, 'mm')}")
     above.set(xlabel="x, east [m]", ylabel="y, north [m]")
     above.set_aspect("equal", adjustable="datalim")
     below.set(xlabel="time [s]", ylabel="distance from the slot [mm]")
-    look = {"loc": "outside lower center", "ncols": min(n + 1, 8)}
+    look = {"loc": "outside lower center", "ncols": min(n + 1, 4)}
     entries = [st.legend_entry(names[i], color=colours[i]) for i in shown]
     fig.legend(handles=[*entries, st.legend_entry("plan", **st.REFERENCE)], **look)
     return fig

@@ -63,6 +63,7 @@ def summary(result: Result) -> Figure:
     for ax in over_time:
         st.draw_time_axis(ax, result)
         ax.set_xlabel("time [s]")
+    key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     if curves.has_edges(result):
         curves.draw_distances(lengths, result)
     elif result.mission.obstacles and result.n_agents > 1:
@@ -74,7 +75,6 @@ def summary(result: Result) -> Figure:
     _draw_attitude(angles, result)
     curves.draw_thrust(thrust, result)
     curves.draw_least(apart, result, "clearance" if result.mission.obstacles else "separation")
-    key = textwrap.fill(st.number_phases(over_time, result), 150, max_lines=3, placeholder=" …")
     entries = space.legend_handles(result, view)
     fig.legend(
         handles=entries, loc="lower center", ncols=math.ceil(len(entries) / (1 if len(entries) <= 10 else 2)),

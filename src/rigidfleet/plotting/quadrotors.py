@@ -163,4 +163,4 @@ def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
     ax.set_yticks(range(1, n + 1))
     ax.set_ylabel("saturated\nagent")
     limit = QUANTITIES["saturation"].limit_of(result.mission)
-    st.annotate(ax, f"limit {limit:.3g} % of a phase", st.corner_places(), color=st.ALERT)
+    st.write_above(ax, f"limit {limit:.3g} % of a phase")

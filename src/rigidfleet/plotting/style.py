@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-    from matplotlib.text import Annotation, Text
-    from matplotlib.transforms import Bbox
+    from matplotlib.text import Text
 
 Draw = Callable[..., "Figure"]
 
@@ -50,7 +49,7 @@ _COLUMN = 5.5  # a figure that is narrower has one column of axes [in]
 _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
 _DOT = _DPI / 100  # a hundredth of an inch [pixels]
-_OUTSIDE = 100  # cost of a text that leaves its axes
+_LETTERS = 19  # of words above an axes in an inch of its width
 _LONGEST = 28  # greatest length of a phase name
 _POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
 #: Number of agents or edges beyond which the spread is drawn instead of each line.
@@ -61,10 +60,6 @@ _ENTRIES = 12  # greatest number of entries of a legend
 STILL = 1e-3
 _ROUNDING = 1e-9  # smaller deviations are not mentioned
 
-#: A possible place of a text: a point and its coordinate system, an offset [points] from it, alignment.
-Place = tuple[tuple[float, float], Any, tuple[float, float], str, str]
-#: Positions along the width of an axes, ends and middle first.
-_ALONG = ((0.995, "right"), (0.5, "center"), (0.005, "left"), (0.75, "center"), (0.25, "center"))
 #: Whether figures have titles, and their width [mm]; None for the usual one.
 _shape: ContextVar[tuple[bool, float | None]] = ContextVar("shape", default=(True, None))
 
@@ -97,9 +92,7 @@ def in_style(draw: Draw) -> Draw:
     @wraps(draw)
     def draw_in_style(*what: Any, **more: Any) -> Figure:
         with apply_style():
-            figure = draw(*what, **more)
-            place_annotations(figure)
-            return figure
+            return draw(*what, **more)
 
     return draw_in_style
 
@@ -279,103 +272,22 @@ def draw_reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
 def draw_limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
     """Draw a limit as a line with its name."""
     ax.axhline(value, color=colour, linewidth=1.0, linestyle=(0, (6, 2)), zorder=2.5, gid="limit")
-    along: list[Place] = [
-        ((x, value), ("axes fraction", "data"), (0, away), ha, va)
-        for x, ha in _ALONG
-        for va, away in (("bottom", 2), ("top", -2))
-    ]
-    annotate(ax, label, [*along, *corner_places()], color=colour)
+    write_above(ax, label)
 
 
-# -- text that covers nothing --------------------------------------------------------------------------
+# -- words about what is drawn ------------------------------------------------------------------------
 
 
-def annotate(ax: Axes, text: str, places: Sequence[Place], **look: Any) -> None:
-    """Write text in an axes, at the first of ``places`` where it covers neither lines nor other text."""
-    (x, y), units, offset, ha, va = places[0]
-    label = ax.annotate(
-        text, (x, y), offset, xycoords=units, textcoords="offset points", ha=ha, va=va, fontsize=7.5,
-        path_effects=halo(), parse_math=False, annotation_clip=False, zorder=6, gid="words", **look,
+def write_above(ax: Axes, words: str, colour: str = INK) -> None:
+    """Write words above an axes, where they cover nothing, behind those that stand there."""
+    before = ax.get_title(loc="right").replace("\n", " ")
+    whole = f"{before}  ·  {words}" if before else words
+    letters = int(_LETTERS * ax.bbox.width / _DPI)
+    over_phases = any(text.get_gid() == "phase" for text in ax.texts)
+    ax.set_title(
+        textwrap.fill(whole, letters), loc="right", pad=13.0 if over_phases else 3.0, fontsize=7.5, color=colour,
+        fontweight="normal", parse_math=False, gid="words",
     )  # fmt: skip
-    label.set_in_layout(False)
-    figure: Any = ax.figure
-    figure.words.append((label, places))
-
-
-def corner_places() -> list[Place]:
-    """Places along the top of an axes, then along its bottom."""
-    return [
-        ((x, y), "axes fraction", (0, -3 if va == "top" else 3), ha, va)
-        for y, va in ((1.0, "top"), (0.0, "bottom"))
-        for x, ha in _ALONG
-    ]
-
-
-def places_around(x: float, y: float) -> list[Place]:
-    """Places around a data point, near ones first, those below first."""
-    sides = (("center", 0.0), ("left", 1.0), ("right", -1.0))
-    near: list[Place] = [
-        ((x, y), "data", (6 * side, sign * away), ha, "top" if sign < 0 else "bottom")
-        for away in (6, 13, 22)
-        for sign in (-1, 1)
-        for ha, side in sides
-    ]
-    beside: list[Place] = [((x, y), "data", (8 * s, 0), ha, "center") for ha, s in sides[1:]]
-    return near[:6] + beside + near[6:]
-
-
-def place_annotations(fig: Any) -> None:
-    """Lay the figure out, and move annotated text to where it covers nothing, or least."""
-    engine = fig.get_layout_engine()
-    if engine is not None:
-        engine.execute(fig)
-    waiting = [text for text, _ in fig.words]
-    for label, places in fig.words:
-        waiting.remove(label)
-        ax = label.axes
-        # Phase names stand outside; text without a place yet covers nothing.
-        others = [
-            text.get_window_extent() for text in ax.texts
-            if text is not label and text not in waiting and text.get_gid() != "phase"
-        ]  # fmt: skip
-        best, chosen = math.inf, places[0]
-        for place in places:
-            _move(label, place)
-            covered = _overlap_cost(ax, label.get_window_extent().padded(2 * _DOT), others)
-            if covered < best:
-                best, chosen = covered, place
-            if not covered:
-                break
-        _move(label, chosen)
-        if best >= _OUTSIDE:  # beside its place rather than off the page
-            box, page = label.get_window_extent(), ax.bbox
-            over = min(0.0, page.x1 - box.x1) or max(0.0, page.x0 - box.x0)
-            label.set_position((chosen[2][0] + 72.0 * over / fig.dpi, chosen[2][1]))
-
-
-def _move(label: Annotation, place: Place) -> None:
-    label.xy, label.xycoords, offset, ha, va = place
-    label.set_position(offset)
-    label.set(ha=ha, va=va)
-
-
-def _overlap_cost(ax: Axes, box: Bbox, others: Sequence[Bbox]) -> int:
-    """Cost of a box [pixels] for what it covers: lines, bands, other boxes; highest for parts outside the axes."""
-    n = sum(box.overlaps(other) for other in others)
-    for line in ax.lines:
-        path = line.get_transform().transform_path(line.get_path())
-        if line.get_linestyle() in ("None", ""):
-            n += int(box.padded(3 * _DOT).count_contains(path.vertices) > 0)
-        else:
-            n += bool(path.intersects_bbox(box, filled=False))
-    for band in ax.collections:
-        paths = map(band.get_transform().transform_path, band.get_paths())
-        n += sum(bool(path.intersects_bbox(box, filled=True)) for path in paths)
-    inside = ax.bbox.padded(_DOT)
-    if not (inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)):
-        over = (inside.x0 - box.x0, box.x1 - inside.x1, inside.y0 - box.y0, box.y1 - inside.y1)
-        n += _OUTSIDE + int(max(over))
-    return n
 
 
 def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
@@ -388,8 +300,7 @@ def note_if_still(ax: Axes, values: Floats, unit: str) -> bool:
     caption = f"{value:.6g} {unit} throughout" + (f", within {off:.1g}" if off > _ROUNDING else "")
     ax.set_ylim(value - 1.0, value + 1.0)
     ax.set_yticks([value], [f"{value:.6g}"])
-    place: Place = (0.5, value), ("axes fraction", "data"), (0, 5), "center", "bottom"
-    annotate(ax, caption, [place], color=GREY)
+    ax.text(0.5, 0.55, caption, transform=ax.transAxes, ha="center", fontsize=7.5, color=GREY)
     return True
 
 
