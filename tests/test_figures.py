@@ -656,18 +656,18 @@ def test_shape_error_is_that_of_the_worst_pair():
     np.testing.assert_allclose(curves.shape_error(grown), 0.4)
 
 
-def test_thinned_lines_keep_their_peaks():
-    """Of 200,000 samples a few thousand are drawn, with the ends and the single sample that peaks."""
-    t = np.linspace(0, 90, 200_000)
-    y = np.sin(t)
-    y[[77_777, 123_456]] = 100.0, -100.0
-    x, z = style.thin_out(t, y)
-    assert len(x) < 4000
-    assert (np.diff(x) > 0).all()
-    assert (x[0], x[-1]) == (t[0], t[-1])
-    assert (z.max(), z.min()) == (100.0, -100.0)
-    assert style.thin_out(t[:100], y[:100])[0] is not None
-    np.testing.assert_array_equal(style.thin_out(t[:100], y[:100])[1], y[:100])
+def test_many_samples_are_light_and_keep_their_peaks():
+    """Of 20,001 samples an SVG has what can be seen of them, with the single sample that peaks."""
+    thrust = np.full((20_001, 3), 9.8) + 0.1 * np.sin(np.linspace(0, 90, 20_001))[:, None]
+    thrust[7_777, 1] = 20.0
+    flight = a_flight(samples=20_001, thrust=thrust)
+    (svg,) = plotting.render_figure(flight, "inputs", ["svg"]).values()
+    assert len(svg) < 200_000
+    (path,) = [e for e in ET.fromstring(svg).iter() if e.get("id") == "agent-2"][:1]
+    (curve,) = [e.get("d", "") for e in path.iter() if e.tag.endswith("}path")]
+    heights = np.array([float(y) for y in re.findall(r"[ML] \S+ (\S+)", curve)])
+    usual = np.median(heights)
+    assert usual - heights.min() > 20 * (heights.max() - usual)
 
 
 def test_a_flight_that_breaks_down_is_still_readable():

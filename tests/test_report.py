@@ -115,8 +115,8 @@ def test_page_is_whole(calm, tmp_path):
     path = tmp_path / "report.html"
     report(calm, path)
     page = Page(path.read_text(encoding="utf-8"))
-    # and the answer of the gains, and the sketch of the first page
-    assert len(page.sources) == len(plotting.figure_names(calm)) + 2
+    # and the sketch of the first page
+    assert len(page.sources) == len(plotting.figure_names(calm)) + 1
     for source in page.sources:
         head, _, data = source.partition(",")
         assert head == "data:image/svg+xml;base64"

@@ -99,7 +99,7 @@ def draw_edge_lines(ax: Axes, result: Result, values: Floats, **look: Any) -> No
             st.draw_spread(ax, result.time, of_group, group.colour)
             continue
         for x in of_group.T:
-            st.draw_line(ax, result.time, x, color=group.colour, **look)
+            ax.plot(result.time, x, color=group.colour, **look)
 
 
 def edge_handles(result: Result) -> list[Line2D]:
@@ -166,7 +166,7 @@ def _draw_components(result: Result, axes: Any, column: _Column) -> None:
     flown, wanted, targets, names, unit = column
     for i, (ax, name) in enumerate(zip(axes, names.split(), strict=True)):
         goals = np.array([goal[i] for _, goal in targets], dtype=float)
-        st.draw_line(ax, result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
+        ax.plot(result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
         st.draw_reference(ax, result.time, wanted[:, i])
         for t, goal in targets:
             ax.plot(t, goal[i], **_RING, markeredgewidth=1.0, zorder=4, clip_on=False)
@@ -369,12 +369,12 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     if np.isfinite(shape).any():
         look: dict[str, Any] = {"color": st.FLOWN, "linewidth": 2.0, "zorder": 1.9}
         known = np.isfinite(shape) if result.n_agents > st.MANY else slice(None)
-        st.draw_line(ax, result.time[known], shape[known], **look)
+        ax.plot(result.time[known], shape[known], **look)
         handles.append(st.legend_entry("greatest error of all pairs", **look))
     if np.isfinite(size).any():
         draw_edge_lines(ax, result, size, linewidth=0.6, alpha=0.7)
         look = {"color": st.INK, "linewidth": 1.3}
-        st.draw_line(ax, result.time, np.fmax.reduce(size, axis=1), **look)
+        ax.plot(result.time, np.fmax.reduce(size, axis=1), **look)
         handles.append(st.legend_entry("greatest |c| of an edge", **look))
     if not handles:
         st.write_note(ax, "neither edges nor slots")
@@ -429,7 +429,7 @@ def draw_least(ax: Axes, result: Result, name: str) -> None:
             ax.set_ylim(0.0, 1.4 * limit)
             st.draw_limit(ax, limit, f"limit {limit:g} m")
         return
-    st.draw_line(ax, result.time, values, color=st.TONES[0])
+    ax.plot(result.time, values, color=st.TONES[0])
     st.draw_limit(ax, limit, f"limit {limit:g} m")
     if name == "separation":
         _draw_planned(ax, result)

@@ -116,7 +116,7 @@ def plan_and_flight(result: Result) -> Figure:
         above.plot(*result.position[:, i, :2].T, **look, linewidth=1.4)
         above.plot(*slots[:, i, :2].T, **st.REFERENCE, zorder=3)
         below.fill_between(time, low[:, i], high[:, i], **look, alpha=0.25, linewidth=0)
-        st.draw_line(below, time, 1e3 * off.far[:, i], **look)
+        below.plot(time, 1e3 * off.far[:, i], **look)
         mine = [drift for drift in off.drift_spans(time) if drift.who == i]
         for drift in mine:  # where and when it is off, in bold
             k = slice(*np.searchsorted(time, [drift.start, drift.end]))

@@ -34,7 +34,7 @@ def messages(result: Result) -> Figure:
     if net.silence < 2.0 * np.nanmax(age, initial=0.0):
         st.draw_limit(above, net.silence, f"an edge is let go: {net.silence:g} s")
     push = np.linalg.norm(np.nansum(result.constraint_force, axis=1), axis=1)
-    st.draw_line(below, result.time, push, color=st.FLOWN)
+    below.plot(result.time, push, color=st.FLOWN)
     if push.max() > _DIVERGES * np.median(push) > 0.0:
         below.set_yscale("log")
     else:

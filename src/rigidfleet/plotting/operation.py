@@ -71,6 +71,6 @@ def _draw_vehicle_lines(
         return st.agent_line_handles(result.n_agents)
     colours = st.agent_colours(len(agents))
     return [
-        st.draw_line(ax, result.time, values[:, i - 1], color=colour, label=f"agent {i}")
+        ax.plot(result.time, values[:, i - 1], color=colour, label=f"agent {i}")[0]
         for i, colour in zip(agents, colours, strict=True)
     ]

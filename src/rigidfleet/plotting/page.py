@@ -37,7 +37,7 @@ def _draw_attitude(ax: Axes, result: Result) -> None:
     handles = []
     for i, (name, width) in enumerate((("roll", 1.2), ("pitch", 1.8), ("yaw", 2.4))):
         look: dict[str, Any] = {"color": st.TONES[i], "linewidth": width, "zorder": 2.3 - 0.1 * i}
-        st.draw_line(ax, result.time, flown[:, i], **look)
+        ax.plot(result.time, flown[:, i], **look)
         st.draw_reference(ax, result.time, wanted[:, i])
         handles.append(st.legend_entry(name, **look))
     _legend_above(ax, handles)

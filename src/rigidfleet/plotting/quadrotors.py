@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from rigidfleet.mission import Mission
 
-_ROWS = 12  # greatest number of vehicles with a bar each; of more, their number is drawn
 _TEXT_ROW = 0.35  # height of a row that holds only text
 
 
@@ -94,7 +93,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
         i = e.who
     colours = st.colour_scale(4)
     for k, colour in enumerate(colours):
-        st.draw_line(ax, result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
+        ax.plot(result.time, force[:, i, k], color=colour, linewidth=1.9 - 0.35 * k)
     Panel(ax, result, force[:, i], "N").leave_out_final_peak()
     low, high = ax.get_ylim()
     if limits[i] < high + 0.3 * (high - low):
@@ -145,22 +144,19 @@ def draw_with_limit(ax: Axes, result: Result, name: str, values: Floats | None =
 
 
 def _draw_saturation(ax: Axes, result: Result, saturated: Bools) -> None:
-    """A bar for each vehicle while it is saturated; of many vehicles, how many are."""
+    """A bar for each vehicle while it is saturated."""
+    from matplotlib.ticker import MaxNLocator
+
     n, t = result.n_agents, result.time
     if not saturated.any():
         st.write_note(ax, "no vehicle is asked for more than its rotors give")
-        return
-    if n > _ROWS:
-        ax.fill_between(t, saturated.sum(axis=1), step="post", color=st.FLOWN, linewidth=0)
-        ax.set_ylim(0, 1.12 * max(1, int(saturated.sum(axis=1).max())))
-        ax.set_ylabel("saturated\n[vehicles]")
         return
     for i, colour in enumerate(st.agent_colours(n)):
         last = np.append(t, t[-1])
         bars = [(t[a], last[b] - t[a]) for a, b in true_runs(saturated[:, i])]
         ax.broken_barh(bars, (i + 0.6, 0.8), color=colour, linewidth=0.4)
     ax.set_ylim(n + 0.6, 0.4)
-    ax.set_yticks(range(1, n + 1))
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_ylabel("saturated\nagent")
     limit = QUANTITIES["saturation"].limit_of(result.mission)
     st.write_above(ax, f"limit {limit:.3g} % of a phase")

@@ -9,7 +9,6 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,7 +50,6 @@ _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is 
 _DOT = _DPI / 100  # a hundredth of an inch [pixels]
 _LETTERS = 19  # of words above an axes in an inch of its width
 _LONGEST = 28  # greatest length of a phase name
-_POINTS = 3000  # greatest number of samples of a line; more would be drawn over each other
 #: Number of agents or edges beyond which the spread is drawn instead of each line.
 MANY = 200
 _ENTRIES = 12  # greatest number of entries of a legend
@@ -246,27 +244,9 @@ def legend_entry(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
-def draw_line(ax: Axes, t: Floats, y: Floats, **look: Any) -> Line2D:
-    """Line through samples y (K,) at t (K,), thinned if there are more than can be seen."""
-    return ax.plot(*thin_out(t, y), **look)[0]
-
-
-def thin_out(t: Floats, y: Floats, most: int = _POINTS) -> tuple[Floats, Floats]:
-    """About `most` samples or fewer that look the same: the first, least and greatest of each interval."""
-    if len(t) <= most:
-        return t, y
-    keep = {0, len(t) - 1}
-    for start, stop in pairwise(np.linspace(0, len(t), most // 3 + 1).astype(int).tolist()):
-        part = y[start:stop]
-        low, high = np.where(np.isnan(part), np.inf, part), np.where(np.isnan(part), -np.inf, part)
-        keep |= {start, start + int(low.argmin()), start + int(high.argmax())}
-    kept = sorted(keep)
-    return t[kept], y[kept]
-
-
-def draw_reference(ax: Axes, t: Floats, y: Floats) -> Line2D:
+def draw_reference(ax: Axes, t: Floats, y: Floats) -> None:
     """Draw a reference as a dashed line."""
-    return draw_line(ax, t, y, **REFERENCE, zorder=3)
+    ax.plot(t, y, **REFERENCE, zorder=3)
 
 
 def draw_limit(ax: Axes, value: float, label: str, colour: str = ALERT) -> None:
@@ -344,7 +324,7 @@ def draw_spread(ax: Axes, t: Floats, values: Floats, colour: str) -> None:
     look: dict[str, Any] = {"color": colour, "linewidth": 0.0, "zorder": 2.0}
     ax.fill_between(t, least, greatest, alpha=0.25, **look, gid="spread")
     ax.fill_between(t, low, high, alpha=0.45, **look)
-    draw_line(ax, t, middle, color=colour, linewidth=1.4, zorder=2.1)
+    ax.plot(t, middle, color=colour, linewidth=1.4, zorder=2.1)
 
 
 def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
@@ -359,7 +339,7 @@ def draw_agent_lines(ax: Axes, result: Result, values: Floats) -> None:
     for i, colour in enumerate(agent_colours(n)):
         width = 1.0 + 1.6 * (n - 1 - i) / max(n - 1, 1)
         name = f"agent-{i + 1}"
-        draw_line(ax, result.time, values[:, i], color=colour, linewidth=width, gid=name)
+        ax.plot(result.time, values[:, i], color=colour, linewidth=width, gid=name)
 
 
 def agent_handles(n: int, **look: Any) -> list[Line2D]:

@@ -32,14 +32,6 @@ def gain_lines(mission: Mission) -> list[GainLine]:
     return [*constraint, *_tracking_lines(mission), *_regulator_lines(mission)]
 
 
-def error_response(mission: Mission, t: list[float]) -> list[float] | None:
-    """Error c(t)/c(0) of a distance with c'(0) = 0; None without stabilisation."""
-    c = mission.constraint
-    if c.stabilisation == "none" or not len(mission.edges):
-        return None
-    return pid.error_response(c.alpha, c.beta, c.gamma, 1.0, 0.0, 0.0, t)[0].tolist()
-
-
 def _constraint_lines(mission: Mission) -> list[GainLine]:
     c = mission.constraint
     lines = []
