@@ -95,7 +95,7 @@ def figure_names(result: Result | None = None) -> list[str]:
     """
     if result is None:
         return list(_FIGURES)
-    return [name for name, draw in _FIGURES.items() if vars(draw).get("there", bool)(result)]
+    return [name for name, draw in _FIGURES.items() if vars(draw)["there"](result)]
 
 
 def caption(name: str) -> str:

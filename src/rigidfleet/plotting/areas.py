@@ -72,7 +72,7 @@ def falls_of(result: Result) -> Floats:
     return Boundaries(result.mission).ends(result.position, result.velocity)[..., :2]
 
 
-@st.in_style
+@st.figure_of()
 def sketch(result: Result, falls: Floats) -> Figure:
     """The ground from above: fences, people, and where vehicles fly and fall (`falls_of`)."""
     fig = st.blank_figure(5.2, 3.6, "constrained")

@@ -138,8 +138,7 @@ def has_edges(result: Result) -> bool:
     return len(result.edges) > 0
 
 
-@st.in_style
-@st.needs(has_edges, "no edges")
+@st.figure_of(has_edges, "no edges")
 def distances(result: Result) -> Figure:
     """Distances of the active edges, with their references (dashed)."""
     fig, axes = st.time_figure(result, "Distances between agents", 1, height=3.4)
@@ -210,7 +209,7 @@ def _body_figure(result: Result, title: str, *columns: _Column) -> Figure:
     return fig
 
 
-@st.in_style
+@st.figure_of()
 def cm(result: Result) -> Figure:
     """Centre of mass: flown, reference (dashed) and waypoints (rings)."""
     places, speeds = _waypoint_values(result, "position"), _waypoint_values(result, "velocity")
@@ -249,8 +248,7 @@ def has_attitude(result: Result) -> bool:
     return bool(np.isfinite([result.attitude, result.attitude_reference]).any())
 
 
-@st.in_style
-@st.needs(has_attitude, "no body frame attached")
+@st.figure_of(has_attitude, "no body frame attached")
 def attitude(result: Result) -> Figure:
     """Attitude of the formation: flown, reference (dashed) and waypoints (rings)."""
     flown, wanted, targets = flown_and_wanted_euler(result)
@@ -278,8 +276,7 @@ def draw_thrust(ax: Axes, result: Result) -> None:
     panel.draw(distinct_limits(result.mission.fleet.thrust_limit), always=False)
 
 
-@st.in_style
-@st.needs(has_thrust, "forces are not known")
+@st.figure_of(has_thrust, "forces are not known")
 def inputs(result: Result) -> Figure:
     """Thrust of each vehicle with its limit, and enlarged."""
     fig, axes = st.time_figure(result, "Thrust of each agent", 2)
@@ -296,8 +293,7 @@ def inputs(result: Result) -> Figure:
     return fig
 
 
-@st.in_style
-@st.needs(has_edges, "no edges")
+@st.figure_of(has_edges, "no edges")
 def constraint_force(result: Result) -> Figure:
     """Constraint force on each vehicle, and tension of each edge (negative: the edge pushes)."""
     force, tension = np.linalg.norm(result.constraint_force, axis=2), -result.multiplier
@@ -320,8 +316,7 @@ def constraint_force(result: Result) -> Figure:
     return fig
 
 
-@st.in_style
-@st.needs(lambda result: result.disturbance_force is not None, "still air")
+@st.figure_of(lambda result: result.disturbance_force is not None, "still air")
 def disturbance(result: Result) -> Figure:
     """Aerodynamic force on each vehicle, and distance of each vehicle from its slot."""
     fig, axes = st.time_figure(result, "Aerodynamic force, and distance from the slots", 2)
@@ -391,8 +386,7 @@ def draw_error(ax: Axes, result: Result) -> list[Line2D]:
     return handles
 
 
-@st.in_style
-@st.needs(lambda result: has_edges(result) or result.mission.formations)
+@st.figure_of(lambda result: has_edges(result) or result.mission.formations)
 def constraint_error(result: Result) -> Figure:
     """Constraint error |c| of each edge (length minus reference), and shape error of all pairs."""
     title = "Constraint error, and shape error of all pairs against the slots"
@@ -473,8 +467,7 @@ def _distances_shown(result: Result) -> list[str]:
     return [name for name in there if there[name]]
 
 
-@st.in_style
-@st.needs(_distances_shown, "only one agent, and nothing near it")
+@st.figure_of(_distances_shown, "only one agent, and nothing near it")
 def clearance(result: Result) -> Figure:
     """Distances between surfaces, with the limits."""
     names = _distances_shown(result)
@@ -493,8 +486,7 @@ def limited_motions(result: Result) -> list[Quantity]:
     return [q for q in MOTIONS if q.limit_of(result.mission) is not None]
 
 
-@st.in_style
-@st.needs(limited_motions)
+@st.figure_of(limited_motions)
 def motion(result: Result) -> Figure:
     """Speed, acceleration and jerk of each vehicle, as far as they are limited, with their limits."""
     drawn = limited_motions(result) or [q for q in MOTIONS if q.by_phase]

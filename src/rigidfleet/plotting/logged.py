@@ -96,8 +96,7 @@ def log_names(result: Result) -> list[str]:
     return [st.clean_name(x) for x in result.statistics["names"]]
 
 
-@st.in_style
-@st.needs(lambda result: "bands" in result.statistics, "no log against a plan")
+@st.figure_of(lambda result: "bands" in result.statistics, "no log against a plan")
 def plan_and_flight(result: Result) -> Figure:
     """The plan (dashed) and the flight from above, and how far vehicles are from their slots, with what is in doubt."""
     fig = st.blank_figure(st.WIDTH, 3.9, "constrained")

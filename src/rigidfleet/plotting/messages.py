@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 _DIVERGES = 1e4
 
 
-@st.in_style
-@st.needs(lambda result: np.size(result.message_age or ()), "no network: one law knows all states")
+@st.figure_of(
+    lambda result: np.size(result.message_age or ()), "no network: one law knows all states"
+)
 def messages(result: Result) -> Figure:
     """Age of the oldest message that each vehicle goes by, and the force by which the group pushes itself."""
     fig, axes = st.time_figure(result, "Messages of neighbours", 2)

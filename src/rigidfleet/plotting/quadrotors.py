@@ -56,8 +56,7 @@ def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
     return max(every, key=lambda x: x.value / limits[x.who], default=None)
 
 
-@st.in_style
-@st.needs(has_rotors, "no rotors")
+@st.figure_of(has_rotors, "no rotors")
 def rotors(result: Result) -> Figure:
     """Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
@@ -104,8 +103,7 @@ def _draw_nearest(ax: Axes, result: Result) -> None:
     st.draw_legend(ax, entries, "nearest to its limit")
 
 
-@st.in_style
-@st.needs(has_rotors, "no rotors")
+@st.figure_of(has_rotors, "no rotors")
 def vehicles(result: Result) -> Figure:
     """Tilt of each vehicle, its distance from its slot, and when it is asked for more than its rotors give."""
     saturated = np.zeros(result.left.shape, dtype=np.bool_)

@@ -59,8 +59,7 @@ def tiled_figure(n: int, above: float, below: float) -> tuple[Figure, list[Axes]
     return fig, axes.ravel().tolist()[:n]
 
 
-@st.in_style
-@st.needs(lambda result: result.mission.formations, "the mission has no formation")
+@st.figure_of(lambda result: result.mission.formations, "the mission has no formation")
 def formations(result: Result) -> Figure:
     """Formations with their edges and body axes."""
     names = list(result.mission.formations)

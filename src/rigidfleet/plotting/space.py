@@ -332,7 +332,7 @@ def legend_handles(result: Result, view: Scene) -> list[Any]:
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 
 
-@st.in_style
+@st.figure_of()
 def trajectory(result: Result) -> Figure:
     """Paths of the vehicles, and the formation at selected times."""
     wide = st.figure_width(10.5)

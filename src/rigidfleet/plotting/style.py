@@ -84,32 +84,24 @@ def apply_style() -> Generator[None]:
         yield
 
 
-def in_style(draw: Draw) -> Draw:
-    """Draw a figure in our style."""
-
-    @wraps(draw)
-    def draw_in_style(*what: Any, **more: Any) -> Figure:
-        with apply_style():
-            return draw(*what, **more)
-
-    return draw_in_style
-
-
-def needs(there: Callable[[Result], object], nothing: str = "") -> Callable[[Draw], Draw]:
-    """Mark a figure of what a flight may lack: its picture then says that there is ``nothing``, if that is given."""
+def figure_of(
+    there: Callable[[Result], object] = bool, nothing: str = ""
+) -> Callable[[Draw], Draw]:
+    """Draw a figure in our style; where what it shows is not there, say that there is ``nothing``, if that is given."""
 
     def mark(draw: Draw) -> Draw:
         @wraps(draw)
-        def draw_if_there(result: Result, *more: Any) -> Figure:
-            if there(result) or not nothing:
-                return draw(result, *more)
-            name = getattr(draw, "__name__", "").replace("_", " ")
-            fig, axes = time_figure(result, name.capitalize(), 1)
-            write_note(axes[0, 0], nothing)
-            return fig
+        def draw_in_style(result: Result, *more: Any, **named: Any) -> Figure:
+            with apply_style():
+                if there(result) or not nothing:
+                    return draw(result, *more, **named)
+                name = getattr(draw, "__name__", "").replace("_", " ")
+                fig, axes = time_figure(result, name.capitalize(), 1)
+                write_note(axes[0, 0], nothing)
+                return fig
 
-        vars(draw_if_there)["there"] = there
-        return draw_if_there
+        vars(draw_in_style)["there"] = there
+        return draw_in_style
 
     return mark
 
