@@ -953,6 +953,7 @@ def test_a_figure_fits_its_column(triangle, tmp_path, width):
             page, flat = figure.bbox.padded(1.0), [ax for ax in figure.axes if ax.name != "3d"]
             shown: list[Any] = [*figure.texts, *figure.legends, *(ax.get_legend() for ax in flat)]
             shown += [ax.xaxis.label for ax in flat] + [ax.yaxis.label for ax in flat]
+            shown += [ax.zaxis.label for ax in figure.axes if ax.name == "3d"]
             for part in shown:
                 if part is not None and (not isinstance(part, Text) or part.get_text()):
                     box = part.get_window_extent()
@@ -1174,13 +1175,13 @@ def line_of(ax: Any, agent: int) -> np.ndarray:
 
 
 def test_rotors_of_one_model_stand_beside_their_limit():
-    """Each vehicle's greatest rotor is drawn in newtons with the limit; below, all rotors of the one nearest to it."""
+    """Each vehicle's greatest rotor is drawn as a share of its limit; below, all rotors of the one nearest to it."""
     result = by_quadrotors(["px4-sih"] * 3)
     above, below = drawn("rotors", result).axes
     for i in range(3):
-        assert line_of(above, i + 1).max() == pytest.approx((0.3 + 0.1 * i) * 5.0)
-    assert [line.get_ydata()[0] for line in by_gid(above, "limit")] == [pytest.approx(5.0)]
-    assert "limit 5 N" in texts(above)
+        assert line_of(above, i + 1).max() == pytest.approx(30.0 + 10.0 * i)
+    assert [line.get_ydata()[0] for line in by_gid(above, "limit")] == [pytest.approx(100.0)]
+    assert "limit" in texts(above)
     assert below.get_ylabel() == "rotors of agent 3 [N]"
     assert [line.get_ydata().max() for line in below.lines[:4]] == pytest.approx(
         [1.5, 1.5, 2.5, 1.5]

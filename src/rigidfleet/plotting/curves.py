@@ -155,9 +155,7 @@ def distances(result: Result) -> Figure:
 #: Flown and commanded values (K, 3), those of waypoints (time, [3]), names of the components and their unit.
 _Column = tuple[Floats, Floats, list[tuple[float, Any]], str, str]
 #: A waypoint.
-_RING: dict[str, Any] = {
-    "linestyle": "", "marker": "o", "markersize": 5.5, "markerfacecolor": "white", "markeredgecolor": st.INK,
-}  # fmt: skip
+_RING = st.marker_look(st.INK, 5.5, hollow=True)
 
 
 def _draw_components(result: Result, axes: Any, column: _Column) -> None:
@@ -168,7 +166,7 @@ def _draw_components(result: Result, axes: Any, column: _Column) -> None:
         ax.plot(result.time, flown[:, i], color=st.FLOWN, linewidth=2.4)
         st.draw_reference(ax, result.time, wanted[:, i])
         for t, goal in targets:
-            ax.plot(t, goal[i], **_RING, markeredgewidth=1.0, zorder=4, clip_on=False)
+            ax.plot(t, goal[i], **_RING, zorder=4, clip_on=False)
         ax.set_ylabel(f"{name} [{unit}]")
         fit_to_variation(ax, np.concatenate([flown[:, i], wanted[:, i], goals]), unit)
 

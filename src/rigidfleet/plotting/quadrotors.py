@@ -10,7 +10,7 @@ import numpy as np
 from rigidfleet._common.quantities import QUANTITIES, display_unit
 from rigidfleet.plotting import style as st
 from rigidfleet.plotting.logged import true_runs
-from rigidfleet.plotting.peaks import Panel, distinct_limits
+from rigidfleet.plotting.peaks import Panel
 from rigidfleet.result import LABELS, Extremum, Result
 from rigidfleet.result.quantities import samples
 from rigidfleet.typing import Bools, Floats
@@ -58,7 +58,7 @@ def _nearest_to_limit(result: Result, limits: Floats) -> Extremum | None:
 
 @st.figure_of(has_rotors, "no rotors")
 def rotors(result: Result) -> Figure:
-    """Greatest force of a rotor of each vehicle with its limit; all rotors of the one nearest to its limit."""
+    """Greatest force of a rotor of each vehicle as a share of its limit; all rotors of the one nearest to its limit."""
     fig, axes = st.time_figure(result, "Force of the rotors", 2)
     above, below = axes[:, 0]
     _draw_greatest(above, result)
@@ -68,18 +68,16 @@ def rotors(result: Result) -> Figure:
 
 
 def _draw_greatest(ax: Axes, result: Result) -> None:
-    """The greatest of the four rotors of each vehicle; as a share of the limit if limits differ."""
-    limits, force = rotor_limits(result.mission), rotor_forces(result).max(axis=2)
-    between, unit = _nearest_to_limit(result, limits), "N"
-    shown = distinct_limits(limits)
-    ax.set_ylabel("greatest rotor force [N]")
-    if len(shown) > 1:
-        if between is not None:
-            between = between._replace(value=100.0 * between.value / limits[between.who])
-        force, unit, shown = 100.0 * force / limits, "%", [(100.0, "limit", st.ALERT)]
-        ax.set_ylabel("share of the rotor limit [%]")
-    between = None if between is None else between._replace(other=-1)
-    Panel(ax, result, force, unit, between).draw(shown)
+    """The greatest of the four rotors of each vehicle, as a share of its limit."""
+    limits = rotor_limits(result.mission)
+    share, between = (
+        100.0 * rotor_forces(result).max(axis=2) / limits,
+        _nearest_to_limit(result, limits),
+    )
+    if between is not None:
+        between = between._replace(value=100.0 * between.value / limits[between.who], other=-1)
+    ax.set_ylabel("share of the rotor limit [%]")
+    Panel(ax, result, share, "%", between).draw([(100.0, "limit", st.ALERT)])
 
 
 def _draw_nearest(ax: Axes, result: Result) -> None:

@@ -163,9 +163,9 @@ def _draw_paths(ax: Axes, result: Result, view: Scene, axes: int) -> None:
         _draw_many(ax, shots, colours)
     else:
         for colour, r in zip(colours, shots.transpose(1, 2, 0), strict=True):
-            ax.plot(*r, **marker_look(colour, 3), zorder=5)
-            ax.plot(*r[:, :1], **marker_look(colour, 5, hollow=True), zorder=6, gid="start")
-            ax.plot(*r[:, -1:], **marker_look(colour, 5, marker="s"), zorder=6, gid="end")
+            ax.plot(*r, **st.marker_look(colour, 3), zorder=5)
+            ax.plot(*r[:, :1], **st.marker_look(colour, 5, hollow=True), zorder=6, gid="start")
+            ax.plot(*r[:, -1:], **st.marker_look(colour, 5, marker="s"), zorder=6, gid="end")
 
 
 def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
@@ -178,33 +178,18 @@ def _draw_many(ax: Axes, shots: Floats, colours: list[str]) -> None:
         ax.scatter(*r.T, s=4 if k in (0, last) else 3, **look, zorder=6 if hollow else 5)
 
 
-def marker_look(
-    colour: str, size: float, *, hollow: bool = False, marker: str = "o"
-) -> dict[str, Any]:
-    """Look of a marker of a size [points], filled or hollow."""
-    return {
-        "linestyle": "", "marker": marker, "markersize": size,
-        "markerfacecolor": "white" if hollow else colour,
-        "markeredgecolor": colour, "markeredgewidth": 1.2 if hollow else 0.0,
-    }  # fmt: skip
-
-
 def _cross(result: Result) -> dict[str, Any]:
     """Look of a waypoint, which is seen at night, too."""
     colour = st.GREY if has_lights(result) else st.INK
-    return {
-        "linestyle": "",
-        "marker": "+",
-        "markersize": 7,
-        "color": colour,
-        "markeredgewidth": 1.3,
-    }
+    return st.marker_look(colour, 7, marker="+") | {"markeredgewidth": 1.3}
 
 
 def _name_look(result: Result) -> dict[str, Any]:
-    """Look of the name of a waypoint."""
+    """Look of the name of a waypoint, with an outline in the colour of the background."""
+    from matplotlib.patheffects import withStroke
+
     ink, behind = (st.FAINT, st.NIGHT) if has_lights(result) else (st.INK, "white")
-    look = {"color": ink, "path_effects": st.halo(behind)}
+    look = {"color": ink, "path_effects": [withStroke(linewidth=2.5, foreground=behind)]}
     return look | {"fontsize": 7.5, "zorder": 8, "parse_math": False}
 
 
@@ -278,7 +263,7 @@ def _fit_axes(
     """Zoom so that the box of the axes with its labels fills `rect` (left, bottom, width, height)."""
     size = fig.get_size_inches() * fig.dpi
     left, bottom, width, height = np.array(rect) * np.tile(size, 2)
-    side, margin = max(width, height), 0.42 * fig.dpi  # for tick and axis labels
+    side, margin = max(width, height), 0.55 * fig.dpi  # for tick and axis labels
     corner = left + (width - side) / 2, bottom + (height - side) / 2
     ax.set_position((*(corner / size), *(side / size)))
     extent = np.ptp(_on_screen(ax, corners(view.low, view.high)), axis=0)
@@ -326,8 +311,8 @@ def legend_handles(result: Result, view: Scene) -> list[Any]:
     if has_lights(result):
         return waypoints
     ends = [
-        st.legend_entry("start", **marker_look(st.GREY, 5, hollow=True)),
-        st.legend_entry("end", **marker_look(st.GREY, 5, marker="s")),
+        st.legend_entry("start", **st.marker_look(st.GREY, 5, hollow=True)),
+        st.legend_entry("end", **st.marker_look(st.GREY, 5, marker="s")),
     ]
     return [*st.agent_handles(result.n_agents, marker="o", markersize=4), *ends, *waypoints]
 

@@ -236,6 +236,17 @@ def legend_entry(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
+def marker_look(
+    colour: str, size: float, *, hollow: bool = False, marker: str = "o"
+) -> dict[str, Any]:
+    """Look of a marker of a size [points], filled or hollow."""
+    return {
+        "linestyle": "", "marker": marker, "markersize": size,
+        "markerfacecolor": "white" if hollow else colour,
+        "markeredgecolor": colour, "markeredgewidth": 1.2 if hollow else 0.0,
+    }  # fmt: skip
+
+
 def draw_reference(ax: Axes, t: Floats, y: Floats) -> None:
     """Draw a reference as a dashed line."""
     ax.plot(t, y, **REFERENCE, zorder=3)
@@ -280,13 +291,6 @@ def is_still(values: Floats) -> bool:
     """Whether all known values are the same, or none is known."""
     known = values[np.isfinite(values)]
     return not len(known) or float(np.ptp(known)) <= STILL
-
-
-def halo(colour: str = "white") -> list[Any]:
-    """An outline, in the colour of the background, of text that stands on lines."""
-    from matplotlib.patheffects import withStroke
-
-    return [withStroke(linewidth=2.5, foreground=colour)]
 
 
 def write_note(ax: Axes, words: str) -> None:
