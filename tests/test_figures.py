@@ -953,7 +953,8 @@ def test_a_figure_fits_its_column(triangle, tmp_path, width):
             page, flat = figure.bbox.padded(1.0), [ax for ax in figure.axes if ax.name != "3d"]
             shown: list[Any] = [*figure.texts, *figure.legends, *(ax.get_legend() for ax in flat)]
             shown += [ax.xaxis.label for ax in flat] + [ax.yaxis.label for ax in flat]
-            shown += [ax.zaxis.label for ax in figure.axes if ax.name == "3d"]
+            spatial: list[Any] = [ax for ax in figure.axes if ax.name == "3d"]
+            shown += [ax.zaxis.label for ax in spatial]
             for part in shown:
                 if part is not None and (not isinstance(part, Text) or part.get_text()):
                     box = part.get_window_extent()
