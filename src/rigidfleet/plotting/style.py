@@ -47,7 +47,6 @@ WIDTH = 9.0  # width of a figure over time [in]
 _COLUMN = 5.5  # a figure that is narrower has one column of axes [in]
 _PAD = 0.07  # margin around the content [in]
 _DPI = 160  # resolution [pixels per inch]: also of measures, so that a text is measured once
-_DOT = _DPI / 100  # a hundredth of an inch [pixels]
 _LETTERS = 19  # of words above an axes in an inch of its width
 _LONGEST = 28  # greatest length of a phase name
 #: Number of agents or edges beyond which the spread is drawn instead of each line.
@@ -434,7 +433,7 @@ def number_phases(axes: Iterable[Axes], result: Result) -> str:
         for i, (_, start, end) in enumerate(_phase_spans(ax, result)):
             label = _label_phase(ax, str(i + 1), start, end, fontsize=6.5)
             box = label.get_window_extent()
-            if box.x0 < right + 2 * _DOT:
+            if box.x0 < right + 0.02 * _DPI:
                 label.remove()
             else:
                 right = box.x1
